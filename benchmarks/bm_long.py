@@ -107,7 +107,7 @@ def _scores(made: Made, scene: Scene, parts: Sequence[range]) -> list[Score]:
     for part in parts:
         held_out = tuple(index for index in made.split.held_out if index in part)
         first = made.report.model_copy(update={"held_out": held_out})
-        report = judged(first, made.clip, made.split.train, renderer, Hooks())
+        report = judged(first, made.clip, made.split.train, renderer.seen_from, Hooks())
         found.append((report.psnr_tissue_db, report.psnr_right_db))
     return found
 

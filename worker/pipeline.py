@@ -124,7 +124,7 @@ def judge(made: Made, hooks: Hooks) -> Report:
     """
     renderer = SceneRenderer(made.scene, made.device)
     del made.scene  # the renderer has the weights, and they take much memory
-    return judged(made.report, made.clip, made.split.train, renderer, hooks)
+    return judged(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
 
 
 def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:

@@ -2,7 +2,7 @@
 
 A series is a preset, or a preset with some of its numbers changed: `fast:bases=9,points_per_image=20000`. Every grid,
 that of capacity too, is a list of series. `fast:eyes=left` is the preset as it is, trained on the left eye of a stereo
-clip; without it a preset that can takes both.
+clip; without it a preset that can takes both. A series may also be a system of the paper's table 1 (rivals/), as it is.
 """
 
 from __future__ import annotations
@@ -16,13 +16,16 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from contract.wire.errors import InputError
 from contract.wire.names import Eyes
 from contract.wire.options import ReconstructionOptions, parse_options
+from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.train.presets import PRESETS, Preset, preset_named
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
 """The published method, as printed and as released, and what it compares itself with."""
 DEFAULT_SERIES = (*OURS, *RIVALS)
-SHORTHANDS = {"ours": OURS, "rivals": RIVALS}
+TABLE_1 = (*RIVAL_SYSTEMS, "paper", "fast")
+"""The systems that the paper's table 1 compares, and our default."""
+SHORTHANDS = {"ours": OURS, "rivals": RIVALS, "table1": TABLE_1}
 DEFAULT_HOLDOUTS = ("every8", "blocks8")
 GRID_BASES = (3, 5, 9, 17, 33)
 GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
@@ -68,24 +71,24 @@ def plan(
     Cells have the series' canonical names: one series is one row, however it was spelt.
 
     Args:
-        series: also "ours" and "rivals".
+        series: also "ours", "rivals" and "table1".
         eyes: of the series that do not say themselves; a preset that trains on the left eye alone has one cell.
 
     Raises:
         InputError: a series is not known, or no reconstruction takes a holdout or a seed.
     """
     named = [name for each in series for name in SHORTHANDS.get(each, (each,))]
-    presets = dict(_read(with_eyes(name, which)) for name in named for which in eyes)
+    lengths = dict(_named_length(with_eyes(name, which)) for name in named for which in eyes)
     cells = []
     for clip in clips:
         for holdout in holdouts:
             for seed in seeds:
-                for name, preset in presets.items():
+                for name, (own_iterations, own_budget_s) in lengths.items():
                     fixed = list(iterations)
                     timed = list(budgets_s)
                     if not fixed and not timed:  # the preset's own; iterations before seconds, as in a reconstruction
-                        fixed = [preset.iterations] if preset.iterations else []
-                        timed = [preset.budget_s] if preset.budget_s and not fixed else []
+                        fixed = [own_iterations] if own_iterations else []
+                        timed = [own_budget_s] if own_budget_s and not fixed else []
                     cells += [Cell(clip, name, holdout, seed, budget_s=each) for each in timed]
                     cells += [Cell(clip, name, holdout, seed, iterations=each) for each in fixed]
     for cell in cells:
@@ -99,7 +102,8 @@ def options_of(cell: Cell) -> ReconstructionOptions:
     Raises:
         InputError: no reconstruction takes one of them.
     """
-    preset = {} if is_changed(cell.series) else {"preset": preset_of(cell.series).name}
+    is_preset = not (is_changed(cell.series) or is_rival_system(cell.series))
+    preset = {"preset": preset_of(cell.series).name} if is_preset else {}
     length = {"budget_s": cell.budget_s, "iterations": cell.iterations}
     chosen = {"holdout": cell.holdout, "seed": cell.seed, EYES: eyes_of(cell.series)}
     return parse_options(ReconstructionOptions, {**chosen, **length, **preset})
@@ -114,8 +118,22 @@ def preset_of(series: str) -> Preset:
     return _read(series)[1]
 
 
+def is_rival_system(series: str) -> bool:
+    """Whether the series is one of RIVAL_SYSTEMS, which have no preset.
+
+    Raises:
+        InputError: it is one with changes.
+    """
+    if preset_name_of(series) not in RIVAL_SYSTEMS:
+        return False
+    if _changes(series):
+        problem = f"{series!r} changes a system that is measured as it was published."
+        raise InputError("--series", problem, f"Write {preset_name_of(series)!r}.")
+    return True
+
+
 def preset_name_of(series: str) -> str:
-    """The name of the preset that a series is a variant of."""
+    """The name of the preset that a series is a variant of, or of the system that it is."""
     return series.partition(":")[0]
 
 
@@ -162,9 +180,20 @@ def _named(preset: str, changes: Sequence[str]) -> str:
     return f"{preset}:{','.join(changes)}" if changes else preset
 
 
+def _named_length(series: str) -> tuple[str, tuple[int | None, float | None]]:
+    """A series' canonical name, and the iterations or seconds that it trains if nobody says. Raises as preset_of."""
+    if is_rival_system(series):
+        return preset_name_of(series), (None, RIVAL_BUDGET_S)
+    name, preset = _read(series)
+    return name, (preset.iterations, preset.budget_s)
+
+
 def _read(series: str) -> tuple[str, Preset]:
     """A series' canonical name, with its changes in alphabetical order, and its preset. Raises as preset_of."""
     name = preset_name_of(series)
+    if is_rival_system(series):
+        problem = f"{series!r} is no preset: it is trained by `intrasplat evaluate` alone."
+        raise InputError("--series", problem, f"Use one of: {', '.join(PRESETS)}.")
     preset = preset_named(name)
     values: dict[str, Any] = {}
     for change in _changes(series):

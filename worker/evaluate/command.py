@@ -19,6 +19,7 @@ from contract.wire.options import ClipOptions, ReconstructionOptions
 from worker.evaluate.cells import BOTH_EYES, DEFAULT_HOLDOUTS, DEFAULT_SERIES, Cell, capacity_grid, plan
 from worker.evaluate.charts import draw_all
 from worker.evaluate.measure import Bench
+from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Results, adding_alone, write_rows
 from worker.evaluate.sources import PHANTOM_SPELLING, source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
@@ -46,7 +47,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--series",
         nargs="+",
         default=list(DEFAULT_SERIES),
-        help="presets, also ours or rivals, or presets with changes such as fast:bases=9,tracks=false (default: all)",
+        help="presets, also ours or rivals, presets with changes such as fast:bases=9,tracks=false, systems of others "
+        f"({', '.join(RIVAL_SYSTEMS)}), or table1 (default: all presets)",
     )
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")
@@ -195,5 +197,6 @@ def _outcome(row: dict[str, object]) -> str:
     if row["psnr_right_db"] is not None:
         shown += f", right eye {row['psnr_right_db']:.2f} dB"
     return (
-        f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians']} Gaussians, {int(str(row['scene_bytes'])) / 1e6:.1f} MB"
+        f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians'] or 'no'} Gaussians, "
+        f"{int(str(row['scene_bytes'])) / 1e6:.1f} MB"
     )

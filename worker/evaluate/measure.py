@@ -13,7 +13,7 @@ import os
 import shlex
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,14 +24,17 @@ from contract.runtime.exits import flag_of
 from contract.wire.errors import InputError
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
-from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, options_of, preset_of
+from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, is_rival_system, options_of, preset_of
 from worker.evaluate.right_eye import right_eye_ranks
+from worker.evaluate.rivals import RIVAL_SYSTEMS
+from worker.evaluate.rivals.run import Length, Make, RivalCandidate, every_core, run_rival
 from worker.evaluate.rows import KEY, NO_RESULT, SCORES, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
-from worker.evaluate.truth import SceneCandidate, Truth
-from worker.input.clip import DepthClip
+from worker.evaluate.truth import Candidate, SceneCandidate, Truth
+from worker.input.clip import DepthClip, split_frames
+from worker.machine.timing import Timings
 from worker.model.metrics import depth_agreement_mm, depth_errors_mm, psnr_tissue, ssim
-from worker.pipeline import reconstruct
+from worker.pipeline import open_with_depth, reconstruct
 from worker.raster.backend import Device, choose_device
 from worker.raster.step import camera_vector
 from worker.scene.checkpoint import load_scene
@@ -43,6 +46,8 @@ from worker.train.targets import camera_in_units
 
 UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
 """Renders at different times, of which the median counts; the first fill caches."""
+MAX_TIMING_S = 30.0
+"""After so long the renders that are timed already are enough."""
 MAX_ERROR_CHARACTERS = 300
 
 Values = dict[str, object]
@@ -57,6 +62,7 @@ class Bench:
 
     sources: Mapping[str, Source]
     device: DeviceName = "auto"
+    rivals: Mapping[str, Make] = field(default_factory=lambda: RIVAL_SYSTEMS)
     _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
     _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
     _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
@@ -94,6 +100,9 @@ class Bench:
         if opened.clip.right is None and eyes_of(cell.series) != BOTH_EYES:
             problem = f"{cell.clip} has one eye, so {cell.series!r} would be measured like both eyes."
             raise InputError("--eyes", problem, "Leave it out.")
+        if is_rival_system(cell.series):
+            with every_core():
+                return self._measured_rival(cell, opened, hooks)
         request = ReconstructionRequest(
             clip=opened.clip,
             options=options_of(cell),
@@ -111,7 +120,11 @@ class Bench:
             kept = [path for path in out.iterdir() if path.name not in (REPORT, CURVE)]
             scene_bytes = sum(path.stat().st_size for path in kept)
         seconds = seconds_of(report.seconds, opened.seconds, on_the_way.took_s)
-        values = _reported(report, seconds) | _size(scene) | _speed(scene, report, choose_device(self.device))
+        values = (
+            _reported(report, seconds)
+            | _size(scene)
+            | _speed(scene_renderer(scene, choose_device(self.device)), report)
+        )
         values |= {
             "machine": machine(report.device),
             "scene_bytes": scene_bytes,
@@ -121,19 +134,50 @@ class Bench:
             curve = on_the_way.completed(curve)
             # its end is scored on all held-out frames of the model as it is kept
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
-        return values | self._true(place, opened, scene, report), curve
-
-    def _true(self, place: tuple[str, str], opened: OpenClip, scene: Scene, report: Report) -> Values:
-        """The scores against the truth, for a clip that has one, or against the recorded right eye."""
         if opened.phantom is None:
-            return dict(right_eye_ranks(scene, opened.clip, report.held_out))
-        if not report.held_out:
+            return values | right_eye_ranks(scene, opened.clip, report.held_out), curve
+        return values | self._true(place, opened, SceneCandidate(scene), report), curve
+
+    def _measured_rival(self, cell: Cell, opened: OpenClip, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
+        """The same of a system that has no scene."""
+        device, timings, options = choose_device(self.device), Timings(), options_of(cell)
+        with timings.measure("open_s"):
+            clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, Timings(), device)
+        on_the_way = _OnTheWay(clip)
+        fitted = run_rival(
+            cell.series,
+            self.rivals[cell.series],
+            clip,
+            split_frames(clip, cell.holdout),
+            Length(cell.iterations, cell.budget_s),
+            seed=cell.seed,
+            device=device,
+            waited_s=sum(opened.seconds.values()) + timings.seconds["open_s"],
+            hooks=dataclasses.replace(hooks, on_held_out=on_the_way.judge),
+        )
+        report, rival = fitted.report, fitted.rival
+        curve = on_the_way.completed([dataclasses.asdict(point) for point in fitted.curve], in_t_post_s=False)
+        if curve:
+            curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
+        pose, camera = clip.world_from_camera[0], clip.intrinsics
+        speed = _speed(lambda t: rival.render(t, pose, camera), report)
+        values = _reported(report, {**opened.seconds, **report.seconds}) | speed
+        values |= {"machine": machine(report.device), "scene_bytes": report.scene_bytes, "bases": None}
+        values |= {"gaussians": rival.gaussians or None, "not_measured": rival.not_measured}
+        if opened.phantom is None:
+            return values, curve
+        place = (cell.clip, cell.holdout)
+        return values | self._true(place, opened, RivalCandidate(rival, clip), report), curve
+
+    def _true(self, place: tuple[str, str], opened: OpenClip, candidate: Candidate, report: Report) -> Values:
+        """The scores of a phantom's candidate against the truth."""
+        if opened.phantom is None or not report.held_out:
             return {}
         if place not in self._truth:
             unused = {*report.held_out, *report.repeated}
             train = [frame for frame in range(report.frame_count) if frame not in unused]
             self._truth[place] = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
-        return dataclasses.asdict(self._truth[place].score(SceneCandidate(scene)))
+        return dataclasses.asdict(self._truth[place].score(candidate))
 
 
 class _OnTheWay:
@@ -166,12 +210,12 @@ class _OnTheWay:
         self._errors_mm[-1].append(depth_errors_mm(view.depth_mm, self._clip.depth_mm[frame], tissue))
         self.took_s += time.perf_counter() - start
 
-    def completed(self, curve: Sequence[Values]) -> list[Values]:
-        """The points of curve.csv with both scores, and with a t_post_s from which judging is taken out."""
+    def completed(self, curve: Sequence[Values], *, in_t_post_s: bool = True) -> list[Values]:
+        """The points of curve.csv with both scores, and with a t_post_s that judging is taken out of if it is there."""
         return [
             {
                 **point,
-                "t_post_s": float(str(point["t_post_s"])) - before_s,
+                "t_post_s": float(str(point["t_post_s"])) - before_s * in_t_post_s,
                 "ssim": _mean_of_known(found),
                 "depth_agreement_mm": depth_agreement_mm(errors),
             }
@@ -192,16 +236,23 @@ def command_of(cell: Cell, source: Source, device: DeviceName = "auto") -> str:
     return shlex.join(["intrasplat", "evaluate", source.argument, *options])
 
 
-def render_ms(scene: Scene, device: Device) -> float:
-    """Median milliseconds of an image at the clip's size, deformation included, at times spread over the clip."""
-    model = model_of(scene, device)
-    camera = camera_vector(camera_in_units(scene.intrinsics, scene.world_from_camera[0], scene.units_per_mm))
+def render_ms(render: Callable[[float], object]) -> float:
+    """Median milliseconds of rendering a time, at times spread over the clip; of slow methods few are timed."""
     took: list[float] = []
     for t in np.random.default_rng(0).permutation(np.linspace(0, 1, UNTIMED_RENDERS + TIMED_RENDERS, endpoint=False)):
         start = time.perf_counter()
-        model.render(camera, float(t))
+        render(float(t))
         took.append(time.perf_counter() - start)
-    return 1000 * float(np.median(took[UNTIMED_RENDERS:]))
+        if sum(took) > MAX_TIMING_S:
+            break
+    return 1000 * float(np.median(took[min(UNTIMED_RENDERS, len(took) - 1) :]))
+
+
+def scene_renderer(scene: Scene, device: Device) -> Callable[[float], object]:
+    """Renders a time of the scene at the clip's size, deformation included."""
+    model = model_of(scene, device)
+    camera = camera_vector(camera_in_units(scene.intrinsics, scene.world_from_camera[0], scene.units_per_mm))
+    return lambda t: model.render(camera, t)
 
 
 def seconds_of(run: Mapping[str, float], opening: Mapping[str, float], judging_s: float) -> dict[str, float]:
@@ -234,8 +285,8 @@ def _size(scene: Scene) -> Values:
     return {"gaussians": len(scene.gaussians), "floats_a_gaussian": floats / len(scene.gaussians)}
 
 
-def _speed(scene: Scene, report: Report, device: Device) -> Values:
-    median_ms = render_ms(scene, device)
+def _speed(render: Callable[[float], object], report: Report) -> Values:
+    median_ms = render_ms(render)
     step_ms = 1000 * report.seconds["optimise_s"] / report.iterations
     return {"step_ms": step_ms, "render_ms": median_ms, "render_fps": 1000 / median_ms}
 

@@ -41,10 +41,11 @@ TRUTH = (
 )  # fmt: skip
 SIZE = ("iterations", "gaussians", "bases", "floats_a_gaussian", "scene_bytes", "stored_loss_held_out_db")
 SPEED = ("t_train_s", "t_post_s", "seconds", "step_ms", "render_ms", "render_fps", "width", "height", "load_1min")
-ORIGIN = ("machine", "commit", "command", "error")
+ORIGIN = ("machine", "commit", "command", "error", "not_measured")
 RUN_FIELDS = (*KEY, *SCORES, *COPIES, *TRUTH, *SIZE, *SPEED, *ORIGIN)
 """Empty means not measured. docs/conventions.md defines SCORES and the clocks, truth.py TRUTH, measure.py the rest:
 SIZE in _size and _stored_loss_held_out_db, SPEED in seconds_of and _speed. seconds is JSON, load_1min before the run.
+not_measured says which figures a method of others cannot have, and why.
 """
 CURVE_FIELDS = (
     *KEY, "t_train_s", "t_post_s", "iteration", "psnr_tissue_db", "psnr_right_db", "ssim", "depth_agreement_mm",

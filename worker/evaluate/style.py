@@ -64,6 +64,9 @@ _LOOKS = {
     "pfs": Look("#8C7A00", "P"),
     "hexplane": Look("#000000", "X"),
     "paper-wide": Look("#7F7F7F", ">"),
+    "endonerf": Look("#8B4513", "p"),
+    "lerplane": Look("#556B2F", "d"),
+    "endogaussian": Look("#4B0082", "*"),
 }
 """pfs has Okabe and Ito's yellow darkened: on white it is too light for a line."""
 BASES_LOOKS = (

@@ -28,6 +28,7 @@ from worker.render.left import OutOfView
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
+from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 
 FAR_POSE = 0.35
@@ -131,6 +132,12 @@ class SceneRenderer:
                 image[:, rows] = shown[:, rows]
                 pause()
         return image[:5], None if values is None else image[5]
+
+    def seen_from(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        """The scene's colour, depth in mm and alpha at model time t."""
+        image, _ = self.layers(t, world_from_camera, intrinsics)
+        depth_mm = solid_depth_mm(image[3], image[4], self.scene.units_per_mm)
+        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
 
     def values(self, t: float) -> NDArray[np.float32] | None:
         """blended_values [N] at model time t: trust where positive. None: not known."""

@@ -1,4 +1,4 @@
-"""The judge: a finished scene's own renders against the frames of its clip."""
+"""The judge: a finished model's own renders against the frames of its clip."""
 
 from __future__ import annotations
 
@@ -13,24 +13,22 @@ from worker.input.clip import DepthClip, Eye
 from worker.machine.cores import cores
 from worker.machine.hooks import Hooks, Progress
 from worker.machine.opencv import one_opencv_thread
-from worker.render.view import SceneRenderer
 from worker.report.baselines import copy_baselines
 from worker.report.quality import measure, scored_report
 from worker.report.right_eye import measure_right
 from worker.train.hooks import RenderedFrame
-from worker.train.scoring import FrameRenderer, Mapping, sample_frames
-from worker.train.targets import solid_depth_mm
+from worker.train.scoring import FrameRenderer, Mapping, PoseRenderer, sample_frames
 
 STAGE = "score"
 
 
-def judged(first: Report, clip: DepthClip, train: Sequence[int], renderer: SceneRenderer, hooks: Hooks) -> Report:
-    """The report with the scores of the scene's held-out frames, of the right eye's, and of the copy baselines.
+def judged(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRenderer, hooks: Hooks) -> Report:
+    """The report with the scores of the model's held-out frames, of the right eye's, and of the copy baselines.
 
     Args:
-        first: the report of the scene before it was scored.
-        train: the frames that the scene was trained on.
-        renderer: the scene's.
+        first: the report of the model before it was scored.
+        train: the frames that the model was trained on.
+        render: the model's; several threads may call it.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
@@ -42,15 +40,13 @@ def judged(first: Report, clip: DepthClip, train: Sequence[int], renderer: Scene
     def views(eye: DepthClip | Eye) -> FrameRenderer:
         """Renders the frame of this index from the eye's own pose."""
 
-        def render(index: int) -> RenderedFrame:
+        def view(index: int) -> RenderedFrame:
             nonlocal done
             hooks.on_progress(Progress(STAGE, done / total, first.iterations, first.iterations))
             done += 1
-            image, _ = renderer.layers(float(clip.t[index]), eye.world_from_camera[index], eye.intrinsics)
-            depth_mm = solid_depth_mm(image[3], image[4], renderer.scene.units_per_mm)
-            return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+            return render(float(clip.t[index]), eye.world_from_camera[index], eye.intrinsics)
 
-        return render
+        return view
 
     with (
         one_opencv_thread(),

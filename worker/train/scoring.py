@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.input.clip import Eye, spread
+from worker.input.camera import Intrinsics
+from worker.input.clip import DepthClip, Eye, spread
 from worker.model.metrics import psnr_tissue
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
-from worker.train.hooks import RenderedFrame
+from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.run import Run
 from worker.train.targets import camera_in_units, solid_depth_mm
 
@@ -34,6 +35,8 @@ the left eye."""
 
 FrameRenderer = Callable[[int], RenderedFrame]
 """Renders the frame of this index from an eye's own pose."""
+PoseRenderer = Callable[[float, NDArray[np.float64], Intrinsics], RenderedFrame]
+"""Renders model time t from world_from_camera [4, 4] in mm with a camera."""
 Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
 """As map(): what a function gives for each frame, in their order."""
 
@@ -67,29 +70,37 @@ class HeldOutScore:
 
 
 def held_out_score(run: Run, model: Model | None = None) -> HeldOutScore:
-    """The score over at most sixteen held-out frames, evenly spread; with `model`, of that instead of the run's.
+    """As score_held_out, of the run; with `model`, of that instead of the run's."""
+    setup = run.setup
 
-    The hooks see the left eye's renders.
+    def render_as(eye: Eye | None) -> FrameRenderer:
+        return frame_renderer(run, model, eye)
+
+    return score_held_out(setup.clip, setup.split.held_out, render_as, setup.hooks)
+
+
+def score_held_out(
+    clip: DepthClip, held_out: Sequence[int], render_as: Callable[[Eye | None], FrameRenderer], hooks: TrainingHooks
+) -> HeldOutScore:
+    """The score over at most sixteen of the held-out frames, evenly spread.
+
+    Args:
+        render_as: renders from the left eye for None, else from the clip's right eye.
+        hooks: see the left eye's renders.
     """
-    clip, scores = run.setup.clip, []
-    frames = sample_frames(run.setup.split.held_out, MAX_SCORED_FRAMES)
-    render = frame_renderer(run, model)
+    scores, frames, render = [], sample_frames(held_out, MAX_SCORED_FRAMES), render_as(None)
     for index in frames:
         frame = render(index)
-        run.setup.hooks.on_held_out(index, frame)
+        hooks.on_held_out(index, frame)
         if clip.tissue[index].any():  # else it has no score
             scores.append(psnr_tissue(frame.rgb, clip.rgb[index], clip.tissue[index]))
         clip.let_go(index)
-    right = _right_scores(run, frames, model)
+    right = [] if clip.right is None else _right_scores(clip.right, frames, render_as(clip.right))
     return HeldOutScore(*(float(np.mean(each)) if each else math.nan for each in (scores, right)))
 
 
-def _right_scores(run: Run, frames: Sequence[int], model: Model | None) -> list[float]:
-    """psnr_tissue in dB of the right eye's frames that show tissue which the left eye sees; [] without a right eye."""
-    right = run.setup.clip.right
-    if right is None:
-        return []
-    render = frame_renderer(run, model, right)
+def _right_scores(right: Eye, frames: Sequence[int], render: FrameRenderer) -> list[float]:
+    """psnr_tissue in dB of the right eye's frames that show tissue which the left eye sees."""
     judged = ((index, judged_pixels(right, index)) for index in right.one_by_one(frames))
     return [psnr_tissue(render(index).rgb, right.rgb[index], pixels) for index, pixels in judged if pixels.any()]
 

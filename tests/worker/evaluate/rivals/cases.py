@@ -1,0 +1,82 @@
+"""Small clips, and the checks that every rival has to pass."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import torch
+
+from tests.worker.phantoms import phantom_clip
+from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.rivals.run import Length, train_rival
+from worker.input.clip import DepthClip
+from worker.machine.timing import Stopwatch
+from worker.model.metrics import psnr_tissue
+from worker.train.hooks import RenderedFrame, TrainingHooks
+
+Make = Callable[[Seen, int], Rival]
+
+
+def small_clip(frames: int) -> DepthClip:
+    """Frames of 64x48 that an instrument crosses."""
+    return phantom_clip("breathing", frames=frames, width=64, height=48, noise=False)
+
+
+def fitted(make: Make, clip: DepthClip, train: Sequence[int], iterations: int, seed: int = 0) -> Rival:
+    """A rival after so many iterations on these frames."""
+    rival = make(Seen.of(clip, train), seed)
+    made = train_rival(rival, Length(iterations, None), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+    assert made == iterations
+    return rival
+
+
+def frame_of(rival: Rival, clip: DepthClip, index: int) -> RenderedFrame:
+    """A frame as the rival shows it from the endoscope."""
+    return rival.render(float(clip.t[index]), clip.world_from_camera[index], clip.intrinsics)
+
+
+def score_db(rival: Rival, clip: DepthClip, index: int) -> float:
+    return psnr_tissue(frame_of(rival, clip, index).rgb, clip.rgb[index], clip.tissue[index])
+
+
+def depth_error_mm(rival: Rival, clip: DepthClip, index: int) -> float:
+    """Median over tissue."""
+    error = np.abs(frame_of(rival, clip, index).depth_mm - clip.depth_mm[index])
+    return float(np.median(error[clip.tissue[index]]))
+
+
+def without_held_out(clip: DepthClip, held_out: int) -> DepthClip:
+    """The clip with another picture, mask and depth in the frame that is held out."""
+    rgb, tissue, depth_mm = (each.copy() for each in (clip.rgb, clip.tissue, clip.depth_mm))
+    rgb[held_out], tissue[held_out], depth_mm[held_out] = 255 - rgb[held_out], True, 20.0
+    return dataclasses.replace(clip, rgb=rgb, tissue=tissue, depth_mm=depth_mm)
+
+
+def numbers_of(rival: Rival) -> list[bytes]:
+    """All that is trained, bit by bit."""
+    return [each.detach().numpy().tobytes() for each in rival.parameters()]
+
+
+def check_gradient(rival: Rival, parameters: Iterable[torch.Tensor], step: float = 1e-6) -> None:
+    """The loss falls along a random direction as autograd says, by central differences in float64."""
+    moved = list(parameters)
+    random = torch.Generator().manual_seed(5)
+    directions = [torch.randn(each.shape, generator=random, dtype=torch.float64) for each in moved]
+    found = torch.autograd.grad(rival.loss(1, 0.0), moved)
+    slope = float(sum((a * b).sum() for a, b in zip(found, directions, strict=True)))
+    assert all(bool((each != 0).any()) for each in found), "each parameter has a part in the loss"
+
+    def loss_at(distance: float) -> float:
+        with torch.no_grad():
+            for each, direction in zip(moved, directions, strict=True):
+                each.add_(direction, alpha=distance)
+            found = float(rival.loss(1, 0.0))
+            for each, direction in zip(moved, directions, strict=True):
+                each.sub_(direction, alpha=distance)
+        return found
+
+    measured = (loss_at(step) - loss_at(-step)) / (2 * step)
+    assert math.isclose(measured, slope, rel_tol=1e-4), (measured, slope)

@@ -1,0 +1,71 @@
+"""A canonical field that a network displaces into."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from tests.worker.evaluate.rivals.cases import (
+    check_gradient,
+    depth_error_mm,
+    fitted,
+    frame_of,
+    numbers_of,
+    score_db,
+    small_clip,
+    without_held_out,
+)
+from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings
+from worker.evaluate.rivals.rival import Seen
+
+SMALL = EndoNerfSettings(
+    rays=512, samples=4, layers=4, width=64, spread=0.01, space_octaves=6, time_octaves=4,
+    rate=1e-2, last_rate=1e-3, depth_weight=0.1,
+)  # fmt: skip
+"""What learns 64x48 pixels in seconds."""
+TINY = EndoNerfSettings(rays=16, samples=3, layers=3, width=8, space_octaves=2, time_octaves=2, view_octaves=1)
+
+
+def small(seen: Seen, seed: int) -> EndoNerf:
+    return EndoNerf(seen, seed, SMALL)
+
+
+def test_its_gradient_is_that_of_finite_differences() -> None:
+    seen = Seen.of(small_clip(2), [1], dtype=torch.float64)
+    rival = EndoNerf(seen, 3, TINY)
+    check_gradient(rival, rival.parameters())
+
+
+def test_it_overfits_one_frame_above_30_db() -> None:
+    clip = small_clip(2)
+    rival = fitted(small, clip, [1], 400)
+    assert score_db(rival, clip, 1) > 30
+    assert depth_error_mm(rival, clip, 1) < 1
+
+
+def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
+    clip = small_clip(9)
+    first, spoilt = (fitted(small, each, [0, 8], 40) for each in (clip, without_held_out(clip, 4)))
+    assert numbers_of(first) == numbers_of(spoilt)
+    np.testing.assert_array_equal(frame_of(first, clip, 4).rgb, frame_of(spoilt, clip, 4).rgb)
+    assert np.abs(frame_of(first, clip, 8).rgb - frame_of(first, clip, 0).rgb).max() > 0.01
+    assert numbers_of(fitted(small, clip, [0, 8], 40, seed=1)) != numbers_of(first)
+
+
+def test_rays_are_drawn_where_there_is_tissue_and_more_often_where_it_hides() -> None:
+    clip = small_clip(9)
+    rival = small(Seen.of(clip, range(9)), 0)
+    often = (~clip.tissue).sum(0)
+    importance = rival._importance.numpy()
+    assert importance[often > 0].min() > importance[often == 0].max() == 1
+
+
+def test_depth_that_the_field_contradicts_gives_way_late() -> None:
+    clip = small_clip(2)
+    rival = small(Seen.of(clip, [1]), 0)
+    before = rival._s.clone()
+    rival.loss(1, 0.0)
+    assert torch.equal(rival._s, before)
+    rival.loss(1, 0.5)
+    changed = int((rival._s != before).sum())
+    assert 0 < changed <= 6, "a hundredth of 512 rays"

@@ -1,0 +1,98 @@
+"""A rival's row, its clock, and what a series of its name is."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+import pytest
+import torch
+
+from contract.wire.errors import Cancelled, InputError, TrainingDiverged
+from tests.worker.evaluate.rivals.cases import small_clip
+from tests.worker.evaluate.rivals.test_endonerf import TINY
+from worker.evaluate import stability
+from worker.evaluate.cells import Cell, plan, preset_of
+from worker.evaluate.measure import Bench
+from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
+from worker.evaluate.rivals.endonerf import EndoNerf
+from worker.evaluate.rivals.rival import Seen
+from worker.evaluate.rivals.run import Length, train_rival
+from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
+from worker.evaluate.sources import source_of
+from worker.machine.timing import Stopwatch
+from worker.train.hooks import TrainingHooks
+from worker.train.presets import PRESETS
+
+CLIP = "phantom:pull:64x48:9frames"
+
+
+def tiny(seen: Seen, seed: int) -> EndoNerf:
+    return EndoNerf(seen, seed, TINY)
+
+
+def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why() -> None:
+    source = source_of(CLIP)
+    bench = Bench({source.name: source}, "cpu", {"endonerf": tiny})
+    row, curve = bench.measure(Cell(source.name, "endonerf", "every8", 0, iterations=2), TrainingHooks())
+    empty = {name for name in RUN_FIELDS if row.get(name) in (None, "") or row[name] != row[name]}
+    of_the_right_eye = {"psnr_right_db", "psnr_right_clear_db", "warp_db", "warp_clear_db"}
+    of_scenes = {"gaussians", "bases", "floats_a_gaussian", "stored_loss_held_out_db"}
+    motion_and_trust = {name for name in TRUTH if name.startswith(("rank_", "mo"))}
+    assert empty == {"error", *of_the_right_eye, *of_scenes, *motion_and_trust}
+    assert str(row["not_measured"]).startswith("motion: ")
+    assert row["scene_bytes"] == 4 * sum(each.numel() for each in tiny(Seen.of(small_clip(2), [1]), 0).parameters())
+    (end,) = curve
+    assert set(CURVE_FIELDS) - set(KEY) == set(end)
+    assert (end["iteration"], end["t_train_s"]) == (2, row["t_train_s"])
+    assert row["t_post_s"] == end["t_post_s"] >= row["t_train_s"]  # type: ignore[operator]
+    for name in ("psnr_tissue_db", "ssim", "depth_agreement_mm"):
+        assert end[name] == pytest.approx(row[name], abs=1e-3)
+
+
+def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
+    rival, clock = tiny(Seen.of(small_clip(2), [1]), 0), Stopwatch()
+    scored: list[int] = []
+
+    def score(made: int) -> float:
+        scored.append(made)
+        time.sleep(1.0)
+        return 20.0
+
+    reports: list[float] = []
+    hooks = TrainingHooks(on_progress=lambda now: reports.append(now.fraction))
+    made = train_rival(rival, Length(None, 1.3), clock, hooks, score)
+    assert clock.elapsed_s >= 1.3, "a second of scoring at the mark of 1 s would have ended it"
+    assert scored == sorted({*scored, made})
+    assert reports == sorted(reports)
+
+
+def test_a_rival_stops_when_it_is_asked_to_and_when_its_loss_is_no_number() -> None:
+    rival = tiny(Seen.of(small_clip(2), [1]), 0)
+    with pytest.raises(Cancelled):
+        train_rival(rival, Length(9, None), Stopwatch(), TrainingHooks(should_stop=lambda: True), lambda _: math.nan)
+    with torch.no_grad():
+        rival.parameters()[0].fill_(math.nan)
+    with pytest.raises(TrainingDiverged, match="iteration 1"):
+        train_rival(rival, Length(9, None), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+
+
+def test_a_clip_without_depth_is_refused() -> None:
+    clip = small_clip(2)
+    blind = dataclasses.replace(clip, depth_mm=0 * clip.depth_mm)
+    with pytest.raises(InputError, match="valid depth"):
+        Seen.of(blind, [1])
+
+
+def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
+    cells = plan(["clip"], ["table1"], ["every8"], [0])
+    assert [cell.series for cell in cells] == [*RIVAL_SYSTEMS, "paper", "fast"]
+    assert cells[0].budget_s == RIVAL_BUDGET_S
+    assert not set(RIVAL_SYSTEMS) & set(PRESETS)
+    for series in ("endonerf:bases=3", "endonerf:eyes=left"):
+        with pytest.raises(InputError, match="as it was published"):
+            plan(["clip"], [series], ["every8"], [0])
+    for refused in (lambda: preset_of("endonerf"), lambda: stability.plan(["smoke"], [3], ["endonerf"], [0])):
+        with pytest.raises(InputError, match="by `intrasplat evaluate` alone"):
+            refused()

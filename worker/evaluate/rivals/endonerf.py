@@ -1,0 +1,194 @@
+"""`endonerf`: a canonical radiance field and a network that displaces into it (Wang et al., MICCAI 2022; own text).
+
+Symbols: M rays, S samples a ray, H W pixels. docs/decisions/078 lists what differs from the paper, and why.
+
+A place x at time t looks up colour and density at x + G(x, t). Rays are drawn where there is tissue, more of them where
+instruments often hide it; samples of a ray lie about the measured depth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from worker.evaluate.rivals.fields import Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.rival import Rival, Seen
+from worker.input.camera import Intrinsics
+from worker.stereo.right_eye import nearest_known
+from worker.train.hooks import RenderedFrame
+
+SOLID = 1e10
+"""Length of a ray's last sample: whatever is dense there ends the ray."""
+RENDERED_RAYS = 4096
+"""At a time."""
+GUIDES = 8
+"""Training frames nearest in time whose depth guides the rays of a render."""
+
+
+@dataclass(frozen=True)
+class EndoNerfSettings:
+    """As published, where the paper says.
+
+    spread         standard deviation of the samples about the depth, in s
+    space_octaves, time_octaves, view_octaves  of the positional encodings
+    rate           of Adam; it falls exponentially to last_rate
+    depth_weight   of |depth error|, in s, beside the squared colour error
+    refined_from   progress from which the depth of the refined_share of a batch's rays that fit worst is replaced
+    """
+
+    rays: int = 2048
+    samples: int = 64
+    layers: int = 8
+    width: int = 256
+    spread: float = 0.02
+    space_octaves: int = 10
+    time_octaves: int = 10
+    view_octaves: int = 4
+    rate: float = 5e-4
+    last_rate: float = 5e-5
+    depth_weight: float = 1.0
+    refined_from: float = 0.04
+    refined_share: float = 0.01
+
+
+class EndoNerf(Rival):
+    """A training EndoNeRF."""
+
+    not_measured = "motion: it maps each moment to the canonical one, not back; confidence: it has none"
+
+    def __init__(self, seen: Seen, seed: int, settings: EndoNerfSettings | None = None) -> None:
+        self.seed, self.settings = seed, settings or EndoNerfSettings()
+        self._seen, self._box = seen, Box.of(seen)
+        hidden = (~seen.tissue).sum(0).to(seen.rgb)
+        self._importance = 1 + hidden / hidden.norm().clamp(min=1e-9)
+        self._s = self._box.s_of(seen.depth_mm.clamp(min=1e-3))
+        self._has_depth = seen.depth_mm > 0
+        self._measured = [frame for frame in range(len(seen)) if bool(seen.tissue[frame].any())]
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.field = _Field(self.settings).to(seen.rgb)
+        self.optimizer = torch.optim.Adam(self.field.parameters())
+
+    def rates(self, progress: float) -> Sequence[float]:
+        first, last = self.settings.rate, self.settings.last_rate
+        return [first * (last / first) ** progress]
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """Of rays of one frame: mean squared colour error and mean depth error where there is depth."""
+        seen, random = self._seen, self.generator(iteration)
+        frame = self._measured[int(torch.randint(len(self._measured), (), generator=random))]
+        drawn = drawn_pixels(self._importance * seen.tissue[frame], self.settings.rays, random)
+        width = seen.intrinsics.width
+        row, column = drawn // width, drawn % width
+        origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
+        known = self._has_depth[frame, row, column]
+        about, evenly = self._s[frame, row, column], torch.rand(len(row), self.settings.samples, generator=random)
+        noise = torch.randn(evenly.shape, generator=random).to(about)
+        guided = (about[:, None] + self.settings.spread * noise).clamp(0, 1)
+        s = torch.where(known[:, None], guided, evenly.to(about)).sort(-1).values
+        rgb, depth_s, _ = self._shown(origin, direction, s, float(seen.t[frame]))
+        colour = (rgb - seen.rgb[frame, row, column]).square().mean()
+        error = torch.where(known, (depth_s - about).abs(), 0.0)
+        if progress >= self.settings.refined_from:
+            self._refine(frame, row, column, depth_s.detach(), error.detach())
+        return colour + self.settings.depth_weight * error.sum() / known.sum().clamp(min=1)
+
+    @torch.no_grad()
+    def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        """As worker/evaluate/rivals/rival.py says. Samples lie about the depth of the frames nearest in time."""
+        pose = pose_tensor(world_from_camera, self._seen.rgb)
+        about = self._box.s_of(self._guide_mm(t, pose, intrinsics)).flatten()
+        quantiles = (torch.arange(self.settings.samples).to(about) + 0.5) / self.settings.samples
+        offsets = self.settings.spread * math.sqrt(2) * torch.erfinv(2 * quantiles - 1)
+
+        def show(part: slice, origin: Tensor, direction: Tensor) -> Shown:
+            return self._shown(origin, direction, (about[part, None] + offsets).clamp(0, 1), t)
+
+        return picture(self._box, intrinsics, pose, show, RENDERED_RAYS)
+
+    def _shown(self, origin: Tensor, direction: Tensor, s: Tensor, t: float) -> Shown:
+        """What is shown by rays whose samples lie at ascending s [M, S]."""
+        points_mm = origin[:, None] + self._box.depth_mm(s)[..., None] * direction[:, None]
+        view = torch.nn.functional.normalize(direction, dim=-1)[:, None].expand_as(points_mm)
+        density, rgb = self.field(self._box.place(points_mm).flatten(0, 1), t, view.flatten(0, 1))
+        length = torch.cat([s[:, 1:] - s[:, :-1], torch.full_like(s[:, :1], SOLID)], 1)
+        weight = weights_along(density.reshape(s.shape), length)
+        return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
+
+    def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
+        """Where the field contradicts the stereo depth most, the field is believed."""
+        worst = error > torch.quantile(error, 1 - self.settings.refined_share)
+        self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
+
+    def _guide_mm(self, t: float, pose: Tensor, camera: Intrinsics) -> Tensor:
+        """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's."""
+        seen, found = self._seen, np.zeros((camera.height, camera.width), np.float32)
+        camera_from_world = torch.linalg.inv(pose.double())
+        order = torch.argsort((seen.t - t).abs(), stable=True).tolist()
+        for frame in order[:GUIDES]:
+            row, column = torch.nonzero(self._has_depth[frame], as_tuple=True)
+            origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
+            depth_mm = self._box.depth_mm(self._s[frame, row, column])
+            points_mm = (origin + depth_mm[:, None] * direction).double()
+            x, y, z = (points_mm @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).cpu().numpy().T
+            ahead = z > 1.0
+            z, x, y = z[ahead], x[ahead] / z[ahead], y[ahead] / z[ahead]
+            i, j = np.floor(camera.fy * y + camera.cy).astype(int), np.floor(camera.fx * x + camera.cx).astype(int)
+            inside = (i >= 0) & (i < camera.height) & (j >= 0) & (j < camera.width)
+            nearest = np.full(found.shape, np.inf, np.float32)
+            np.minimum.at(nearest, (i[inside], j[inside]), z[inside].astype(np.float32))
+            found = np.where((found == 0) & np.isfinite(nearest), nearest, found)
+        filled = nearest_known(found, found > 0)
+        return torch.from_numpy(np.where(filled > 0, filled, self._box.far_mm)).to(seen.rgb)
+
+
+class _Trunk(nn.Module):
+    """Linear layers with ReLU; the input joins again half-way."""
+
+    def __init__(self, size: int, layers: int, width: int) -> None:
+        super().__init__()
+        self.again = layers // 2
+        ins = [size if k == 0 else width + size * (k == self.again) for k in range(layers)]
+        self.layers = nn.ModuleList([nn.Linear(each, width) for each in ins])
+
+    def forward(self, given: Tensor) -> Tensor:
+        value = given
+        for k, layer in enumerate(self.layers):
+            value = torch.relu(layer(torch.cat([value, given], 1) if k == self.again and k else value))
+        return value
+
+
+class _Field(nn.Module):
+    """Places [M, 3] at a time, seen along view [M, 3]: densities [M], colours [M, 3]."""
+
+    def __init__(self, settings: EndoNerfSettings) -> None:
+        super().__init__()
+        self.settings, width = settings, settings.width
+        space, time = 3 * (1 + 2 * settings.space_octaves), 1 + 2 * settings.time_octaves
+        self.displace = _Trunk(space + time, settings.layers, width)
+        self.displacement = nn.Linear(width, 3)
+        self.trunk = _Trunk(space, settings.layers, width)
+        self.density, self.feature = nn.Linear(width, 1), nn.Linear(width, width)
+        self.branch = nn.Linear(width + 3 * (1 + 2 * settings.view_octaves), width // 2)
+        self.colour = nn.Linear(width // 2, 3)
+
+    def forward(self, place: Tensor, t: float, view: Tensor) -> tuple[Tensor, Tensor]:
+        octaves = self.settings.space_octaves
+        if t > 0:  # the moment t = 0 is the canonical one
+            time = _encoded(torch.full_like(place[:, :1], 2 * t - 1), self.settings.time_octaves)
+            place = place + self.displacement(self.displace(torch.cat([_encoded(place, octaves), time], 1)))
+        known = self.trunk(_encoded(place, octaves))
+        branch = self.branch(torch.cat([self.feature(known), _encoded(view, self.settings.view_octaves)], 1))
+        return torch.relu(self.density(known))[:, 0], torch.sigmoid(self.colour(torch.relu(branch)))
+
+
+def _encoded(value: Tensor, octaves: int) -> Tensor:
+    """[M, D] with sines and cosines of so many octaves: [M, D (1 + 2 octaves)]."""
+    angle = torch.cat([value * (math.pi * 2**k) for k in range(octaves)], 1)
+    return torch.cat([value, torch.sin(angle), torch.cos(angle)], 1)

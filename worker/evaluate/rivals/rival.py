@@ -1,0 +1,117 @@
+"""What a rival is: a published method that learns from the left eye's training frames and renders any time and pose.
+
+Symbols: F training frames, H W pixels. Lengths in mm of the clip's world.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from contract.wire.errors import InputError
+from worker.input.camera import Intrinsics
+from worker.input.clip import DepthClip
+from worker.train.hooks import RenderedFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The training frames of the left eye as tensors on one device. A rival sees nothing else of the clip.
+
+    rgb [F, H, W, 3] in [0, 1]; tissue [F, H, W] bool; depth_mm [F, H, W], 0 where it is not known or not tissue;
+    t [F]; world_from_camera [F, 4, 4]
+    """
+
+    rgb: Tensor
+    tissue: Tensor
+    depth_mm: Tensor
+    t: Tensor
+    world_from_camera: Tensor
+    intrinsics: Intrinsics
+
+    @classmethod
+    def of(cls, clip: DepthClip, train: Sequence[int], device: str = "cpu", dtype: torch.dtype = torch.float32) -> Seen:
+        """Copies of the frames. Raises InputError if none has valid depth on tissue."""
+        frames = list(train)
+        tissue = torch.from_numpy(clip.tissue[frames])
+        depth_mm = torch.from_numpy(clip.depth_mm[frames]) * tissue
+        if not bool((depth_mm > 0).any()):
+            problem = "no training frame has a valid depth on tissue."
+            raise InputError("clip", problem, "Check the calibration and the mask polarity, or hold out fewer frames.")
+        return cls(
+            rgb=torch.from_numpy(clip.rgb[frames]).to(device, dtype) / 255,
+            tissue=tissue.to(device),
+            depth_mm=depth_mm.to(device, dtype),
+            t=torch.from_numpy(clip.t[frames]).to(device, dtype),
+            world_from_camera=torch.from_numpy(clip.world_from_camera[frames]).to(device, dtype),
+            intrinsics=clip.intrinsics,
+        )
+
+    def __len__(self) -> int:
+        return int(self.rgb.shape[0])
+
+
+class Rival(ABC):
+    """A method in training. All that is random follows from its seed and the iteration.
+
+    not_measured  which figures of a row it cannot have, and why
+    optimizer     has all that is trained; its groups' rates are set before every step
+    """
+
+    not_measured: ClassVar[str]
+    optimizer: torch.optim.Optimizer
+    seed: int
+
+    @abstractmethod
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """The loss of an iteration (from 1); progress in [0, 1) says how much of the training is done."""
+
+    @abstractmethod
+    def rates(self, progress: float) -> Sequence[float]:
+        """The learning rate of each of the optimizer's groups."""
+
+    @abstractmethod
+    def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        """The tissue at model time t from a pose (mm) with a camera. Several threads may call it."""
+
+    @property
+    def gaussians(self) -> int:
+        """How many there are; 0 where the method has none."""
+        return 0
+
+    def motion_mm(
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+    ) -> NDArray[np.float32]:
+        """[H, W, 3] world: where what each pixel shows at t = 0 has gone at t; NaN where the method does not tell."""
+        del t, world_from_camera
+        return np.full((intrinsics.height, intrinsics.width, 3), np.nan, np.float32)
+
+    def step(self, iteration: int, progress: float) -> float:
+        """One iteration; returns its loss."""
+        for group, rate in zip(self.optimizer.param_groups, self.rates(progress), strict=True):
+            group["lr"] = rate
+        self.optimizer.zero_grad(set_to_none=True)
+        loss = self.loss(iteration, progress)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return float(loss.detach())
+
+    def parameters(self) -> list[Tensor]:
+        """All that is trained."""
+        return [each for group in self.optimizer.param_groups for each in group["params"]]
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers are trained; the size of a model on disk is four bytes each."""
+        return sum(each.numel() for each in self.parameters())
+
+    def generator(self, iteration: int) -> torch.Generator:
+        """The random numbers of an iteration; 0 stands for the start. On the CPU, so that a device changes none."""
+        return torch.Generator().manual_seed(1_000_003 * self.seed + iteration)

@@ -1,0 +1,190 @@
+"""A rival is trained on a clip and judged as every model is: same frames, same clock, same scores.
+
+Rates follow the share of the budget that is used, so a longer run is a slower one. With a number of iterations nothing
+reads the clock, and the same seed gives the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from contract.wire.errors import Cancelled, TrainingDiverged
+from contract.wire.report import Report
+from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.truth import Pose, ShownView
+from worker.input.clip import DepthClip, Eye, FrameSplit
+from worker.machine.cores import cores
+from worker.machine.hooks import Progress
+from worker.machine.timing import Stopwatch
+from worker.raster.backend import Device
+from worker.report.judge import judged
+from worker.report.quality import Training, first_report
+from worker.train.hooks import RenderedFrame, TrainingHooks
+from worker.train.loop import CURVE_SECONDS, REPORT_EVERY_S
+from worker.train.run import CurvePoint
+from worker.train.scoring import FrameRenderer, score_held_out
+
+Make = Callable[[Seen, int], Rival]
+"""A rival before its first step, from what it may see and a seed."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """How long a rival trains: one of the two is given."""
+
+    iterations: int | None
+    budget_s: float | None
+
+    def progress(self, made: int, elapsed_s: float) -> float:
+        """The share that is done; 1 or more at the end."""
+        if self.iterations is not None:
+            return made / self.iterations
+        assert self.budget_s is not None
+        return elapsed_s / self.budget_s
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A trained rival, its scored report and its curve."""
+
+    rival: Rival
+    report: Report
+    curve: tuple[CurvePoint, ...]
+
+
+def train_rival(
+    rival: Rival, length: Length, clock: Stopwatch, hooks: TrainingHooks, score: Callable[[int], float]
+) -> int:
+    """Train to the end of its length; returns the iterations made.
+
+    Args:
+        clock: t_train_s so far; paused while score is called.
+        score: of the held-out frames in dB, given the iterations made; called at CURVE_SECONDS and at the end.
+
+    Raises:
+        Cancelled: hooks.should_stop said so.
+        TrainingDiverged: a loss is not finite.
+    """
+    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
+    made, reported, last_db = 0, -math.inf, math.nan
+    while (progress := length.progress(made, clock.elapsed_s)) < 1:
+        if hooks.should_stop():
+            raise Cancelled(f"Stopped after {made} iterations.")
+        made += 1
+        if not math.isfinite(rival.step(made, progress)):
+            raise TrainingDiverged(f"The loss is not finite at iteration {made}.")
+        now = clock.elapsed_s
+        if marks and now >= marks[0] and length.progress(made, now) < 1:
+            marks = [mark for mark in marks if mark > now]
+            with clock.paused():
+                last_db = score(made)
+        if now - reported >= REPORT_EVERY_S:
+            reported = now
+            known_db = None if math.isnan(last_db) else last_db
+            hooks.on_progress(Progress("train", min(progress, 1.0), made, length.iterations or 0, psnr_db=known_db))
+    with clock.paused():
+        score(made)
+    return made
+
+
+def run_rival(
+    name: str,
+    make: Make,
+    clip: DepthClip,
+    split: FrameSplit,
+    length: Length,
+    *,
+    seed: int,
+    device: Device,
+    waited_s: float,
+    hooks: TrainingHooks,
+) -> Fitted:
+    """Train a rival on the left eye of the clip's training frames, and judge it.
+
+    waited_s: from the request to the start of training. t_post_s is that and t_train_s: scoring belongs to neither.
+
+    Raises:
+        InputError: no training frame has valid depth.
+        Cancelled: hooks.should_stop said so.
+        TrainingDiverged: the loss or a render is not finite.
+    """
+    clock = Stopwatch()
+    curve: list[CurvePoint] = []
+    rival = make(Seen.of(clip, split.train, device.memory), seed)
+    start_s = clock.elapsed_s
+
+    def render_as(eye: Eye | None) -> FrameRenderer:
+        by: Eye = clip if eye is None else eye
+
+        def view(index: int) -> RenderedFrame:
+            return rival.render(float(clip.t[index]), by.world_from_camera[index], by.intrinsics)
+
+        return view
+
+    def score(made: int) -> float:
+        t_train_s = clock.elapsed_s
+        found = score_held_out(clip, split.held_out, render_as, hooks)
+        if not math.isnan(found.left_db):
+            right_db = None if math.isnan(found.right_db) else found.right_db
+            curve.append(CurvePoint(t_train_s, made, found.left_db, right_db, waited_s + t_train_s))
+        return found.left_db
+
+    made = train_rival(rival, length, clock, hooks, score)
+    t_train_s = curve[-1].t_train_s if curve else clock.elapsed_s
+    seconds = {"start_s": start_s, "optimise_s": t_train_s - start_s, "t_train_s": t_train_s}
+    seconds["t_post_s"] = waited_s + t_train_s
+    first = first_report(clip, split, _training(name, rival, made, seed, device, seconds))
+    return Fitted(rival, judged(first, clip, split.train, rival.render, hooks), tuple(curve))
+
+
+@contextmanager
+def every_core() -> Iterator[None]:
+    """Torch computes on every core within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(cores())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class RivalCandidate:
+    """A trained rival before the truth (worker/evaluate/truth.py)."""
+
+    def __init__(self, rival: Rival, clip: DepthClip) -> None:
+        self._rival, self._clip = rival, clip
+
+    def view(self, frame: int, pose: Pose) -> ShownView:
+        shown = self._rival.render(float(self._clip.t[frame]), pose, self._clip.intrinsics)
+        unknown = np.full(shown.depth_mm.shape, np.nan, np.float32)  # no rival says how far to trust it
+        return ShownView(shown.rgb, shown.depth_mm, unknown)
+
+    def motion_mm(self, frame: int) -> NDArray[np.floating]:
+        clip = self._clip
+        return self._rival.motion_mm(float(clip.t[frame]), clip.world_from_camera[0], clip.intrinsics)
+
+
+def _training(name: str, rival: Rival, made: int, seed: int, device: Device, seconds: Mapping[str, float]) -> Training:
+    return Training(
+        preset=name,
+        eyes="left",
+        seed=seed,
+        device=str(device),
+        iterations=made,
+        frames_seen=0,
+        gaussians=rival.gaussians,
+        bases=0,
+        scene_bytes=4 * rival.numbers,
+        units_per_mm=1.0,
+        seconds=dict(seconds),
+        versions={"python": platform.python_version(), "torch": version("torch")},
+    )
