@@ -1,5 +1,5 @@
-"""`intrasplat keys`: make, list and revoke the API keys of an installation, in its data directory; and tell the secret
-with which a tenant's receivers verify webhooks.
+"""`intrasplat keys`: make, rotate, list and revoke the API keys of an installation, in its data directory; and tell the
+secret with which a tenant's receivers verify webhooks.
 
 The commands edit the file that the services read (contract/access/keys.py). Run them as the user that runs the service:
 that user can read the clips anyway.
@@ -10,10 +10,11 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import time
 from datetime import UTC, datetime
 
-from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
-from contract.access.keys import DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope
+from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now, utc_text
+from contract.access.keys import DAY_S, DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope, no_such_key
 from contract.access.webhook_secrets import tenant_secret
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
@@ -21,10 +22,15 @@ from contract.runtime.settings import Settings
 from contract.wire.errors import InputError
 from contract.wire.job import TENANT_PATTERN
 
+UNITS_S = {"d": DAY_S, "h": 3600.0}
+TIME_REMEDY = "Give a time to come: 90d, 12h, or a date such as 2030-01-31 (UTC)."
+
 
 def add_keys(commands: Commands) -> None:
-    """Add `keys` with create, list and revoke."""
-    parser = commands.add_parser("keys", help="make, list and revoke API keys", description="API keys of a service.")
+    """Add `keys` with create, rotate, list and revoke."""
+    parser = commands.add_parser(
+        "keys", help="make, rotate, list and revoke API keys", description="API keys of a service."
+    )
     own: Commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     create = add_command(own, "create", "make a key and print it, this once", _create)
     create.add_argument("--tenant", required=True, help="whose jobs the key reaches: 1 to 40 of a-z, 0-9 and -")
@@ -37,23 +43,53 @@ def add_keys(commands: Commands) -> None:
     create.add_argument("--label", help="what the list shows, at most 60 characters; name no patient")
     webhooks = add_command(own, "webhook-secret", "print what a tenant verifies webhooks with", _webhook_secret)
     webhooks.add_argument("--tenant", required=True, help="whose jobs the webhooks are about")
+    rotate = add_command(own, "rotate", "make a key like another, which then ends after a while", _rotate)
+    rotate.add_argument("key_id", metavar="ID", help="as `intrasplat keys list` shows it")
+    rotate.add_argument("--overlap", default="24h", metavar="TIME", help="while both are good (default: %(default)s)")
+    for command in (create, rotate):
+        command.add_argument(
+            "--expires", metavar="WHEN", help="after this time, such as 90d or 12h, or on this date (UTC) it is refused"
+        )
     revoke = add_command(own, "revoke", "refuse a key from now on", _revoke)
     revoke.add_argument("key_id", metavar="ID", help="as `intrasplat keys list` shows it")
-    for command in (create, add_command(own, "list", "show all keys, without their secrets", _list), revoke):
+    for command in (create, rotate, add_command(own, "list", "show all keys, without their secrets", _list), revoke):
         add_data_dir(command)
 
 
 def _create(options: argparse.Namespace) -> int:
     keys = KeyFile(settings_of(options).data_dir)
-    key, text = keys.create(options.tenant, _scopes(options.scopes), options.label)
+    expires_at_s = _expires_at_s(options)
+    key, text = keys.create(options.tenant, _scopes(options.scopes), options.label, expires_at_s)
     try:
         _record(options, AuditAction.KEY_CREATED, key)
     except BaseException:
         keys.revoke(key.key_id)  # it was never shown
         raise
+    _show(key, text)
+    return ExitCode.OK
+
+
+def _rotate(options: argparse.Namespace) -> int:
+    keys, expires_at_s = KeyFile(settings_of(options).data_dir), _expires_at_s(options)
+    ends_at_s = _until("--overlap", options.overlap)
+    new, text = keys.create_successor(options.key_id, expires_at_s)
+    try:
+        _record(options, AuditAction.KEY_CREATED, new)
+        old = next(key for key in keys.list() if key.key_id == options.key_id).ending(ends_at_s)
+        outcome = f"followed by {new.key_id}, ends {utc_text(old.expires_at_s or ends_at_s)}"
+        _record(options, AuditAction.KEY_ROTATED, old, outcome)
+        keys.end(old.key_id, ends_at_s)
+    except BaseException:
+        keys.revoke(new.key_id)  # it was never shown
+        raise
+    _show(new, text)
+    print(f"the old one: {_line(old)}", file=sys.stderr)
+    return ExitCode.OK
+
+
+def _show(key: ApiKey, text: str) -> None:
     print(text)
     print(f"{_line(key)}\nKeep the key; it is not shown again.", file=sys.stderr)
-    return ExitCode.OK
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -65,7 +101,7 @@ def _list(options: argparse.Namespace) -> int:
 def _revoke(options: argparse.Namespace) -> int:
     key = KeyFile(settings_of(options).data_dir).revoke(options.key_id)
     if key is None:
-        raise InputError("ID", f"there is no key {options.key_id!r}.", "See `intrasplat keys list`.")
+        raise no_such_key(options.key_id)
     print(f"revoked {_line(key)}", file=sys.stderr)
     _record(options, AuditAction.KEY_REVOKED, key)
     return ExitCode.OK
@@ -82,8 +118,8 @@ def _webhook_secret(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def _record(options: argparse.Namespace, action: AuditAction, key: ApiKey) -> None:
-    entry = AuditEntry(time=utc_now(), action=action, tenant=key.tenant, key_id=key.key_id)
+def _record(options: argparse.Namespace, action: AuditAction, key: ApiKey, outcome: str = "ok") -> None:
+    entry = AuditEntry(time=utc_now(), action=action, outcome=outcome, tenant=key.tenant, key_id=key.key_id)
     AuditLog(settings_of(options).data_dir).append(entry)
 
 
@@ -94,6 +130,35 @@ def _scopes(text: str) -> frozenset[KeyScope]:
         raise InputError("--scopes", f"{error}.", f"Use some of {', '.join(KeyScope)}.") from error
 
 
+def _until(flag: str, text: str) -> float:
+    """The UNIX time that a length of time from now, or a date, names.
+
+    Raises:
+        InputError: it is neither, or is over.
+    """
+    now_s = time.time()
+    if length := re.fullmatch(r"(\d{1,5})([dh])", text, re.ASCII):
+        until_s = now_s + int(length[1]) * UNITS_S[length[2]]
+    else:
+        try:
+            day = datetime.fromisoformat(text)
+        except ValueError:
+            raise InputError(flag, f"{text[:40]!r} is no time.", TIME_REMEDY) from None
+        until_s = (day if day.tzinfo else day.replace(tzinfo=UTC)).timestamp()
+    if until_s <= now_s:
+        raise InputError(flag, f"{text[:40]!r} is over.", TIME_REMEDY)
+    return until_s
+
+
+def _expires_at_s(options: argparse.Namespace) -> float | None:
+    return None if options.expires is None else _until("--expires", options.expires)
+
+
 def _line(key: ApiKey) -> str:
-    created = datetime.fromtimestamp(key.created_at_s, UTC).strftime("%Y-%m-%d")
-    return f"{key.key_id}  {key.tenant}  {','.join(sorted(key.scopes))}  {created}  {key.label or ''}".rstrip()
+    created = utc_text(key.created_at_s)[: len("2026-01-31")]
+    expires = "never expires"
+    if key.expires_at_s is not None:
+        word = "expired" if key.has_expired(time.time()) else "expires"
+        expires = f"{word} {utc_text(key.expires_at_s)}"
+    scopes = ",".join(sorted(key.scopes))
+    return f"{key.key_id}  {key.tenant}  {scopes}  {created}  {expires}  {key.label or ''}".rstrip()

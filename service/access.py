@@ -7,12 +7,14 @@ elsewhere, whatever address it has. A key that is wrong is refused everywhere.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from contract.access.keys import ApiKey, KeyFile, KeyScope
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.wire.errors import ErrorCode
 from contract.wire.job import LOCAL_TENANT, JobRecord
 from service.limits import Limiter
 from service.problems import Problem
@@ -20,6 +22,7 @@ from service.problems import Problem
 ALL_SCOPES = frozenset(KeyScope)
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="intrasplat"'}
 KEY_REMEDY = "Send `Authorization: Bearer KEY`; whoever runs the service makes keys with `intrasplat keys create`."
+EXPIRED_REMEDY = "Ask whoever runs the service for a new one: `intrasplat keys rotate`, or `create`."
 WRONG_KEYS_PER_S = 0.2
 WRONG_KEYS_AT_ONCE = 10.0
 """From one address. Keys cannot be guessed; this keeps whoever tries from filling logs and audit."""
@@ -42,6 +45,7 @@ class Caller:
     scopes: frozenset[KeyScope]
     key_id: str | None
     address: str
+    expires_at_s: float | None = None
 
     def require(self, scope: KeyScope) -> None:
         """Return if the caller has the scope; Problem 403 that names it otherwise."""
@@ -68,8 +72,10 @@ class Refusal(Problem):
         address: str,
         caller: Caller | None = None,
         job_id: str | None = None,
+        code: ErrorCode | None = None,
     ) -> None:
-        super().__init__(status, detail, field=field, remedy=remedy, headers=CHALLENGE if status == 401 else None)
+        headers, extensions = CHALLENGE if status == 401 else None, {"code": code.value} if code else None
+        super().__init__(status, detail, field=field, remedy=remedy, headers=headers, extensions=extensions)
         self.address = address
         self.caller = caller
         self.job_id = job_id
@@ -88,8 +94,8 @@ class Access:
         """Whose request has these headers (names in lower case); None if it has no key and needs one.
 
         Raises:
-            Problem: 401: the key is wrong. 429: too many wrong keys came from this address. Right keys still pass, so
-                that nobody behind a common proxy can lock out the others.
+            Problem: 401: the key is wrong, or has expired. 429: too many wrong keys came from this address. Right keys
+                still pass, so that nobody behind a common proxy can lock out the others.
             UnavailableError: the file of keys is damaged.
         """
         text = _key_text(headers)
@@ -105,7 +111,11 @@ class Access:
         if key is None:
             self._wrong_keys.admit(address)
             raise Refusal(401, "This key is not known.", KEY_REMEDY, address=address)
-        return Caller(key.tenant, key.scopes, key.key_id, address)
+        caller = Caller(key.tenant, key.scopes, key.key_id, address, key.expires_at_s)
+        if key.has_expired(time.time()):
+            detail, code = "This key has expired.", ErrorCode.KEY_EXPIRED
+            raise Refusal(401, detail, EXPIRED_REMEDY, address=address, caller=caller, code=code)
+        return caller
 
     @contextmanager
     def stranger(self) -> Iterator[None]:

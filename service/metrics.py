@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import time
 from collections.abc import Iterator
 from http import HTTPStatus
@@ -13,6 +14,7 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from contract.access.keys import KeyFile, expiring_keys
 from contract.queue.interface import Queue
 from contract.runtime import traces
 from contract.runtime.version import version
@@ -43,6 +45,7 @@ class Metrics:
     def __init__(self, queue: Queue, store: Store) -> None:
         registry = self._registry = CollectorRegistry()
         registry.register(_QueueCollector(queue, store))
+        registry.register(_KeyCollector(store))
         ProcessCollector(registry=registry)
         Info("intrasplat_build", "The running version.", registry=registry).info({"version": version()})
         self.requests = Counter(
@@ -124,6 +127,19 @@ class Measure:
             self._metrics.received.labels(route).inc(received_bytes)
         if status in REASONS:
             self._metrics.rejected.labels(REASONS[status]).inc()
+
+
+class _KeyCollector(Collector):
+    """The keys whose holders will be refused soon."""
+
+    def __init__(self, store: Store) -> None:
+        self._keys = KeyFile(store.data_dir)
+
+    def collect(self) -> Iterator[Metric]:
+        """How many expire within 14 days; nothing while the file cannot be read."""
+        with contextlib.suppress(UnavailableError):
+            number = len(expiring_keys(self._keys.list(), time.time()))
+            yield GaugeMetricFamily("intrasplat_keys_expiring", "Keys that expire within 14 days.", number)
 
 
 class _QueueCollector(Collector):

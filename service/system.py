@@ -9,6 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from contract import CONTRACT_VERSION
+from contract.access.audit import utc_text
 from contract.access.keys import KeyScope
 from contract.runtime.version import version
 from contract.wire.errors import UnavailableError
@@ -101,12 +102,14 @@ class KeyView(BaseModel):
     tenant: str
     scopes: list[KeyScope]
     key_id: str | None
+    expires_at: str | None = Field(description="ISO 8601, UTC; null: it does not expire")
 
 
 @router.get("/key", operation_id="get_key")
 async def get_key(caller: AnyCaller) -> KeyView:
-    """The tenant and the scopes of the caller's key."""
-    return KeyView(tenant=caller.tenant, scopes=sorted(caller.scopes), key_id=caller.key_id)
+    """The tenant and the scopes of the caller's key, and when it expires."""
+    expires_at = None if caller.expires_at_s is None else utc_text(caller.expires_at_s)
+    return KeyView(tenant=caller.tenant, scopes=sorted(caller.scopes), key_id=caller.key_id, expires_at=expires_at)
 
 
 @router.get(

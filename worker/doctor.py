@@ -8,11 +8,13 @@ import platform
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from contract.access.keys import KeyFile, expiring_keys
 from contract.queue.embedded import find_server
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import GIB, Settings
@@ -81,6 +83,7 @@ def examine(settings: Settings) -> list[Finding]:
         lambda: _segmenter(settings),
         lambda: _queue(settings),
         lambda: _disk(settings),
+        lambda: _keys(settings),
     )
     return [finding for check in checks for finding in check()]
 
@@ -94,6 +97,17 @@ def format_findings(findings: list[Finding]) -> str:
         if finding.remedy:
             lines.append(f"{'':<8}{'':<32}-> {finding.remedy}")
     return "\n".join(lines)
+
+
+def _keys(settings: Settings) -> list[Finding]:
+    try:
+        keys = KeyFile(settings.data_dir).list()
+    except UnavailableError as error:
+        return [Finding("keys", error.problem, error.remedy, blocks=True)]
+    soon = expiring_keys(keys, time.time())
+    found = f"{len(keys)}, {len(soon)} of which expire within 14 days"
+    names = ", ".join(key.key_id for key in soon)
+    return [Finding("keys", found, f"intrasplat keys rotate: {names}" if soon else None)] if keys else []
 
 
 def _python() -> list[Finding]:

@@ -1,7 +1,7 @@
 // The service's routes that this page uses. What goes wrong is thrown as a Problem.
 
 import { askForKey, currentKey, keyHeaders } from "./key.js";
-import { connectionLost, errorWords, Problem, problemOf } from "./problem.js";
+import { connectionLost, Problem, problemOf, wrongKeyWords } from "./problem.js";
 
 /** @typedef {import("./wire.js").JobView} Job */
 /**
@@ -40,7 +40,7 @@ export async function request(path, options = {}) {
   }
   if (response.ok || response.status === NOT_MODIFIED) return response;
   const problem = await problemOf(response);
-  if (problem.status === 401 && sent === currentKey()) askForKey(sent ? errorWords("http_401", "wrong") : problem.message);
+  if (problem.status === 401 && sent === currentKey()) askForKey(sent ? wrongKeyWords(problem) : problem.message);
   throw problem;
 }
 

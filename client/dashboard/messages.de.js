@@ -86,6 +86,7 @@ export const DE = {
     "attempts_exhausted": "Die Arbeit brach mehrmals ab. Versuchen Sie es noch einmal; hilft das nicht, melden Sie es dem Betreiber.",
     "cancelled": "Es wurde abgebrochen.",
     "fault": "Im Dienst ging etwas schief. Versuchen Sie es noch einmal; hilft das nicht, melden Sie es dem Betreiber.",
+    "key_expired": "Dieser Schlüssel ist abgelaufen. Bitten Sie um einen neuen.",
     "input": "Das Gesendete kann nicht verwendet werden.",
     "input:clip": "Dieser Clip kann nicht verwendet werden.",
     "input:left": "Der Clip des linken Auges kann nicht verwendet werden.",

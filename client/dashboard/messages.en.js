@@ -86,6 +86,7 @@ export const EN = {
     "attempts_exhausted": "The work broke off several times. Try again; if it fails again, tell whoever runs the service.",
     "cancelled": "It was cancelled.",
     "fault": "Something went wrong in the service. Try again; if it fails again, tell whoever runs the service.",
+    "key_expired": "This key has expired. Ask for a new one.",
     "input": "What was sent cannot be used.",
     "input:clip": "This clip cannot be used.",
     "input:left": "The left eye's clip cannot be used.",

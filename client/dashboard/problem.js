@@ -63,6 +63,9 @@ export class Problem extends Error {
   }
 }
 
+/** @param {Problem} problem the answer 401 to a key @returns {string} what is wrong with that key */
+export const wrongKeyWords = (problem) => (problem.document.code ? problem.message : errorWords("http_401", "wrong"));
+
 /** @returns {Problem} that no answer came */
 export const connectionLost = () => new Problem(LOST);
 

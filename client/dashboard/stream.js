@@ -1,7 +1,7 @@
 // Pictures over one WebSocket: a view is asked for, its picture comes back, then the next.
 
 import { askForKey, currentKey } from "./key.js";
-import { connectionLost, errorWords, Problem } from "./problem.js";
+import { connectionLost, Problem, wrongKeyWords } from "./problem.js";
 
 /**
  * What is asked for; the query of GET /render.
@@ -83,7 +83,7 @@ export class Stream {
     if (typeof data === "string") {
       const document = JSON.parse(data);
       const problem = new Problem(document.status, document, document.retry_after_s);
-      if (problem.status === 401 && key === currentKey()) askForKey(key ? errorWords("http_401", "wrong") : problem.message);
+      if (problem.status === 401 && key === currentKey()) askForKey(key ? wrongKeyWords(problem) : problem.message);
       if (document.id === undefined || document.id === null || document.id === this.pending?.id) this.#fail(problem);
       return;
     }

@@ -52,6 +52,8 @@ class AuditAction(StrEnum):
     """A missing or wrong key, a missing scope, another tenant's job. The outcome is the HTTP status."""
     KEY_CREATED = "key-created"
     KEY_REVOKED = "key-revoked"
+    KEY_ROTATED = "key-rotated"
+    """It has a successor; the outcome says which, and when this one ends."""
     BACKED_UP = "backed-up"
     """All of it was copied."""
     RESTORED = "restored"
@@ -78,6 +80,11 @@ class AuditEntry(BaseModel):
 def utc_now() -> str:
     """The time of an entry, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def utc_text(at_s: float) -> str:
+    """A UNIX time for people and in outcomes, ISO 8601 to the second."""
+    return datetime.fromtimestamp(at_s, UTC).isoformat(timespec="seconds")
 
 
 class AuditLog:

@@ -2,7 +2,7 @@
 
 A key reads isp_<id>_<secret>. The id names it in lists, logs and the audit. The secret is 256 random bits, and the file
 holds only its SHA-256 (no salt and no slow hash, because nobody can guess 256 bits). The file is replaced whole. Every
-service reads it again when it has changed, and so refuses a revoked key at once.
+service reads it again when it has changed, and so refuses a revoked key at once. A key may expire.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import hashlib
 import hmac
 import secrets
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Literal
@@ -29,6 +29,9 @@ KEYS_FILE = "keys.json"
 KEY_PREFIX = "isp"
 SECRET_BYTES = 32
 MAX_LABEL_CHARACTERS = 60
+DAY_S = 24 * 3600.0
+WARN_BEFORE_S = 14 * DAY_S
+"""A key that expires within this time is told to whoever runs the service."""
 
 
 class KeyScope(StrEnum):
@@ -64,6 +67,16 @@ class ApiKey(BaseModel):
     secret_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     created_at_s: float
     label: str | None = Field(default=None, max_length=MAX_LABEL_CHARACTERS)
+    expires_at_s: float | None = Field(default=None, gt=0, lt=1e11, allow_inf_nan=False)
+    """From then on it is refused, UNIX time; None: never."""
+
+    def has_expired(self, now_s: float) -> bool:
+        """Whether it is refused at that UNIX time."""
+        return self.expires_at_s is not None and self.expires_at_s <= now_s
+
+    def ending(self, at_s: float) -> ApiKey:
+        """The same key, which expires at that UNIX time at the latest."""
+        return self.model_copy(update={"expires_at_s": min(at_s, self.expires_at_s or at_s)})
 
 
 class _Stored(BaseModel):
@@ -84,7 +97,11 @@ class KeyFile:
         self._by_id: dict[str, ApiKey] = {}
 
     def create(
-        self, tenant: str, scopes: Collection[KeyScope] = DEFAULT_SCOPES, label: str | None = None
+        self,
+        tenant: str,
+        scopes: Collection[KeyScope] = DEFAULT_SCOPES,
+        label: str | None = None,
+        expires_at_s: float | None = None,
     ) -> tuple[ApiKey, str]:
         """A new key and its text, which is kept nowhere.
 
@@ -101,6 +118,7 @@ class KeyFile:
                 secret_sha256=_sha256(secret),
                 created_at_s=time.time(),
                 label=label,
+                expires_at_s=expires_at_s,
             )
         except ValidationError as error:
             first = error.errors()[0]
@@ -109,6 +127,28 @@ class KeyFile:
         with self._changing() as keys:
             self._write((*keys, key))
         return key, f"{KEY_PREFIX}_{key.key_id}_{secret}"
+
+    def create_successor(self, key_id: str, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
+        """A new key with the tenant, the scopes and the label of another, and its text; the other stays as it is.
+
+        Args:
+            expires_at_s: of the new key; None: it lasts as long as the other was made to last.
+
+        Raises:
+            InputError: no key has that id.
+            UnavailableError: as create().
+        """
+        old = next((key for key in self.list() if key.key_id == key_id), None)
+        if old is None:
+            raise no_such_key(key_id)
+        if old.expires_at_s is not None:
+            expires_at_s = expires_at_s or time.time() + old.expires_at_s - old.created_at_s
+        return self.create(old.tenant, old.scopes, old.label, expires_at_s)
+
+    def end(self, key_id: str, at_s: float) -> None:
+        """Let a key expire at that UNIX time, unless it does so before. Raises UnavailableError as create()."""
+        with self._changing() as keys:
+            self._write(tuple(key.ending(at_s) if key.key_id == key_id else key for key in keys))
 
     def list(self) -> tuple[ApiKey, ...]:
         """All keys, oldest first.
@@ -132,7 +172,7 @@ class KeyFile:
         return revoked
 
     def find(self, text: str) -> ApiKey | None:
-        """The key that this text belongs to; None if there is none. Costs one stat and one hash.
+        """The key that this text belongs to, be it expired; None if there is none. Costs one stat and one hash.
 
         Raises:
             UnavailableError: the file is damaged; no key is accepted.
@@ -175,7 +215,17 @@ class KeyFile:
             yield self.list()
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
-        replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1).encode())
+        replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1, exclude_none=True).encode())
+
+
+def expiring_keys(keys: Iterable[ApiKey], now_s: float) -> list[ApiKey]:
+    """Those that expire within WARN_BEFORE_S after that UNIX time, and have not yet."""
+    return [key for key in keys if not key.has_expired(now_s) and key.has_expired(now_s + WARN_BEFORE_S)]
+
+
+def no_such_key(key_id: str) -> InputError:
+    """The error of an id that no key has."""
+    return InputError("ID", f"there is no key {key_id[:40]!r}.", "See `intrasplat keys list`.")
 
 
 def check_keys(settings: Settings) -> None:

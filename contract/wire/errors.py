@@ -26,6 +26,7 @@ class ErrorCode(StrEnum):
     CANCELLED = "cancelled"
     FAULT = "fault"
     INPUT = "input"
+    KEY_EXPIRED = "key_expired"
     LIMIT = "limit"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"

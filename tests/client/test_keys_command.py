@@ -9,7 +9,7 @@ import pytest
 
 from client.cli import main
 from contract.access.audit import AUDIT_FILE
-from contract.access.keys import KeyFile, KeyScope
+from contract.access.keys import DAY_S, KeyFile, KeyScope
 from contract.runtime.exits import ExitCode
 
 
@@ -68,3 +68,36 @@ def test_bad_arguments_are_refused_in_a_sentence(
     told = capsys.readouterr()
     assert told.out == ""
     assert told.err.startswith("intrasplat: ")
+
+
+def test_a_key_is_made_to_expire_and_rotated_and_the_list_and_the_audit_tell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--data-dir", str(tmp_path)]
+    assert main(["keys", "create", "--tenant", "ward-3", "--expires", "2090-01-31", *where]) == ExitCode.OK
+    old_text = capsys.readouterr().out.strip()
+    (old,) = KeyFile(tmp_path).list()
+    assert main(["keys", "rotate", old.key_id, "--overlap", "12h", "--expires", "90d", *where]) == ExitCode.OK
+    text = capsys.readouterr().out.strip()
+    ending, new = KeyFile(tmp_path).find(old_text), KeyFile(tmp_path).find(text)
+    assert ending is not None
+    assert new is not None
+    assert (ending.expires_at_s or 0.0) + 80 * DAY_S < (new.expires_at_s or 0.0) < (old.expires_at_s or 0.0)
+    main(["keys", "list", *where])
+    assert all("  expires 20" in line for line in capsys.readouterr().out.splitlines())
+    lines = [json.loads(line) for line in (tmp_path / AUDIT_FILE).read_text().splitlines()]
+    assert [(line["action"], line["key_id"]) for line in lines[1:]] == [
+        ("key-created", new.key_id),
+        ("key-rotated", old.key_id),
+    ]
+    assert lines[-1]["outcome"].startswith(f"followed by {new.key_id}, ends 20")
+
+
+@pytest.mark.parametrize("when", ["90", "2001-01-31", "0d", "soon", "-1d"])
+def test_a_time_that_is_over_or_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], when: str
+) -> None:
+    create = ["keys", "create", "--tenant", "ward-3", f"--expires={when}", "--data-dir", str(tmp_path)]
+    assert main(create) == ExitCode.BAD_INPUT
+    assert "--expires" in capsys.readouterr().err
+    assert KeyFile(tmp_path).list() == ()

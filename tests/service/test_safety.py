@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,10 @@ from fastapi.routing import APIRoute, APIWebSocketRoute
 from starlette.routing import BaseRoute, Route
 
 from contract.access.audit import AUDIT_FILE, RESERVE_FILE
-from contract.access.keys import KEYS_FILE, KeyFile, KeyScope
+from contract.access.keys import DAY_S, KEYS_FILE, KeyFile, KeyScope
 from contract.runtime.settings import Settings
 from contract.store.store import Store
+from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
 from contract.wire.names import MANIFEST
 from service import deps
@@ -212,6 +214,31 @@ def test_a_revoked_key_is_refused_with_the_next_request(open_service: ServiceUnd
     keys = KeyFile(open_service.store.data_dir)
     keys.revoke(keys.list()[0].key_id)
     assert_problem(holder.request("GET", "/jobs"), 401, "Authorization")
+
+
+def test_a_key_that_has_expired_is_refused_and_only_its_holder_hears_why(open_service: ServiceUnderTest) -> None:
+    holder = ward(open_service, "ward-3")
+    keys = KeyFile(open_service.store.data_dir)
+    (key,) = keys.list()
+    assert holder.request("GET", "/key").json()["expires_at"] is None
+    keys.end(key.key_id, 4e9)
+    assert holder.request("GET", "/key").json()["expires_at"] == "2096-10-02T07:06:40+00:00"
+    keys.end(key.key_id, time.time())
+    problem = assert_problem(holder.request("GET", "/jobs"), 401, "Authorization")
+    assert problem["code"] == ErrorCode.KEY_EXPIRED
+    guessed = open_service.http.get("/jobs", headers={"X-API-Key": f"isp_{key.key_id}_{'0' * 64}"})
+    assert "code" not in assert_problem(guessed, 401, "Authorization")
+    refused = [line for line in audit(open_service) if line["action"] == "refused"]
+    assert [line.get("key_id") for line in refused] == [key.key_id, None]
+
+
+def test_metrics_count_the_keys_that_expire_within_14_days(open_service: ServiceUnderTest) -> None:
+    operator = ward(open_service, "ward-3", frozenset({KeyScope.OPERATE}))
+    keys = KeyFile(open_service.store.data_dir)
+    assert "intrasplat_keys_expiring 0.0" in operator.request("GET", "/metrics").text
+    keys.create("ward-4", expires_at_s=time.time() + 13 * DAY_S)
+    keys.create("ward-5", expires_at_s=time.time() + 15 * DAY_S)
+    assert "intrasplat_keys_expiring 1.0" in operator.request("GET", "/metrics").text
 
 
 def test_a_damaged_file_of_keys_lets_nobody_in(open_service: ServiceUnderTest) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -303,12 +304,15 @@ def test_a_wrong_key_or_one_that_may_not_see_is_refused_before_the_handshake(gua
         assert refused.value.response.status_code == status
 
 
-def test_a_key_that_is_revoked_ends_its_streams(guarded: LiveService) -> None:
+@pytest.mark.parametrize("end", [KeyFile.revoke, lambda keys, key_id: keys.end(key_id, time.time())])
+def test_a_key_that_is_revoked_or_expires_ends_its_streams(
+    guarded: LiveService, end: Callable[[KeyFile, str], object]
+) -> None:
     own, text = guarded.finished_scene("ward-3"), key(guarded)
     with viewing(guarded, additional_headers=bearer(text)) as viewer:
         ask(viewer, scene=own)
         view(viewer)
-        KeyFile(guarded.store.data_dir).revoke(text.split("_")[1])
+        end(KeyFile(guarded.store.data_dir), text.split("_")[1])
         ask(viewer, scene=own)
         assert problem(viewer)["status"] == 401
         with pytest.raises(ConnectionClosed):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
-from contract.access.keys import KEYS_FILE, KeyFile, KeyScope, check_keys
+from contract.access.keys import KEYS_FILE, WARN_BEFORE_S, KeyFile, KeyScope, check_keys, expiring_keys
 from contract.runtime.settings import Settings
 from contract.wire.errors import InputError, UnavailableError
 
@@ -108,3 +109,33 @@ def test_a_service_that_others_reach_needs_a_key(tmp_path: Path) -> None:
         check_keys(abroad)
     KeyFile(tmp_path).create("ward")
     check_keys(abroad)
+
+
+def test_a_key_expires_at_its_time_and_old_files_are_read_and_new_ones_stay_readable(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    lasting, _ = keys.create("a")
+    assert "expires_at_s" not in (tmp_path / KEYS_FILE).read_text()  # which version 0.2 would refuse
+    ending, text = keys.create("b", expires_at_s=2e9)
+    assert keys.find(text) == ending
+    assert [key.has_expired(2e9 - 1) for key in (lasting, ending)] == [False, False]
+    assert [key.has_expired(2e9) for key in (lasting, ending)] == [False, True]
+    assert expiring_keys(keys.list(), 2e9 - WARN_BEFORE_S) == [ending]
+    assert expiring_keys(keys.list(), 2e9 - WARN_BEFORE_S - 1) == expiring_keys(keys.list(), 2e9) == []
+
+
+def test_a_successor_is_like_the_key_before_and_lasts_as_long_which_ends_after_the_overlap(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    old, old_text = keys.create("ward-3", {KeyScope.VIEW}, "theatre 2", time.time() + 1000.0)
+    new, text = keys.create_successor(old.key_id)
+    keys.end(old.key_id, time.time() + 10.0)
+    found = keys.find(old_text)
+    assert found is not None
+    assert found.expires_at_s is not None
+    assert old.expires_at_s is not None
+    assert found.expires_at_s < old.expires_at_s <= (new.expires_at_s or 0.0)
+    assert (new.tenant, new.scopes, new.label) == (old.tenant, old.scopes, old.label)
+    assert keys.find(text) == new
+    keys.end(old.key_id, 3e9)
+    assert keys.find(old_text) == found
+    with pytest.raises(InputError, match="no key"):
+        keys.create_successor("000000000000")
