@@ -172,7 +172,7 @@ class Connection:
             if future is None or future.done():  # its caller has given up
                 continue
             try:
-                future.set_result(Answer(WorkerReply.model_validate_json(head), body))
+                future.set_result(Answer(WorkerReply.model_validate_json(head, extra="ignore"), body))
             except ValidationError:
                 problem = "The worker's answer cannot be read."
                 future.set_exception(UnavailableError(problem, "Start service and worker from the same version."))

@@ -26,7 +26,7 @@ NAMES = (
 UNREADABLE = JobError(
     code=ErrorCode.RECORD_UNREADABLE,
     problem="The queue's record of this job cannot be read.",
-    remedy="Submit the clip again.",
+    remedy="Retry it when no worker is of an earlier version than the service; else send the clip again.",
 )
 
 

@@ -92,4 +92,5 @@ def _changed(fields: Mapping[str, str]) -> dict[str, object]:
 
 
 def _parsed(model: type[Model], document: str | None) -> Model | None:
-    return model.model_validate_json(document) if document else None
+    """What a worker reported. One of a later version may tell more than this one knows."""
+    return model.model_validate_json(document, extra="ignore") if document else None

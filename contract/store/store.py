@@ -261,7 +261,8 @@ class Store:
     def _report(self, job_id: str, attempt: int) -> Report:
         path = self.scene_folder(job_id, attempt) / REPORT
         try:
-            return Report.model_validate_json(path.read_bytes())
+            # a worker of a later version may tell more than this one knows
+            return Report.model_validate_json(path.read_bytes(), extra="ignore")
         except (OSError, ValidationError) as error:
             raise SceneError(f"The report of scene {job_id} cannot be read ({type(error).__name__}).") from error
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.wire.codes import known_code
 from contract.wire.errors import ErrorCode
 from contract.wire.labels import Labels
 from contract.wire.names import JOB_ID_PATTERN
@@ -88,7 +90,7 @@ class JobError(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    code: ErrorCode = ErrorCode.UNCLASSIFIED
+    code: Annotated[ErrorCode, known_code(ErrorCode)] = ErrorCode.UNCLASSIFIED
     problem: str
     field: str | None = None
     remedy: str | None = None

@@ -7,8 +7,11 @@ code.
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
+
+from contract.wire.codes import known_code
 
 
 class Severity(StrEnum):
@@ -112,7 +115,7 @@ class Notice(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    code: NoticeCode
+    code: Annotated[NoticeCode, known_code(NoticeCode)]
     severity: Severity
     text: str
 
