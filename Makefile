@@ -51,7 +51,7 @@ EVALUATE := $(BIN)/intrasplat evaluate
 # the folder of the recordings: d4d_endonerf/ and so on
 evaluate capacity: export INTRASPLAT_DATA ?= ../shared/data
 
-.PHONY: help setup demo test check bench gpu-check evaluate capacity chaos images-check sbom clean
+.PHONY: help setup demo test check bench gpu-check evaluate capacity chaos attacks images-check sbom clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -120,6 +120,9 @@ capacity: setup ## a grid of fixed capacities beside the automatic choice; takes
 
 chaos: setup $(DEV_STAMP) ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
 	@$(BIN)/python -m tests.chaos $(ARGS)
+
+attacks: setup $(DEV_STAMP) ## replay the attacks that once stopped everybody, and measure what another tenant feels of them
+	@$(BIN)/python -m tests.attacks $(ARGS)
 
 images-check: setup $(DEV_STAMP) ## build both images and run them, where buildah and podman are; takes minutes, needs root
 	@$(BIN)/python docker/check $(ARGS)

@@ -210,7 +210,7 @@ async def _beside_large(url: str, scene: str, other: str, worker: str) -> list[R
 
 def _without_queue(url: str, data_dir: Path, seen: str, unseen: str, seconds: float) -> list[Row]:
     """Views while the queue's server is stopped: it takes connections and answers nothing."""
-    server = _process(lambda command, _: str(data_dir / "valkey").encode() in command)
+    server = process(lambda command, _: str(data_dir / "valkey").encode() in command)
     spent_ms: list[float] = []
     os.kill(server, signal.SIGSTOP)
     try:
@@ -234,7 +234,7 @@ def _watched(url: str, job_id: str, seconds: float) -> list[Row]:
     """Viewers of a job that trains, and how fast it trains with them and between."""
     rows: list[Row] = []
     parts = (
-        _process(lambda command, _: command.endswith(b"\0-m\0worker\0device\0")),
+        process(lambda command, _: command.endswith(b"\0-m\0worker\0device\0")),
         _service_process(url),
         os.getpid(),
     )
@@ -344,14 +344,14 @@ def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
 def _service_process(url: str) -> int:
     """The process id of the service at this address, told by its environment (Linux)."""
     sign = f"INTRASPLAT_PORT={httpx.URL(url).port}\0".encode()
-    return _process(lambda command, entry: command.endswith(b"\0-m\0service\0") and sign in _environment(entry))
+    return process(lambda command, entry: command.endswith(b"\0-m\0service\0") and sign in _environment(entry))
 
 
 def _environment(entry: Path) -> bytes:
     return (entry / "environ").read_bytes()
 
 
-def _process(is_it: Callable[[bytes, Path], bool]) -> int:
+def process(is_it: Callable[[bytes, Path], bool]) -> int:
     """The id of the process whose command line and entry in /proc are those (Linux)."""
     for entry in Path("/proc").iterdir():
         with suppress(OSError):  # it has just ended, or is another user's

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,15 @@ from client.demo import started_service
 from intrasplat_client import Client, JobRejected, RequestRefused
 from tests.service.under_test import ServiceUnderTest, assert_problem
 from tests.worker.input.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
+
+JSON = {"Content-Type": "application/json"}
+FOREIGN = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}
+
+
+def sent(options: str) -> dict[str, Any]:
+    """A good clip with these options."""
+    return {"files": {"clip": (VIDEO.name, VIDEO.read_bytes())}, "data": {"options": options}}
+
 
 PLAIN = [name for name, hostile in CORPUS.items() if hostile.refused_at == "upload"]
 DECODED = [name for name, hostile in CORPUS.items() if hostile.refused_at == "decoding"]
@@ -43,6 +53,47 @@ def test_what_only_decoding_shows_fails_its_job_and_the_worker_takes_the_next(tm
         assert [job.attempt for job in jobs] == [1] * len(DECODED)  # no job took the worker with it
         assert client.is_ready()
     assert list((tmp_path / "data" / "scenes").iterdir()) == []
+
+
+DEEP, BUDGET = "[" * 99_999, "options.budget_s"
+REQUESTS: dict[str, tuple[str, str, dict[str, Any], int, str | None]] = {
+    "deep options": ("POST", "/reconstruct", sent(options=f'{{"preset": {DEEP}'), 413, "options"),
+    "options nested as deep as they are long": ("POST", "/reconstruct", sent(options="[" * 9_000), 422, "options"),
+    "a deep body": ("POST", "/reconstruct", {"content": f'{{"clip": {DEEP}', "headers": JSON}, 400, "body"),
+    "a body of deep objects": (
+        "POST",
+        "/reconstruct",
+        {"content": '{"options":' * 9_999, "headers": JSON},
+        400,
+        "body",
+    ),
+    "a budget that is no number": ("POST", "/reconstruct", sent(options='{"budget_s": NaN}'), 422, BUDGET),
+    "a budget beyond all numbers": (
+        "POST",
+        "/reconstruct",
+        sent(options='{"budget_s": 1e999}'),
+        422,
+        "options.budget_s",
+    ),
+    "a budget below nothing": ("POST", "/reconstruct", sent(options='{"budget_s": -1}'), 422, BUDGET),
+    "two eyes without a calibration": ("POST", "/reconstruct", sent(options='{"layout": "sbs"}'), 422, "calibration"),
+    "a layer by a wrong name": ("GET", "/render?scene=x&layers=depth", {}, 422, "layers"),
+    "a state by a wrong name": ("GET", "/jobs?stat=failed", {}, 422, "stat"),
+    "a time that is no number": ("GET", "/render?t=nan", {}, 422, "t"),
+    "a lens beyond all numbers": ("GET", "/render?fx=inf", {}, 422, "fx"),
+    "pixels beyond all screens": ("GET", "/render?width=1000000", {}, 422, "width"),
+    "an image of a foreign page": ("GET", "/render", {"headers": FOREIGN}, 403, "Sec-Fetch-Site"),
+}
+"""What was found to do harm, or to be passed over: method, address, arguments, status, field."""
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_a_hostile_request_is_refused_by_its_field_and_leaves_nothing(service: ServiceUnderTest, name: str) -> None:
+    method, address, arguments, status, field = REQUESTS[name]
+    problem = assert_problem(service.http.request(method, address, **arguments), status, field)
+    assert problem["remedy"]
+    assert service.spooled() == []
+    assert service.queue.records() == []
 
 
 def rejection(client: Client, hostile: Hostile, folder: Path) -> JobRejected:

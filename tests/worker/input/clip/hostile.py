@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+import json
 import stat
 import struct
 import zipfile
@@ -60,6 +61,12 @@ class Hostile:
 
 def fixed(content: bytes) -> Callable[[Path], bytes]:
     return lambda folder: content
+
+
+def calibration(**changes: str) -> bytes:
+    """The good calibration with other values, as they are to stand in the file."""
+    values = {name: json.dumps(value) for name, value in json.loads(CALIBRATION).items()} | changes
+    return ("{" + ", ".join(f'"{name}": {value}' for name, value in values.items()) + "}").encode()
 
 
 def png(width: int, height: int) -> bytes:
@@ -223,6 +230,37 @@ CORPUS: dict[str, Hostile] = {
     ),
     "bytes": Hostile("calibration.yaml", fixed(bytes(range(256)) * 9), "not a text", part="calibration"),
     "deep": Hostile("calibration.json", fixed(b'{"a":' + b"[" * 99_999), "nested 100000 levels", part="calibration"),
+    "deep YAML": Hostile(
+        "calibration.yaml",
+        fixed(b"%YAML:1.0\n---\nM1: " + b"{a: " * 99_999),
+        "nested 100000 levels",
+        part="calibration",
+    ),
+    "not a number": Hostile("calibration.json", fixed(calibration(fx_px="NaN")), "finite number", part="calibration"),
+    "beyond all numbers": Hostile(
+        "calibration.json", fixed(calibration(baseline_mm="1e999")), "finite number", part="calibration"
+    ),
+    "in metres": Hostile(
+        "calibration.json", fixed(calibration(baseline_mm="0.004")), "probably in metres", part="calibration"
+    ),
+    "no width": Hostile("calibration.json", fixed(calibration(width="0")), "width", part="calibration"),
+    "ten times the size": Hostile(
+        "calibration.json",
+        fixed(calibration(width="960", height="800")),
+        "more than 8 times apart",
+        "decoding",
+        "calibration",
+    ),
+    "a million times the size": Hostile(
+        "calibration.json",
+        fixed(calibration(width="96000000", height="80000000")),
+        "more than 8 times apart",
+        "decoding",
+        "calibration",
+    ),
+    "of a cropped picture": Hostile(
+        "calibration.json", fixed(calibration(width="120")), "not one uniform scale", "decoding", "calibration"
+    ),
     "broken JSON": Hostile("calibration.json", fixed(CALIBRATION[:-9]), "not valid JSON", part="calibration"),
     "no camera": Hostile(
         "calibration.yaml", fixed(b"%YAML:1.0\n---\nK: 1\n"), "found no M1, M2, R, T", part="calibration"
