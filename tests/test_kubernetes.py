@@ -18,6 +18,7 @@ from contract.queue.interface import Claim
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import ENVIRONMENT_PREFIX, OTHER_VARIABLES, Settings
 from contract.store.shelf import new_job_id
+from contract.wire.errors import InputError
 from contract.wire.job import JobFiles, JobRecord, JobState
 from contract.wire.options import JobOptions, Priority
 from tests.contract.conftest import emptied, valkey_url
@@ -163,7 +164,7 @@ def test_every_variable_that_is_set_is_a_setting() -> None:
 
 
 def test_what_the_cluster_would_set_of_its_own_is_kept_away() -> None:
-    with pytest.raises(Exception, match="INTRASPLAT_PORT"):  # what a Service named `intrasplat` gives its pods
+    with pytest.raises(InputError, match="INTRASPLAT_PORT"):  # what a Service named `intrasplat` gives its pods
         Settings.from_environment({"INTRASPLAT_PORT": "tcp://10.0.0.7:8765"})
     assert all(pod_of(each)["enableServiceLinks"] is False for each in WORKLOADS.values())
 

@@ -24,10 +24,12 @@ from composition import DOCKER, PROJECT, Composition, podman
 from PIL import Image as Picture
 from PIL import ImageStat
 from proxies import Site, protocol, proxy, site_in
+from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from intrasplat_client import Client, JobState, JobView
+from intrasplat_client.errors import IntrasplatError
 
 NEEDED = ("buildah", "podman", "openssl")
 PROXIES = ("nginx", "caddy")
@@ -42,6 +44,8 @@ LONG_ITERATIONS = 5000
 STEPS_BEFORE = 100
 """It is interrupted only then, so that training which begins again would be seen."""
 PATIENCE_S = 300.0
+FAULTS = (RuntimeError, OSError, subprocess.SubprocessError, IntrasplatError, WebSocketException)
+"""Of programs, the service and its connections: they end the check, and are told in its table."""
 
 
 class Table:
@@ -49,11 +53,19 @@ class Table:
 
     def __init__(self) -> None:
         self.is_sound = True
+        self.not_tried: list[str] = []
 
     def row(self, topic: str, found: str, is_right: bool = True) -> None:
         """Print what was found, and remember if it is not as it should be."""
         self.is_sound &= is_right
         print(f"{'ok' if is_right else 'WRONG':<6} {topic:<38} {found}", flush=True)
+
+    def end(self) -> int:
+        """Print what came of it; the exit status."""
+        verdict = "all that was tried is as it should be" if self.is_sound else "see the lines marked WRONG"
+        left_out = f"; not here, so not tried: {', '.join(self.not_tried)}" if self.not_tried else ""
+        print(f"images-check: {verdict}{left_out}")
+        return 0 if self.is_sound else 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,15 +79,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"images-check: NOTHING WAS CHECKED, for this machine has no {', '.join(missing)}")
         return 0
     table = Table()
-    with tempfile.TemporaryDirectory(prefix=f"{PROJECT}-") as folder:
-        site = site_in(Path(folder))
-        os.environ["SSL_CERT_FILE"] = str(site.folder / "cert.pem")  # for the clients of this process
-        with Composition(site.name) as composition:
-            for name in BUILT:
-                build(table, name, composition.services[name]["image"], arguments)
-            run(table, composition, site)
-    print("images-check: all is as it should be" if table.is_sound else "images-check: see the lines marked WRONG")
-    return 0 if table.is_sound else 1
+    try:
+        with tempfile.TemporaryDirectory(prefix=f"{PROJECT}-") as folder:
+            site = site_in(Path(folder))
+            os.environ["SSL_CERT_FILE"] = str(site.folder / "cert.pem")  # for the clients of this process
+            with Composition(site.name) as composition:
+                for name in BUILT:
+                    build(table, name, composition.services[name]["image"], arguments)
+                run(table, composition, site)
+    except FAULTS as error:
+        table.row("the check ended here", str(error), is_right=False)
+    return table.end()
 
 
 def build(table: Table, name: str, image: str, arguments: argparse.Namespace) -> None:
@@ -112,7 +126,7 @@ def run(table: Table, composition: Composition, site: Site) -> None:
     table.row("worker: `intrasplat phantom`", "made a clip")
     for program in PROXIES:
         if shutil.which(program) is None:
-            table.row(f"{program}: not tried", "it is not installed")
+            table.not_tried.append(program)
             continue
         with proxy(program, site):
             journey(table, composition, site, program, key, clip / "made")
