@@ -26,6 +26,7 @@ axe.run(document, { resultTypes: ["violations"] })
   .then(({ violations }) => done(violations.map(told)), (error) => done([String(error)]));
 """
 MIN_TOUCH_PX = 44
+MIN_LETTER_PX = 12
 MIN_BORDER = 3.0
 
 
@@ -80,6 +81,10 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
         page.script("document.querySelector('#loop-start').click()")
         found["scene"] = violations(page, axe)
         page.until_text("#report", "dB")
+        page.script("for (const id of ['more', 'way']) document.getElementById(id).open = true")
+        page.until(lambda: page.text("#way .panel"))
+        found["way"] = violations(page, axe)
+        page.script("for (const id of ['more', 'way']) document.getElementById(id).open = false")
         for mode in ("wipe", "side", "off"):
             choose(page, mode)
             found[mode] = violations(page, axe)
@@ -96,6 +101,10 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
         page.until(lambda: page.find("#measuring").is_displayed())
         found["measuring"] = violations(page, axe)
         page.click("#measuring .end")
+        page.press(scene, say("job.save", language))
+        page.until(lambda: page.find("#download .kinds button").is_displayed())
+        found["download"] = violations(page, axe)
+        page.click("#download header button")
         page.press(scene, say("job.delete", language))
         page.until(lambda: page.find("#confirm").is_displayed())
         found["question"] = violations(page, axe)
@@ -109,7 +118,13 @@ const seen = { opacityProperty: true, visibilityProperty: true };
 const isShown = (each) => each.checkVisibility(seen) && !each.closest("dialog");
 const shown = [...document.querySelectorAll(all)].filter(isShown);
 const target = (each) => (each.type === "checkbox" ? each.closest("label") : each);
-const box = (each) => target(each).getBoundingClientRect();
+const clip = (each, { left, top, right, bottom }) => {
+  const panel = each.closest(".moving")?.getBoundingClientRect(); // on a phone it scrolls
+  if (!panel) return { left, top, right, bottom };
+  return { left, top: Math.max(top, panel.top), right, bottom: Math.min(bottom, panel.bottom) };
+};
+const full = (each) => target(each).getBoundingClientRect();
+const box = (each) => clip(each, full(each));
 const name = (each) => each.id || each.textContent.trim() || each.name;
 const common = (from, to, a, b) => Math.min(a[to], b[to]) - Math.max(a[from], b[from]);
 const over = [];
@@ -120,9 +135,15 @@ for (const [i, first] of shown.entries()) for (const second of shown.slice(i + 1
 }
 const isOff = ({ left, right, bottom }) => left < 0 || right > innerWidth + 1 || bottom > innerHeight + 1;
 const isSmall = ({ width, height }) => Math.min(width, height) < arguments[0];
+const isFaint = (each) => parseFloat(getComputedStyle(each).fontSize) < arguments[1];
 const used = shown.filter((each) => each.matches("button, select, input, summary"));
-const named = (some, is) => some.filter((each) => is(box(each))).map(name);
-return { over, off: named(shown, isOff), small: named(used, isSmall) };
+const named = (some, is) => some.filter(is).map(name);
+return {
+  over,
+  off: named(shown, (each) => isOff(box(each))),
+  small: named(used, (each) => isSmall(full(each))),
+  faint: named(shown, isFaint),
+};
 """
 
 
@@ -144,7 +165,7 @@ def test_nothing_overlaps_or_lies_off_the_screen_and_all_can_be_touched(
         page.until(lambda: page.find("#loop-all").is_displayed())
         for is_open in (True, False):  # wide screens show all in either case
             page.script("document.querySelector('#more').open = arguments[0]", is_open)
-            assert page.script(LAYOUT, MIN_TOUCH_PX) == {"over": [], "off": [], "small": []}
+            assert page.script(LAYOUT, MIN_TOUCH_PX, MIN_LETTER_PX) == {"over": [], "off": [], "small": [], "faint": []}
         letters = float(page.script("return parseFloat(getComputedStyle(document.querySelector('#badge')).fontSize)"))
         assert letters >= (48 if height == 1080 else 20)
     page.script("localStorage.clear()")

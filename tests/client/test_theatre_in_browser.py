@@ -118,6 +118,21 @@ def test_held_upright_the_picture_keeps_its_share_and_the_status_its_words(
     page.script("localStorage.clear()")
 
 
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (360, 640), (844, 390)])
+def test_on_a_phone_the_picture_keeps_its_share_while_more_is_open_and_the_rest_is_scrolled_to(
+    site: Site, page: Page, width: int, height: int
+) -> None:
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        page.until_text("#time-value", "40")
+        page.find("#more summary").click()
+        assert box_of(page, "#controls")[1] - box_of(page, "#theatre")[1] > 0.4 * height
+        for css in ("#speed", "#way summary"):
+            page.script("document.querySelector(arguments[0]).scrollIntoView()", css)
+            assert is_on_screen(page, css)
+
+
 def test_on_a_phone_an_open_drawer_has_the_screen_also_below_a_message(site: Site, page: Page, tmp_path: Path) -> None:
     broken = tmp_path / "cut short.mp4"
     broken.write_bytes(b"\0\0\0\x18ftypisom" + bytes(64))
