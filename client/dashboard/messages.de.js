@@ -569,7 +569,7 @@ export const DE = {
     "guesses": "Vermutetes zeigen",
     "guesses_why": "Was kein Bild des Clips sah, ist schraffiert, außer Sie wollen sehen, was das Modell dort vermutet.",
     "highlights": "Glanz zeigen",
-    "highlights_why": "Die zwei Augen eines Stereoclips unterscheiden Glanz und Gewebe; Farben gibt es auch ohne Glanz.",
+    "highlights_why": "Farben gibt es auch ohne den Glanz, den die zwei Augen eines Stereoclips an verschiedenen Stellen sahen; was beide an derselben Stelle sahen, bleibt.",
     "stage": "Das Gewebe. Das Fragezeichen zeigt alle Tasten.",
     "eye": "Auge des Endoskops",
     "left_eye": "linkes Auge",

@@ -569,7 +569,7 @@ export const EN = {
     "guesses": "Show guesses",
     "guesses_why": "What no frame of the clip saw is hatched, unless you want to see what the model guesses there.",
     "highlights": "Show highlights",
-    "highlights_why": "The two eyes of a stereo clip tell highlights from tissue; colours can be shown without them.",
+    "highlights_why": "Colours can be shown without the highlights that the two eyes of a stereo clip saw in different places; what both saw in one place stays.",
     "stage": "The tissue. Question mark lists all keys.",
     "eye": "Eye of the endoscope",
     "left_eye": "left eye",
