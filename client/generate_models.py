@@ -19,9 +19,10 @@ from contract.wire.job import TERMINAL_STATES, JobView
 from contract.wire.measuring import Measurement
 from contract.wire.options import JobOptions
 from contract.wire.report import Report
+from contract.wire.webhooks import Delivery
 
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
-READ = (JobView, Report, SceneCameras, Measurement)
+READ = (JobView, Delivery, Report, SceneCameras, Measurement)
 """What the service answers with; types that these contain follow."""
 CLOSED = ("JobState",)
 """Enumerations whose every member a reader must know. Of others, a member that a later version adds is read as text."""

@@ -19,6 +19,7 @@ from contract.wire.job import JobProgress
 from contract.wire.labels import NO_NAMES
 from contract.wire.names import MANIFEST
 from contract.wire.options import JobOptions
+from contract.wire.webhooks import CALLBACK_ABOUT
 from intrasplat_client import Client, Conflict, JobState, JobView
 from intrasplat_client.connection import DEFAULT_URL
 
@@ -73,6 +74,7 @@ def _add_submit(commands: Commands) -> None:
     add_options(parser, JobOptions)
     parser.add_argument("--label", metavar="TEXT", help=f"a text to find the job by. {NO_NAMES}")
     _add_metadata(parser, f"a text to find the job by; may come several times. {NO_NAMES}")
+    parser.add_argument("--callback-url", metavar="URL", help=CALLBACK_ABOUT)
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same clip is the same job")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
     add_service(parser)
@@ -110,6 +112,7 @@ def _add_import(commands: Commands) -> None:
     parser.add_argument("--retention-hours", type=finite, metavar="H", help="purge the scene so many hours later")
     parser.add_argument("--label", metavar="TEXT", help=f"a text to find the scene by. {NO_NAMES}")
     _add_metadata(parser, f"a text to find the scene by; may come several times. {NO_NAMES}")
+    parser.add_argument("--callback-url", metavar="URL", help=CALLBACK_ABOUT)
     parser.add_argument("--idempotency-key", metavar="TEXT", help="the same key with the same file is the same scene")
     parser.add_argument("--watch", action="store_true", help="wait for the scene, with a progress bar")
     add_service(parser)
@@ -163,6 +166,7 @@ def _submit(options: argparse.Namespace) -> int:
                 masks=options.masks,
                 label=options.label,
                 metadata=dict(options.metadata or ()),
+                callback_url=options.callback_url,
                 idempotency_key=options.idempotency_key,
                 on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),
                 **chosen,
@@ -178,6 +182,7 @@ def _import(options: argparse.Namespace) -> int:
                 options.file,
                 label=options.label,
                 metadata=dict(options.metadata or ()),
+                callback_url=options.callback_url,
                 retention_hours=options.retention_hours,
                 idempotency_key=options.idempotency_key,
                 on_upload=lambda sent, total: bar.show(JobProgress(stage="upload", fraction=sent / total)),

@@ -12,7 +12,7 @@ from typing_extensions import Unpack
 
 from intrasplat_client.connection import DEFAULT_URL, BlockingConnection, http_settings, iterate, run
 from intrasplat_client.core import SCORES_WITHIN_S, Core
-from intrasplat_client.models import GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
+from intrasplat_client.models import Delivery, GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
 from intrasplat_client.session import DEFAULT_PATIENCE_S, OnWait
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.viewer import StreamMessages, Viewer
@@ -56,6 +56,7 @@ class Client:
         masks: Path | None = None,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
+        callback_url: str | None = None,
         idempotency_key: str | None = None,
         in_pieces: bool | None = None,
         on_upload: OnUpload | None = None,
@@ -69,6 +70,7 @@ class Client:
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
         `label` and `metadata` are texts to find the job by; write no names of persons into them.
+        `callback_url` is where the service sends a webhook when the job has ended; its host must be allowed there.
         `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
 
         Raises:
@@ -84,6 +86,7 @@ class Client:
                 masks=masks,
                 label=label,
                 metadata=metadata,
+                callback_url=callback_url,
                 idempotency_key=idempotency_key,
                 in_pieces=in_pieces,
                 on_upload=on_upload,
@@ -97,6 +100,7 @@ class Client:
         *,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
+        callback_url: str | None = None,
         retention_hours: float | None = None,
         idempotency_key: str | None = None,
         on_upload: OnUpload | None = None,
@@ -104,7 +108,7 @@ class Client:
         """Import a scene that another installation exported with format="scene", and get its queued job.
 
         The job is done when a worker has read the scene; its id is the scene's here. The same idempotency_key with the
-        same file always yields the same job. label, metadata, on_upload: as reconstruct has them.
+        same file always yields the same job. label, metadata, callback_url, on_upload: as reconstruct has them.
 
         Raises:
             InputError: the file cannot be read; nothing was sent.
@@ -114,6 +118,7 @@ class Client:
                 path,
                 label=label,
                 metadata=metadata,
+                callback_url=callback_url,
                 retention_hours=retention_hours,
                 idempotency_key=idempotency_key,
                 on_upload=on_upload,
@@ -155,6 +160,10 @@ class Client:
     def label(self, job_id: str, label: str | None = None, metadata: Mapping[str, str] | None = None) -> JobView:
         """Change a job's label, or its metadata as a whole; "" and {} remove them, what is not given stays."""
         return run(self._core.label(job_id, label, metadata))
+
+    def deliveries(self, job_id: str) -> list[Delivery]:
+        """The webhooks about the ends of a job that has a callback_url, with every try to deliver them."""
+        return run(self._core.deliveries(job_id))
 
     def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""

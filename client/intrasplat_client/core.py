@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import httpx
+from pydantic import TypeAdapter
 from typing_extensions import Unpack
 
 from intrasplat_client import events, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
-from intrasplat_client.models import GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
+from intrasplat_client.models import Delivery, GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
 from intrasplat_client.session import OnWait, Session, parsed
 from intrasplat_client.submission import OnUpload
 from intrasplat_client.views import Image, view_query
@@ -48,6 +49,7 @@ class Core:
         masks: Path | None = None,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
+        callback_url: str | None = None,
         idempotency_key: str | None = None,
         in_pieces: bool | None = None,
         on_upload: OnUpload | None = None,
@@ -61,6 +63,7 @@ class Core:
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
         `label` and `metadata` are texts to find the job by; write no names of persons into them.
+        `callback_url` is where the service sends a webhook when the job has ended; its host must be allowed there.
         `options` say how to reconstruct: preset, budget_s or iterations, holdout and others (GivenOptions).
 
         Raises:
@@ -71,7 +74,7 @@ class Core:
         prepared = submission.prepare(
             clip,
             right,
-            clip_of,
+            submission.texts_of(clip_of=clip_of, callback_url=callback_url),
             others,
             options,
             submission.labels_of(label, metadata),
@@ -87,6 +90,7 @@ class Core:
         *,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
+        callback_url: str | None = None,
         retention_hours: float | None = None,
         idempotency_key: str | None = None,
         on_upload: OnUpload | None = None,
@@ -94,7 +98,7 @@ class Core:
         """Import a scene that another installation exported with format="scene", and get its queued job.
 
         The job is done when a worker has read the scene; its id is the scene's here. The same idempotency_key with the
-        same file always yields the same job. label, metadata, on_upload: as reconstruct has them.
+        same file always yields the same job. label, metadata, callback_url, on_upload: as reconstruct has them.
 
         Raises:
             InputError: the file cannot be read; nothing was sent.
@@ -102,6 +106,7 @@ class Core:
         prepared = submission.prepare_scene(
             Path(path),
             retention_hours,
+            submission.texts_of(callback_url=callback_url),
             submission.labels_of(label, metadata),
             idempotency_key=idempotency_key,
             on_upload=on_upload,
@@ -137,6 +142,11 @@ class Core:
         """Change a job's label, or its metadata as a whole; "" and {} remove them, what is not given stays."""
         change = submission.labels_of(label, metadata)
         return await self._job(Call("PATCH", _path("jobs", job_id), json=change, is_repeatable=True))
+
+    async def deliveries(self, job_id: str) -> list[Delivery]:
+        """The webhooks about the ends of a job that has a callback_url, with every try to deliver them."""
+        response = await self._session.request(Call("GET", _path("jobs", job_id, "deliveries"), is_repeatable=True))
+        return parsed(response, TypeAdapter(list[Delivery]).validate_json, response.content)
 
     async def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""

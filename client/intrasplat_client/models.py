@@ -16,6 +16,14 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow")
 
 
+class DeliveryStatus(StrEnum):
+    """Where the delivery of a webhook stands."""
+
+    OWED = "owed"
+    DELIVERED = "delivered"
+    FAILED = "failed"
+
+
 class ErrorCode(StrEnum):
     """The kind of an error, for programs; docs/codes.md explains each."""
 
@@ -145,6 +153,17 @@ class Severity(StrEnum):
     WARNING = "warning"
 
 
+class TryFailure(StrEnum):
+    """Why one try to deliver a webhook failed; docs/codes.md explains each."""
+
+    ADDRESS_REFUSED = "address_refused"
+    CERTIFICATE = "certificate"
+    HOST_REFUSED = "host_refused"
+    STATUS = "status"
+    TIMEOUT = "timeout"
+    UNREACHABLE = "unreachable"
+
+
 class CameraPoses(Model):
     """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of
     the common motion follows the course of the tissue's own deformation was taken to be the tissue's.
@@ -183,6 +202,34 @@ class ClipCamera(Model):
     fy: float
     cx: float
     cy: float
+
+
+class Delivery(Model):
+    """A webhook about one end of a job, and all tries to deliver it so far."""
+
+    event_id: str
+    """the header webhook-id, the same at every try"""
+    state: JobState
+    """the state in which the job ended"""
+    error_code: str | None = None
+    """the code of a failed job's error"""
+    ended_at_s: float
+    """when the job ended, UNIX s"""
+    status: Annotated[DeliveryStatus | str, Field(union_mode="left_to_right")] = DeliveryStatus.OWED
+    tries: tuple[DeliveryTry, ...] = ()
+    next_try_at_s: float | None = None
+    """when it is tried next, UNIX s; None: never again"""
+
+
+class DeliveryTry(Model):
+    """One try to deliver a webhook."""
+
+    at_s: float
+    """when it began, UNIX s"""
+    status_code: int | None = None
+    """the receiver's answer; None if there was none"""
+    failure: Annotated[TryFailure | str, Field(union_mode="left_to_right")] | None = None
+    """why it failed; None: the webhook was delivered"""
 
 
 class FrameScore(Model):

@@ -43,7 +43,8 @@ OnUpload = Callable[[int, int], object]
 class Submission:
     """A clip that is ready to go: files and their sizes by part, options and labels as JSON can have them.
 
-    texts: what is sent as it is: the id of the job whose clip is used again, if there is no file of one.
+    texts: what is sent as it is: the id of the job whose clip is used again, if there is no file of one, and where a
+    webhook goes.
     """
 
     paths: dict[str, Path]
@@ -70,7 +71,7 @@ class Submission:
 def prepare(
     clip: Path | None,
     right: Path | None,
-    clip_of: str | None,
+    texts: dict[str, str],
     others: Mapping[str, Path | None],
     options: Mapping[str, Any],
     labels: dict[str, Any],
@@ -84,7 +85,7 @@ def prepare(
     Raises:
         InputError: a file cannot be read or is empty, there is not one clip, or an option cannot be used.
     """
-    document = checked_options(options)
+    document, clip_of = checked_options(options), texts.get("clip_of")
     if clip_of is None and clip is None:
         raise InputError("clip", "there is no clip.", "Give its file, or clip_of, the job whose clip is used again.")
     if clip_of is not None and (clip is not None or right is not None):
@@ -94,13 +95,13 @@ def prepare(
     sizes = {part: _size_of(part, path) for part, path in paths.items()}
     if in_pieces is None:
         in_pieces = sum(sizes.values()) >= IN_PIECES_FROM_BYTES
-    texts = {} if clip_of is None else {"clip_of": clip_of}
     return Submission(paths, sizes, texts, document, labels, idempotency_key or str(uuid.uuid4()), in_pieces, on_upload)
 
 
 def prepare_scene(
     path: Path,
     retention_hours: float | None,
+    texts: dict[str, str],
     labels: dict[str, Any],
     *,
     idempotency_key: str | None,
@@ -113,7 +114,12 @@ def prepare_scene(
     """
     document = checked_options({} if retention_hours is None else {"retention_hours": retention_hours})
     sizes, key = {"scene": _size_of("scene", path)}, idempotency_key or str(uuid.uuid4())
-    return Submission({"scene": path}, sizes, {}, document, labels, key, False, on_upload, "/scenes")
+    return Submission({"scene": path}, sizes, texts, document, labels, key, False, on_upload, "/scenes")
+
+
+def texts_of(**given: str | None) -> dict[str, str]:
+    """What is given of clip_of and callback_url, which are sent as they are."""
+    return {name: text for name, text in given.items() if text is not None}
 
 
 def labels_of(label: str | None, metadata: Mapping[str, str] | None) -> dict[str, Any]:

@@ -16,6 +16,10 @@ LOAN_S = 30.0
 """Longer than a try takes (service/webhooks.py)."""
 
 
+OWED_FOR_S = 26 * 3600.0
+"""The webhook of a job that ended longer ago was delivered or given up, also by a queue that was lost since."""
+
+
 @dataclass(frozen=True)
 class Loan:
     """A delivery that a service is to try now; `mark` tells this loan from earlier and later ones."""

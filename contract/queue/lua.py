@@ -11,6 +11,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
+from contract.queue.deliveries import OWED_FOR_S
 from contract.queue.interface import MAX_ATTEMPTS, MAX_DURATIONS, MAX_EVENTS, YIELD_S, worker_died
 from contract.queue.redis_client import reachable
 from contract.queue.redis_hash import EVENT_FIELDS
@@ -69,6 +70,7 @@ def _rules(lease_s: float, preempt_after_s: float) -> str:
         "max_events": MAX_EVENTS,
         "event_fields": EVENT_FIELDS,
         "max_durations": MAX_DURATIONS,
+        "owed_for_s": OWED_FOR_S,
         "budgets_s": dict(BUDGETS_S),
     }
     return json.dumps(rules)

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 
-from contract.queue.deliveries import Loan
+from contract.queue.deliveries import OWED_FOR_S, Loan
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -91,7 +91,9 @@ class MemoryQueue:
             if record.job_id in self._records:
                 return False
             self._remember(record, record.created_at_s + IDEMPOTENCY_S - time.time())
-            self._deliveries.owe(self._write(record))
+            self._write(record)
+            if (record.finished_at_s or 0.0) > time.time() - OWED_FOR_S:
+                self._deliveries.owe(record)
             return True
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:

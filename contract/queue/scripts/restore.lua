@@ -1,6 +1,6 @@
 #!lua
 -- RESTORE: put back the record of an ended job that the queue has lost. It does not count in `ended` again; whether its
--- webhook was delivered is lost, too, so it is owed.
+-- webhook was delivered is lost, too, so it is owed, unless the job ended long ago.
 -- ARGV   2 id, 3 fields of its hash as JSON, 4 created, 5 idempotency hash or '', 6 the rest of its life in ms, 7 token
 -- Keys   job:<id>, idempotency:<tenant>:<hash>, dead, index, events:<id>, owed, deliveries:<id>
 -- Answer 1: this call has restored it; 0: the queue knows the job.
@@ -15,7 +15,7 @@ end
 changes.restored, changes.entry = ARGV[7], '0-0'
 local job = {id = id}
 write(job, changes)
-owe(job)
+if tonumber(job.finished or 0) > now() - RULES.owed_for_s then owe(job) end
 if changes.state == 'failed' then redis.call('ZADD', P .. 'dead', changes.finished or 0, id) end
 index(id, changes.tenant, ARGV[4])
 return 1

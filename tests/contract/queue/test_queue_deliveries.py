@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from itertools import count
 
@@ -150,11 +151,14 @@ def test_a_job_that_is_forgotten_owes_nothing(queue: Queue) -> None:
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 0}
 
 
-def test_a_job_that_the_queue_had_lost_owes_its_webhook_again(queue: Queue) -> None:
-    ended = {"state": JobState.DONE, "attempt": 2, "finished_at_s": 2000.0}
+def test_a_job_that_the_queue_had_lost_owes_its_webhook_again_unless_it_ended_long_ago(queue: Queue) -> None:
+    ended_at_s = round(time.time()) - 60.0
+    ended = {"state": JobState.DONE, "attempt": 2, "finished_at_s": ended_at_s}
     record = job(callback_url=CALLBACK).model_copy(update=ended)
     assert queue.restore(record)
+    assert queue.restore(job(callback_url=CALLBACK).model_copy(update=ended | {"finished_at_s": 2000.0}))
     loan = lent(queue)
     assert loan is not None
     assert loan.delivery.event_id == f"{record.job_id}.2.done"
-    assert loan.delivery.ended_at_s == 2000.0
+    assert loan.delivery.ended_at_s == ended_at_s
+    assert lent(queue) is None
