@@ -86,7 +86,9 @@ export class Memory extends EventTarget {
     const { player } = this;
     const { cameras, canvas } = player;
     const pose = cameras.standing(view.pose ?? null, cameras.shownTime(view.t));
-    const size = fitted(cameras.intrinsics, room);
+    const { width, height } = cameras.intrinsics;
+    const longest = MAX_SIDE_PX / Math.max(width, height);
+    const size = cameras.drawnSize(Math.min(room.width / width, room.height / height, longest));
     const isMarked = view.unseen === "mark";
     const drawn = await player.draw({ t: view.t, pose, ...size, highlights: view.highlights === "on", isMarked, ...how });
     return {
@@ -155,12 +157,6 @@ function codeOf(error) {
   if (error instanceof RangeError) return "too_large"; // no memory for an array
   if (error instanceof Problem) return error.status === 401 || error.status === 403 ? "no_scope" : "no_file";
   return "fault";
-}
-
-/** The largest picture of the clip's shape in a room. */
-function fitted({ width, height }, room) {
-  const scale = Math.min(room.width / width, room.height / height, MAX_SIDE_PX / Math.max(width, height));
-  return { width: Math.max(1, Math.round(width * scale)), height: Math.max(1, Math.round(height * scale)) };
 }
 
 /** @returns {Promise<{manifest: Record<string, any>, scene: ArrayBuffer}>} */

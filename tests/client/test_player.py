@@ -12,7 +12,7 @@ import pytest
 import torch
 from selenium import webdriver
 
-from tests.client.player import TIE_LEVELS, Seen, drawing_browser, player_page
+from tests.client.player import SCENES, TIE_LEVELS, Seen, drawing_browser, player_page
 from tests.worker.scene.compacting import compacted
 from tests.worker.scenes import random_scene
 from worker.model.deformation import SharedBasis
@@ -114,3 +114,21 @@ def test_a_scene_that_only_the_service_draws_is_said_to_be_one(driver: webdriver
     save_scene(tmp_path, random_scene("hexplane"))
     with player_page(driver, tmp_path) as page, pytest.raises(AssertionError, match=r"hexplane.*drawn by the service"):
         page.load()
+
+
+def test_a_screen_smaller_than_the_clip_is_drawn_in_the_clips_pixels(driver: webdriver.Chrome, tmp_path: Path) -> None:
+    save_scene(tmp_path, scattered(10, moves=False))
+    script = """
+      const { Cameras } = await import("/player/camera.js");
+      const manifest = await (await fetch(given[0] + "manifest.json")).json();
+      const sizes = (wide) => {
+        const cameras = new Cameras({ ...manifest, intrinsics: { ...manifest.intrinsics, ...wide } });
+        return [0.3, 1, 2.5].map((scale) => Object.values(cameras.drawnSize(scale)));
+      };
+      return [sizes({}), sizes({ width: 3840, height: 2160 })];
+    """
+    with player_page(driver, tmp_path) as page:
+        small, large = page.run(script, SCENES)
+    assert small == [[64, 48], [64, 48], [160, 120]]
+    assert large[0] == [1931, 1086]  # as many as are judged
+    assert large[1:] == [[3840, 2160], [9600, 5400]]

@@ -50,7 +50,7 @@ from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.measure import WINDOW_PX
 from worker.render.measured import measured
 from worker.render.recorded import live_frame, stored_frame
-from worker.render.view import ROUNDING, Frame, no_pause, render_frame, renderer_of
+from worker.render.view import ROUNDING, Frame, judged_camera, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
@@ -148,6 +148,9 @@ class Views:
         if isinstance(request, ExportRequest):
             return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
         width, height = request.camera.size(*size)
+        if scene is not None:
+            judged = judged_camera(_seen_through(scene.intrinsics, request.camera), scene.intrinsics)
+            return render_cost(max(width * height, judged.width * judged.height), gaussians)
         return render_cost(width * height, gaussians)
 
     def forget_purged(self) -> None:
@@ -219,7 +222,10 @@ class Views:
         drawn = thinned(scene, detail.gaussians)
         told = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
         with traces.span("draw", **told):
-            frame = render_frame(drawn, request.t, pose, camera, self._device, highlights=highlights, pause=self.pause)
+            frame = render_frame(
+            drawn, request.t, pose, camera, self._device,
+            highlights=highlights, is_coarse=level > 0, pause=self.pause,
+        )  # fmt: skip
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
@@ -346,5 +352,10 @@ def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> 
     if width * height > max_pixels:
         problem = f"{width} x {height} is more than {max_pixels} pixels."
         raise LimitError("width", problem, "Ask for a smaller image.")
+    return _seen_through(clip, wanted)
+
+
+def _seen_through(clip: Intrinsics, wanted: IntrinsicsOverride) -> Intrinsics:
+    """The clip's camera with the caller's overrides, of any size."""
     changes = {name: value for name in ("fx", "fy", "cx", "cy") if (value := getattr(wanted, name)) is not None}
-    return dataclasses.replace(clip.resized(width, height), **changes)
+    return dataclasses.replace(clip.resized(*wanted.size(clip.width, clip.height)), **changes)

@@ -80,6 +80,14 @@ def nearest_recorder(scene: Scene, t: float, centre_mm: NDArray[np.float64]) -> 
     return own if np.linalg.norm(own[:3, 3] - centre_mm) <= apart_mm[nearest] else np.array(trained[nearest])
 
 
+def as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
+    """The same view in pixels as fine as the recording's, whose lens is `own`: in these, confidence is calibrated."""
+    width, height = camera.width * own.fx / camera.fx, camera.height * own.fy / camera.fy
+    sampled = camera.resized(max(round(width), 1), max(round(height), 1))
+    is_own = np.allclose([*sampled.numbers().values()], [*own.numbers().values()], rtol=1e-9)
+    return own if is_own else sampled
+
+
 def gloss_seen(
     scene: Scene, t: float, centre_mm: NDArray[np.float64], *, highlights: bool = True
 ) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from worker.input.camera import Intrinsics, to_camera
 from worker.model.gaussians import Gaussians
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
-from worker.render.camera import endoscope_pose
+from worker.render.camera import as_recorded, endoscope_pose
 from worker.render.confidence import confidence, evidence
 from worker.render.unseen import unseen_pixels
 from worker.render.view import renderer_of
@@ -98,17 +98,10 @@ def places_at(
             raise InputError(f"points[{number}]", problem, "Give x and y in pixels from the picture's upper left.")
     own_pose = endoscope_pose(scene, t)
     pose = own_pose if world_from_camera is None else world_from_camera
-    sampled = _as_recorded(camera, scene.intrinsics)
+    sampled = as_recorded(camera, scene.intrinsics)  # so nothing depends on how large the picture is
     across, down = sampled.width / camera.width, sampled.height / camera.height
     view = _View(scene, t, pose, sampled, own_pose, device)
     return [view.place(x * across, y * down) for x, y in points]
-
-
-def _as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
-    """The same view in pixels as fine as the recording's, in which confidence is calibrated: what is measured does not
-    depend on how large the picture is."""
-    scale = own.fx / camera.fx
-    return camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so t
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from worker.model.constants import SH_C0
 from worker.model.layout import COLOUR_ROW
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
-from worker.render.camera import endoscope_pose, view_camera
+from worker.render.camera import as_recorded, endoscope_pose, view_camera
 from worker.render.confidence import confidence, evidence, seen_from_endoscope
 from worker.render.depth_range import DepthRange
 from worker.render.left import OutOfView
@@ -41,6 +42,12 @@ MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
+MAX_JUDGED_PIXELS = 1 << 21
+"""A smaller picture is drawn in the recording's pixels first, in at most so many: those of 1920 x 1080."""
+AS_FINE = 0.02
+"""A picture whose pixels are by no more larger or smaller than the recording's is judged in its own."""
+MOST = 0.5
+"""Of a pixel: more of it decides."""
 PART_PIXELS = 1 << 19
 """Pixels between two pauses of a large render."""
 ROUNDING = 1e-6
@@ -58,12 +65,17 @@ class Frame:
     rgb        [H, W, 3] uint8
     depth_mm   [H, W] float32, camera z, 0 where nothing solid is
     unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
+    unseen_share   of the view, in [0, 1]
     warnings   what to distrust about this frame, and what to know of it
+
+    Confidence, unseen_share and warnings do not depend on how many pixels show the view (docs/conventions.md, "Size of
+    a picture").
     """
 
     rgb: NDArray[np.uint8]
     depth_mm: NDArray[np.float32]
     unseen: NDArray[np.bool_]
+    unseen_share: float
     warnings: tuple[Notice, ...]
     _confidence: Callable[[], NDArray[np.float32]]
 
@@ -86,12 +98,25 @@ class Frame:
         def confidence() -> NDArray[np.float32]:
             return np.asarray(cv2.resize(likely(), size, interpolation=cv2.INTER_LINEAR), np.float32)
 
-        return Frame(rgb, depth_mm, unseen, (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE)), confidence)
+        warnings = (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE))
+        return Frame(rgb, depth_mm, unseen, self.unseen_share, warnings, confidence)
 
-    @property
-    def unseen_share(self) -> float:
-        """Share of the pixels that are unseen, in [0, 1]."""
-        return float(self.unseen.mean())
+    def reduced(self, width: int, height: int) -> Frame:
+        """The frame in fewer pixels: each is the mean of those it covers, as most of them are solid and seen or not."""
+
+        def mean(layer: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.floating]:
+            return np.asarray(cv2.resize(layer, (width, height), interpolation=cv2.INTER_AREA))
+
+        solid = mean((self.depth_mm > 0).astype(np.float32))
+        covered, safe = solid >= MOST, np.maximum(solid, MOST)
+        depth_mm = np.where(covered, mean(self.depth_mm) / safe, 0).astype(np.float32)
+        unseen, likely = mean(self.unseen.astype(np.float32)) > MOST, self._confidence
+
+        def confidence() -> NDArray[np.float32]:
+            return np.where(covered, mean(likely()), 0).astype(np.float32)
+
+        rgb = np.asarray(mean(self.rgb), np.uint8)
+        return Frame(rgb, depth_mm, unseen, self.unseen_share, self.warnings, confidence)
 
 
 class SceneRenderer:
@@ -185,16 +210,21 @@ def render_frame(
     device: Device = CPU,
     *,
     highlights: bool = True,
+    is_coarse: bool = False,
     pause: Callable[[], None] = no_pause,
 ) -> Frame:
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
 
     highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
+    is_coarse: draw and judge no more pixels than asked for, because time is short.
     pause: called between the parts of the work (worker/raster/model.py).
     """
     shown, outside = held_in_clip(scene, t)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    camera = (intrinsics or scene.intrinsics, pose)
+    asked = intrinsics or scene.intrinsics
+    judged = asked if is_coarse else judged_camera(asked, scene.intrinsics)
+    drawn = max(asked, judged, key=_pixels)
+    camera = (drawn, pose)
     image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
     size = image.shape[1:]
     rgb, solid = np.empty((*size, 3), np.uint8), np.empty(size, np.bool_)
@@ -214,9 +244,37 @@ def render_frame(
     if not highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     pause()
-    own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
-    layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, (image[:3], depth_mm, trust), own_view)
-    return Frame(rgb, depth_mm, unseen, warnings, layer)
+    if _pixels(judged) < _pixels(drawn):
+        again = partial(render_frame, scene, shown, pose, judged, device, highlights=highlights)
+        layer: Callable[[], NDArray[np.float32]] = partial(_enlarged_confidence, again, depth_mm > 0)
+    else:
+        own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
+        view = (image[:3], depth_mm, trust)
+        layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, view, own_view)
+    frame = Frame(rgb, depth_mm, unseen, float(unseen.mean()), warnings, layer)
+    return frame if _pixels(drawn) == _pixels(asked) else frame.reduced(asked.width, asked.height)
+
+
+def judged_camera(asked: Intrinsics, own: Intrinsics) -> Intrinsics:
+    """The view in the pixels in which it is judged: the recording's, as far as they are not too many.
+
+    The right eye's lens, and sizes rounded to whole pixels, count as the recording's.
+    """
+    fine = as_recorded(asked, own)
+    if abs(_pixels(fine) / _pixels(asked) - 1) <= AS_FINE:
+        return asked
+    share = math.sqrt(max(MAX_JUDGED_PIXELS, _pixels(asked)) / _pixels(fine))
+    return fine if share >= 1 else fine.resized(max(1, int(fine.width * share)), max(1, int(fine.height * share)))
+
+
+def _pixels(camera: Intrinsics) -> int:
+    return camera.width * camera.height
+
+
+def _enlarged_confidence(judged: Callable[[], Frame], solid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[H, W] the confidence of the frame between its pixels, 0 where nothing solid [H, W] is drawn."""
+    likely = cv2.resize(judged().confidence, solid.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.where(solid, likely, 0).astype(np.float32)
 
 
 def held_in_clip(scene: Scene, t: float) -> tuple[float, tuple[Notice, ...]]:

@@ -98,8 +98,7 @@ class View {
     const canvas = this.player.canvas;
     canvas.style.width = `${Math.max(1, Math.floor(width * fitting))}px`;
     canvas.style.height = `${Math.max(1, Math.floor(height * fitting))}px`;
-    const scale = Math.min(fitting * devicePixelRatio, MAX_ENLARGED);
-    return { width: Math.max(1, Math.round(width * scale)), height: Math.max(1, Math.round(height * scale)) };
+    return this.cameras.drawnSize(Math.min(fitting * devicePixelRatio, MAX_ENLARGED));
   }
 
   play(isPlaying) {

@@ -5,6 +5,8 @@
 const MEDIAN_DEPTH_UNITS = 60;
 /** Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2). */
 const FADING = 1.0;
+/** Pixels in which a picture is judged at most (worker/render/view.py). */
+const MAX_JUDGED_PIXELS = 2 ** 21;
 
 /** @typedef {number[][]} Matrix */
 /** @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number}} Intrinsics pixels */
@@ -159,6 +161,18 @@ export class Cameras {
     const centre = centreOf(pose);
     const offsets = this.trainedFrames.map((frame) => centreOf(this.poses[frame]).map((each, i) => each - centre[i]));
     return (Math.min(...offsets.map((each) => Math.hypot(...each))) * this.unitsPerMm) / MEDIAN_DEPTH_UNITS;
+  }
+
+  /**
+   * The size of a picture so many times as wide as the clip's, but no coarser than what is shown is judged in: unseen
+   * shares and warnings would depend on the screen (docs/conventions.md, "Size of a picture").
+   * @param {number} scale
+   * @returns {{width: number, height: number}} pixels
+   */
+  drawnSize(scale) {
+    const { width, height } = this.intrinsics;
+    const held = Math.max(scale, Math.min(1, Math.sqrt(MAX_JUDGED_PIXELS / (width * height))));
+    return { width: Math.max(1, Math.round(width * held)), height: Math.max(1, Math.round(height * held)) };
   }
 
   /** The clip's camera for a picture of another size: what it sees stays whole. @returns {Intrinsics} */

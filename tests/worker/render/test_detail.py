@@ -25,7 +25,9 @@ def test_a_coarse_picture_resembles_the_whole_one_and_leaves_no_gaps(scene: Scen
     detail, clip = LEVELS[level], scene.intrinsics
     whole = render_frame(scene, 0.4)
     camera = clip.resized(clip.width // detail.pixels, clip.height // detail.pixels)
-    coarse = render_frame(thinned(scene, detail.gaussians), 0.4, None, camera).enlarged(clip.width, clip.height)
+    coarse = render_frame(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True).enlarged(
+        clip.width, clip.height
+    )
     solid = whole.depth_mm > 0
     assert psnr_tissue(coarse.rgb, whole.rgb, solid) > least_db
     assert (coarse.depth_mm[solid] > 0).mean() > 0.98

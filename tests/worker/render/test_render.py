@@ -21,7 +21,7 @@ from worker.model.metrics import psnr_tissue
 from worker.outcome import scene_of, snapshot_of
 from worker.phantom import orbit_pose
 from worker.render.camera import endoscope_pose
-from worker.render.view import FAR_POSE, render_frame, renderer_of
+from worker.render.view import FAR_POSE, judged_camera, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.presets import PRESETS
@@ -92,6 +92,67 @@ def test_every_layer_has_the_asked_size(scene: Scene, size: tuple[int, int]) -> 
     solid = frame.depth_mm > 0
     assert solid.mean() > 0.9
     assert not frame.confidence[~solid].any()
+
+
+@pytest.fixture(scope="module")
+def doubted(scene: Scene) -> Scene:
+    """Of its Gaussians, no frame saw those at the left, and those at the right were hardly seen."""
+    column = scene.gaussians.mean[:, 0]
+    seen = torch.where(column < -15, torch.tensor(0.0), torch.where(column > 0, torch.tensor(0.05), scene.seen))
+    return dataclasses.replace(scene, seen=seen)
+
+
+@pytest.mark.parametrize("scale", [0.15, 0.25, 0.5, 0.75, 1.5, 2, 4])
+@pytest.mark.parametrize("orbit", [None, (10, -5)])
+def test_a_view_is_trusted_alike_in_pictures_of_every_size(
+    doubted: Scene, orbit: tuple[float, float] | None, scale: float
+) -> None:
+    pose, camera = None if orbit is None else orbit_pose(*orbit), doubted.intrinsics
+    own = render_frame(doubted, 0.5, pose)
+    other = render_frame(doubted, 0.5, pose, camera.resized(round(scale * WIDTH), round(scale * HEIGHT)))
+    assert {NoticeCode.UNSEEN, NoticeCode.HARDLY_SEEN} <= {each.code for each in own.warnings}
+    assert [each.code for each in other.warnings] == [each.code for each in own.warnings]
+    assert other.unseen_share == pytest.approx(own.unseen_share, abs=0 if scale < 1 else 0.004)
+    assert other.unseen.mean() == pytest.approx(own.unseen_share, abs=0.03 if scale < 0.5 else 0.015)
+    assert other.confidence.mean() == pytest.approx(own.confidence.mean(), abs=0.01)
+    assert not other.confidence[other.depth_mm == 0].any()
+
+
+def test_a_part_of_the_view_is_trusted_as_the_whole_view_is(doubted: Scene) -> None:
+    camera, whole = doubted.intrinsics, render_frame(doubted, 0.5, orbit_pose(10, -5))
+    part = camera.resized(2 * WIDTH, 2 * HEIGHT).cut(WIDTH, HEIGHT // 2, WIDTH // 2, HEIGHT)
+    shown = render_frame(doubted, 0.5, orbit_pose(10, -5), part)
+    rows, columns = slice(HEIGHT // 4, 3 * HEIGHT // 4), slice(WIDTH // 2, 3 * WIDTH // 4)
+    assert shown.confidence.mean() == pytest.approx(whole.confidence[rows, columns].mean(), abs=0.02)
+
+
+def test_a_smaller_picture_is_as_bright_as_the_recording_and_its_depth_is_a_mean(scene: Scene) -> None:
+    own = render_frame(scene, 0.5)
+    small = render_frame(scene, 0.5, None, scene.intrinsics.resized(WIDTH // 4, HEIGHT // 4))
+    blocks = (HEIGHT // 4, 4, WIDTH // 4, 4)
+    assert np.abs(own.rgb.reshape(*blocks, 3).mean((1, 3)) - small.rgb).max() <= 1
+    solid = (own.depth_mm > 0).reshape(blocks).all((1, 3))
+    assert solid.mean() > 0.9
+    assert_close(small.depth_mm[solid], own.depth_mm.reshape(blocks).mean((1, 3))[solid], relative=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("clip", "asked", "judged"),
+    [
+        ((640, 512), (160, 128), (640, 512)),
+        ((640, 512), (1920, 1536), (640, 512)),
+        ((3840, 2160), (160, 90), (1930, 1086)),
+        ((3840, 2160), (2880, 1620), (2880, 1620)),
+    ],
+)
+def test_a_view_is_judged_in_the_recordings_pixels_as_far_as_they_are_not_too_many(
+    clip: tuple[int, int], asked: tuple[int, int], judged: tuple[int, int]
+) -> None:
+    own = Intrinsics(width=clip[0], height=clip[1], fx=500.3, fy=501.0, cx=300.0, cy=250.0)
+    found = judged_camera(own.resized(*asked), own)
+    assert (found.width, found.height) == judged
+    wide = dataclasses.replace(own, fx=own.fx / 100, fy=own.fy / 100)
+    assert judged_camera(wide, own).width * judged_camera(wide, own).height <= max(1 << 21, clip[0] * clip[1])
 
 
 @pytest.mark.parametrize("scale", [2, 4])
