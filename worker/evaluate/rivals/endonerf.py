@@ -17,14 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from worker.evaluate.rivals.fields import Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.fields import SOLID, Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.input.camera import Intrinsics
 from worker.stereo.right_eye import nearest_known
 from worker.train.hooks import RenderedFrame
 
-SOLID = 1e10
-"""Length of a ray's last sample: whatever is dense there ends the ray."""
 RENDERED_RAYS = 4096
 """At a time."""
 GUIDES = 8

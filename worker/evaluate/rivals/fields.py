@@ -24,6 +24,8 @@ from worker.train.targets import solid_depth_mm
 
 MARGIN = 0.05
 """Of the box's size, on each side."""
+SOLID = 1e10
+"""Length of a ray's last sample: whatever is dense there ends the ray."""
 OUTLIERS = 0.001
 """Share of the depths beyond each end of the box."""
 MAX_SAMPLED = 1 << 20

@@ -43,7 +43,7 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why() 
     assert empty == {"error", *of_the_right_eye, *of_scenes, *motion_and_trust}
     assert str(row["not_measured"]).startswith("motion: ")
     assert row["scene_bytes"] == 4 * sum(each.numel() for each in tiny(Seen.of(small_clip(2), [1]), 0).parameters())
-    (end,) = curve
+    end = curve[-1]  # a slow machine has points on the way, too
     assert set(CURVE_FIELDS) - set(KEY) == set(end)
     assert (end["iteration"], end["t_train_s"]) == (2, row["t_train_s"])
     assert row["t_post_s"] == end["t_post_s"] >= row["t_train_s"]  # type: ignore[operator]

@@ -1,0 +1,91 @@
+"""A radiance field in planes of space and of time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from tests.worker.evaluate.rivals.cases import (
+    check_gradient,
+    depth_error_mm,
+    fitted,
+    frame_of,
+    numbers_of,
+    score_db,
+    small_clip,
+    without_held_out,
+)
+from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, drawn_edges, excess, importance
+from worker.evaluate.rivals.rival import Seen
+
+SMALL = LerPlaneSettings(
+    rays=512, samples=8, cells=(16, 64), features=8, time_cells=4, proposal_samples=(16, 12), proposal_cells=(32,),
+    proposal_features=4, hidden=32, rate=2e-2,
+)  # fmt: skip
+"""What learns 64x48 pixels in seconds."""
+TINY = LerPlaneSettings(
+    rays=16, samples=3, cells=(3, 5), features=2, time_cells=2, proposal_samples=(4,), proposal_cells=(3,),
+    proposal_features=2, hidden=4, bins=2, proposal_weight=0.0,
+)  # fmt: skip
+"""Without the proposals' loss: what they learn from is held fixed, so a difference of it is not its gradient."""
+
+
+def small(seen: Seen, seed: int) -> LerPlane:
+    return LerPlane(seen, seed, SMALL)
+
+
+def test_its_gradient_is_that_of_finite_differences() -> None:
+    seen = Seen.of(small_clip(2), [0, 1], dtype=torch.float64)
+    rival = LerPlane(seen, 3, TINY)
+    with torch.no_grad():
+        for each in (*rival.field.planes.time, *rival.proposal.planes.time):
+            each.add_(0.1)  # away from 1, where the distance from it has a kink
+    check_gradient(rival, rival.field.parameters())
+
+
+def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_where_they_allow_the_weights() -> None:
+    random = torch.Generator().manual_seed(0)
+    edges = torch.sort(torch.rand(5, 4, generator=random, dtype=torch.float64)).values
+    proposed_edges = torch.linspace(0, 1, 7, dtype=torch.float64).expand(5, 7)
+    weight, proposed = (torch.rand(5, n, generator=random, dtype=torch.float64) / n for n in (3, 6))
+    proposed.requires_grad_()
+    assert torch.autograd.gradcheck(lambda each: excess(edges, weight, proposed_edges, each), (proposed / 9,))
+    assert float(excess(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
+
+
+def test_samples_gather_where_the_proposals_have_weight() -> None:
+    edges, weight = torch.linspace(0, 1, 11).expand(2, 11), torch.zeros(2, 10)
+    weight[0, 3], weight[1, 8] = 1.0, 1.0
+    found = drawn_edges(edges, weight, 20, None)
+    assert bool((found.diff(dim=-1) >= 0).all())
+    for row, (low, high) in zip(found, ((0.3, 0.4), (0.8, 0.9)), strict=True):
+        assert float(((row >= low - 1e-6) & (row <= high + 1e-6)).float().mean()) > 0.9
+
+
+def test_it_overfits_one_frame_above_30_db() -> None:
+    clip = small_clip(2)
+    rival = fitted(small, clip, [1], 180)
+    assert score_db(rival, clip, 1) > 30
+    assert depth_error_mm(rival, clip, 1) < 1
+
+
+def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
+    clip = small_clip(9)
+    first, spoilt = (fitted(small, each, [0, 8], 40) for each in (clip, without_held_out(clip, 4)))
+    assert numbers_of(first) == numbers_of(spoilt)
+    np.testing.assert_array_equal(frame_of(first, clip, 4).rgb, frame_of(spoilt, clip, 4).rgb)
+    assert np.abs(frame_of(first, clip, 8).rgb - frame_of(first, clip, 0).rgb).max() > 0.01
+    assert numbers_of(fitted(small, clip, [0, 8], 40, seed=1)) != numbers_of(first)
+
+
+def test_pixels_that_change_and_tissue_that_hides_are_drawn_more_often() -> None:
+    clip = small_clip(3)
+    still = dataclasses.replace(clip, rgb=clip.rgb[[0, 0, 0]].copy(), tissue=np.ones_like(clip.tissue))
+    still.rgb[1, 10, 20] ^= 128
+    still.tissue[0, 30:, :] = False
+    weight = importance(Seen.of(still, range(3)), 0.01, 0.1)
+    assert float(weight[1, 10, 20]) > 5 * float(weight[1, 11, 20])
+    assert bool((weight[0, 30:] == 0).all())
+    assert float(weight[1, 40, 5]) > float(weight[1, 5, 5])

@@ -1,0 +1,241 @@
+"""`lerplane`: a radiance field factored into planes of space and of time (Yang et al., MICCAI 2023; own text).
+
+Symbols: M rays, S samples a ray, K intervals a ray, F training frames, H W pixels. docs/decisions/078 lists what
+differs from the paper, and why.
+
+Planes of space are common to all moments, planes of time multiply them; a small network decodes features, place and
+time into density and colour. A coarser field of its own proposes where a ray's samples lie. Rays are drawn from all
+frames at once, more of them where the picture changes and where instruments often hide the tissue.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import huber_loss
+
+from worker.evaluate.rivals.fields import SOLID, Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.rival import Rival, Seen
+from worker.input.camera import Intrinsics
+from worker.train.hooks import RenderedFrame
+
+RENDERED_RAYS = 2048
+"""At a time."""
+MAX_LOG_DENSITY = 15.0
+WINDOW = 2
+"""Frames before and after with which a frame is compared, for the importance of its pixels."""
+
+
+@dataclass(frozen=True)
+class LerPlaneSettings:
+    """As published, or as the authors' BSD-licensed configuration says.
+
+    cells, features     of the planes, by resolution; time_cells is their most cells of time
+    proposal_*          of the field that proposes samples, and how many intervals it looks at, one round after another
+    bins                of the one-blob encoding of place and time
+    rate                of Adam: it rises for the share warm_up of the training, then falls like a cosine
+    least, most         limits of a pixel's change, for its importance
+    annealed            share of the training in which the proposals sharpen
+    """
+
+    rays: int = 2048
+    samples: int = 64
+    cells: tuple[int, ...] = (64, 128, 256, 512)
+    features: int = 16
+    time_cells: int = 150
+    proposal_samples: tuple[int, ...] = (256, 128)
+    proposal_cells: tuple[int, ...] = (128,)
+    proposal_features: int = 8
+    hidden: int = 64
+    bins: int = 4
+    rate: float = 1e-2
+    warm_up: float = 0.05
+    annealed: float = 0.1
+    least: float = 0.01
+    most: float = 0.1
+    depth_weight: float = 1.0
+    proposal_weight: float = 1.0
+    variation_weight: float = 1e-4
+    unrest_weight: float = 1e-4
+    jerk_weight: float = 0.03
+    proposal_jerk_weight: float = 1e-4
+
+
+class LerPlane(Rival):
+    """A training LerPlane."""
+
+    not_measured = "motion: it has a field for each moment and no points that move; confidence: it has none"
+
+    def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:
+        self.seed, self.settings = seed, settings or LerPlaneSettings()
+        self._seen, self._box = seen, Box.of(seen)
+        self._importance = importance(seen, self.settings.least, self.settings.most)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            time_cells = max(2, min(self.settings.time_cells, len(seen)))
+            self.field = _Field(self.settings, time_cells).to(seen.rgb)
+            self.proposal = _Proposal(self.settings, time_cells).to(seen.rgb)
+        self.optimizer = torch.optim.Adam([*self.field.parameters(), *self.proposal.parameters()])
+
+    def rates(self, progress: float) -> Sequence[float]:
+        warm_up = self.settings.warm_up
+        if progress < warm_up:
+            return [self.settings.rate * (0.01 + 0.99 * progress / warm_up)]
+        return [self.settings.rate * 0.5 * (1 + math.cos(math.pi * (progress - warm_up) / (1 - warm_up)))]
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """Colour, depth, proposals, and how even the planes are."""
+        seen, chosen, random = self._seen, self.settings, self.generator(iteration)
+        drawn = drawn_pixels(self._importance, chosen.rays, random)
+        height, width = seen.tissue.shape[1:]
+        frame, row, column = drawn // (height * width), drawn // width % height, drawn % width
+        origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
+        sharpness = _annealed(progress / chosen.annealed)
+        (rgb, depth_s, _), spread = self._shown(origin, direction, seen.t[frame], sharpness, random)
+        depth_mm = seen.depth_mm[frame, row, column]
+        known = depth_mm > 0
+        about = self._box.s_of(depth_mm.clamp(min=1e-3))
+        error = torch.where(known, huber_loss(depth_s, about, reduction="none", delta=0.2), 0.0)
+        loss = (rgb - seen.rgb[frame, row, column]).square().mean()
+        loss = loss + chosen.depth_weight * error.sum() / known.sum().clamp(min=1)
+        return loss + chosen.proposal_weight * spread + self._unevenness()
+
+    @torch.no_grad()
+    def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        pose = pose_tensor(world_from_camera, self._seen.rgb)
+
+        def show(part: slice, origin: Tensor, direction: Tensor) -> Shown:
+            del part
+            return self._shown(origin, direction, torch.full_like(origin[:, 0], t), 1.0, None)[0]
+
+        return picture(self._box, intrinsics, pose, show, RENDERED_RAYS)
+
+    def _shown(
+        self, origin: Tensor, direction: Tensor, t: Tensor, sharpness: float, random: torch.Generator | None
+    ) -> tuple[Shown, Tensor]:
+        """What is shown by rays at times [M], and the loss of the proposals.
+
+        random: jitters the intervals; None puts them in the middle.
+        """
+        edges = origin.new_tensor([0.0, 1.0]).expand(len(origin), 2)
+        weight, proposed = torch.ones_like(edges[:, :1]), []
+        for count in self.settings.proposal_samples:
+            edges = drawn_edges(edges, weight.detach() ** sharpness, count, random)
+            place = self._places(origin, direction, edges)
+            density = self.proposal(place, t.repeat_interleave(count)).reshape(-1, count)
+            weight = weights_along(density, edges.diff(dim=-1))
+            proposed.append((edges, weight))
+        edges = drawn_edges(edges, weight.detach() ** sharpness, self.settings.samples, random)
+        place = self._places(origin, direction, edges)
+        density, rgb = self.field(place, t.repeat_interleave(self.settings.samples))
+        s = (edges[:, 1:] + edges[:, :-1]) / 2
+        length = torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(s[:, :1], SOLID)], 1)
+        weight = weights_along(density.reshape(s.shape), length)
+        spread = sum((excess(edges, weight.detach(), *each) for each in proposed), weight.new_zeros(()))
+        colour = (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1)
+        return (colour, (weight * s).sum(1), weight.sum(1)), spread
+
+    def _places(self, origin: Tensor, direction: Tensor, edges: Tensor) -> Tensor:
+        """The middles of the intervals in the box, [M K, 3]."""
+        depth_mm = self._box.depth_mm((edges[:, 1:] + edges[:, :-1]) / 2)
+        return self._box.place(origin[:, None] + depth_mm[..., None] * direction[:, None]).flatten(0, 1)
+
+    def _unevenness(self) -> Tensor:
+        chosen, total = self.settings, self._seen.rgb.new_zeros(())
+        jerks = (chosen.jerk_weight, chosen.proposal_jerk_weight)
+        for planes, jerk_weight in zip((self.field.planes, self.proposal.planes), jerks, strict=True):
+            total = total + chosen.variation_weight * planes.variation()
+            total = total + chosen.unrest_weight * planes.unrest() + jerk_weight * planes.jerk()
+        return total
+
+
+def importance(seen: Seen, least: float, most: float) -> Tensor:
+    """[F, H, W] weight with which a pixel is drawn: how much its colour differs from the frames around, held between
+    least and most, over how often it shows tissue; 0 where it does not."""
+    shown = seen.rgb * seen.tissue[..., None]
+    weight = torch.empty_like(seen.depth_mm)
+    often = seen.tissue.sum(0).clamp(min=1) / len(seen)
+    for frame in range(len(seen)):
+        around = [i for i in range(max(0, frame - WINDOW), min(len(seen), frame + WINDOW + 1)) if i != frame]
+        changes = [(shown[frame] - shown[other]).abs().mean(-1) for other in around] or [torch.zeros_like(often)]
+        weight[frame] = torch.stack(changes).mean(0).clamp(least, most) / often * seen.tissue[frame]
+    return weight
+
+
+def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generator | None) -> Tensor:
+    """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1]."""
+    weight = weight + 1e-3 / weight.shape[1]  # a ray without any weight is looked at evenly
+    share = torch.cumsum(weight / weight.sum(-1, keepdim=True), -1)
+    share = torch.cat([torch.zeros_like(share[:, :1]), share[:, :-1], torch.ones_like(share[:, :1])], -1)
+    wanted = torch.linspace(0, 1, count + 1).to(edges).expand(len(edges), -1)
+    if random is not None:
+        jitter = (torch.rand(len(edges), count + 1, generator=random).to(edges) - 0.5) / count
+        wanted = (wanted + jitter).clamp(0, 1)
+    above = torch.searchsorted(share, wanted.contiguous(), right=True).clamp(1, share.shape[1] - 1)
+    low, high = (share.gather(1, each) for each in (above - 1, above))
+    inside = ((wanted - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
+    start, end = (edges.gather(1, each) for each in (above - 1, above))
+    return start + inside * (end - start)
+
+
+def excess(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
+    """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap (Barron et al., 2022)."""
+    total = torch.cat([torch.zeros_like(proposed[:, :1]), torch.cumsum(proposed, -1)], -1)
+    most = proposed.shape[1]
+    at = proposed_edges.contiguous()
+    first = (torch.searchsorted(at, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, most)
+    last = torch.searchsorted(at, edges[:, 1:].contiguous()).clamp(0, most)
+    bound = total.gather(1, last) - total.gather(1, first)
+    return ((weight - bound).clamp(min=0).square() / (weight + 1e-7)).sum(-1).mean()
+
+
+def _annealed(done: float) -> float:
+    """The exponent of the proposals' weights: 0 at first, 1 from done = 1 on."""
+    done = min(done, 1.0)
+    return 10 * done / (9 * done + 1)
+
+
+class _Proposal(nn.Module):
+    """Densities [M] at places [M, 3] and times [M]."""
+
+    def __init__(self, settings: LerPlaneSettings, time_cells: int) -> None:
+        super().__init__()
+        self.planes = Planes(settings.proposal_cells, time_cells, settings.proposal_features)
+        self.decode = nn.Sequential(
+            nn.Linear(self.planes.size, settings.hidden), nn.ReLU(), nn.Linear(settings.hidden, 1)
+        )
+
+    def forward(self, place: Tensor, t: Tensor) -> Tensor:
+        return _density(self.decode(self.planes(place, t))[:, 0])
+
+
+class _Field(nn.Module):
+    """Densities [M] and colours [M, 3] at places [M, 3] and times [M]."""
+
+    def __init__(self, settings: LerPlaneSettings, time_cells: int) -> None:
+        super().__init__()
+        self.bins, hidden = settings.bins, settings.hidden
+        self.planes = Planes(settings.cells, time_cells, settings.features)
+        given = self.planes.size + 4 * settings.bins
+        self.decode = nn.Sequential(nn.Linear(given, hidden), nn.ReLU(), nn.Linear(hidden, 16))
+        self.colour = nn.Sequential(
+            nn.Linear(15, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3), nn.Sigmoid()
+        )
+
+    def forward(self, place: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        at = torch.cat([(place + 1) / 2, t[:, None]], 1)
+        middles = (torch.arange(self.bins).to(at) + 0.5) / self.bins
+        blobs = torch.exp(-0.5 * ((at[..., None] - middles) * self.bins).square()).flatten(1)
+        decoded = self.decode(torch.cat([self.planes(place, t), blobs], 1))
+        return _density(decoded[:, 0]), self.colour(decoded[:, 1:])
+
+
+def _density(raw: Tensor) -> Tensor:
+    return torch.exp(raw.clamp(max=MAX_LOG_DENSITY))

@@ -1,0 +1,61 @@
+"""Factor planes: features of a place and a time, which `lerplane` and `endogaussian` share.
+
+Symbols: M points, R cells of a spatial axis, Q cells of time, C features a plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample
+
+SPACE_PAIRS, TIME_PAIRS = ((0, 1), (0, 2), (1, 2)), ((0, 3), (1, 3), (2, 3))
+
+
+class Planes(nn.Module):
+    """Features of (x, y, z, t), each in [-1, 1]: at each resolution the product of six planes' bilinear values.
+
+    space  by resolution [3, C, R, R]: xy, xz, yz, which do not change in time
+    time   by resolution [3, C, Q, R]: xt, yt, zt, 1 at the start, so that space is learnt first
+    """
+
+    def __init__(self, cells: Sequence[int], time_cells: int, features: int) -> None:
+        super().__init__()
+        spaces = [torch.empty(3, features, each, each).uniform_(0.1, 0.5) for each in cells]
+        self.space = nn.ParameterList(spaces)
+        self.time = nn.ParameterList([torch.ones(3, features, time_cells, each) for each in cells])
+        self.size = len(cells) * features
+
+    def forward(self, place: Tensor, t: Tensor) -> Tensor:
+        """place [M, 3] and model times [M] in [0, 1]: features [M, size]."""
+        at = torch.cat([place, 2 * t[:, None] - 1], 1)
+        spaces, times = (torch.stack([at[:, pair] for pair in pairs])[:, None] for pairs in (SPACE_PAIRS, TIME_PAIRS))
+        found = [
+            _sampled(s, spaces).prod(0) * _sampled(q, times).prod(0) for s, q in zip(self.space, self.time, strict=True)
+        ]
+        return torch.cat(found).T
+
+    def variation(self) -> Tensor:
+        """Mean squared difference of neighbouring cells of the planes of space."""
+        found = [(each[..., 1:, :] - each[..., :-1, :]).square().mean() for each in self.space]
+        return torch.stack([*found, *((each[..., 1:] - each[..., :-1]).square().mean() for each in self.space)]).sum()
+
+    def jerk(self) -> Tensor:
+        """Mean squared second difference in time of the planes of time; 0 where they have fewer than three cells."""
+        total = torch.zeros((), dtype=self.time[0].dtype, device=self.time[0].device)
+        for each in self.time:
+            if each.shape[2] > 2:
+                total = total + (each[:, :, 2:] - 2 * each[:, :, 1:-1] + each[:, :, :-2]).square().mean()
+        return total
+
+    def unrest(self) -> Tensor:
+        """Mean distance of the planes of time from 1, where they change nothing."""
+        return torch.stack([(1 - each).abs().mean() for each in self.time]).sum()
+
+
+def _sampled(planes: Tensor, at: Tensor) -> Tensor:
+    """Planes [3, C, rows, columns] at [3, 1, M, 2]: [3, C, M]."""
+    found: Tensor = grid_sample(planes, at, mode="bilinear", padding_mode="border", align_corners=True)
+    return found[:, :, 0]
