@@ -7,7 +7,8 @@ one request, resumable, and broken off in the middle), watched over SSE while it
 viewers over HTTP and one over the WebSocket, now and then cancelled, and purged. Every ten seconds resident memory,
 open files and threads of service, supervisor, device child and Valkey are noted. At the end: the median of the three
 minutes after the tenth against that of the last three, and the slope of the straight line through all samples after the
-tenth minute. A rise of memory of more than 2 %, or of files or threads by more than two (pools breathe), is marked.
+tenth minute. Of files and threads, which come and go with callers, the fewest in those minutes. A rise of memory by
+more than 2 %, or of files or threads by more than two, is marked.
 """
 
 from __future__ import annotations
@@ -208,8 +209,9 @@ def _judge(rows: list[Row], minutes: float) -> int:
             if not first or not last or minutes < SETTLED_AFTER_MIN + 2 * WINDOW_MIN:
                 print(f"{process:13} {measure:8} too short a run to judge")
                 continue
-            before, after = median(first), median(last)
-            allowed = before * ALLOWED_RISE if measure == "rss_mib" else ALLOWED_MORE
+            is_memory = measure == "rss_mib"
+            before, after = (median(values) if is_memory else min(values) for values in (first, last))
+            allowed = before * ALLOWED_RISE if is_memory else ALLOWED_MORE
             mark = "GREW" if after - before > allowed else "ok"
             grown += mark != "ok"
             slope_per_hour = 60 * linear_regression(*zip(*settled, strict=True)).slope

@@ -363,7 +363,8 @@ class Store:
         for area in Area:
             removed += self._shelf.remove(area, job_id)
         with disk_errors():
-            for path in (self.data_dir / UNSCORED).glob(f"*/{job_id}.*"):
+            # no pattern with the id in it, for Python remembers hundreds of patterns
+            for path in (each for each in (self.data_dir / UNSCORED).glob("*/*") if each.name.startswith(f"{job_id}.")):
                 path.unlink(missing_ok=True)
         left = sum(len(self._here.folders(area, job_id)) for area in Area)
         if left:
