@@ -25,7 +25,7 @@
  *   cy: number,
  * }} ClipCamera
  */
-/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
+/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
  *   frame: number,
