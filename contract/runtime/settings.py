@@ -70,13 +70,14 @@ def _check_names(source: Mapping[str, str], fields: Collection[str]) -> None:
 class Settings(BaseModel):
     """The settings. Each field `name` is read from `INTRASPLAT_NAME`, only redis_url from the customary REDIS_URL.
 
-    For secrets, a variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value.
+    For secrets, a variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value. Secrets are the
+    fields with repr=False: neither an error nor the text of Settings shows them.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True)
 
     data_dir: Path = Field(default_factory=default_data_dir)
-    redis_url: str | None = None
+    redis_url: str | None = Field(default=None, repr=False)
     """None: `intrasplat up` starts its own Valkey and hands its address to the processes it starts."""
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=1, le=65535)
@@ -120,7 +121,7 @@ class Settings(BaseModel):
     max_retention_hours: float | None = Field(default=None, gt=0)
 
     # webhooks
-    webhook_secret: str | None = Field(default=None, min_length=32)
+    webhook_secret: str | None = Field(default=None, min_length=32, repr=False)
     """The secrets that tenants verify webhooks with are made from it."""
     webhook_hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
     """Where webhooks may go: HOST or HOST:PORT for https, http://HOST:PORT without encryption; nowhere by default."""
@@ -132,7 +133,7 @@ class Settings(BaseModel):
     render_timeout_s: float = Field(default=20.0, gt=0)
     render_endpoint: str | None = Field(default=None, pattern=r"^tcp://[^\s]+:\d+$")
     """The address at which services on other machines reach the worker; needs render_secret. None: a unix socket."""
-    render_secret: str | None = Field(default=None, min_length=32)
+    render_secret: str | None = Field(default=None, min_length=32, repr=False)
     """Shared by services and workers, which make the keys of their encrypted connection from it."""
     hot_bytes: int = Field(default=2 * GIB, gt=0)
     """Maximum bytes of all scenes that a worker keeps in memory."""
@@ -171,8 +172,10 @@ class Settings(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             first = error.errors()[0]
-            variable = ENVIRONMENT_PREFIX + str(first["loc"][0]).upper()
-            problem = f"{first['input']!r} is not accepted: {first['msg']}."
+            name = str(first["loc"][0])
+            variable = ENVIRONMENT_PREFIX + name.upper()
+            shown = repr(first["input"]) if cls.model_fields[name].repr else "its value"
+            problem = f"{shown} is not accepted: {first['msg']}."
             raise InputError(variable, problem, f"Correct or unset {variable}.") from error
 
     def to_environment(self) -> dict[str, str]:

@@ -43,6 +43,26 @@ def test_a_value_that_is_not_accepted_is_named_with_its_variable(variable: str, 
         Settings.from_environment({variable: value})
 
 
+SECRETS = [name for name in Settings.model_fields if name == "redis_url" or name.endswith("_secret")]
+
+
+@pytest.mark.parametrize("name", [name for name in SECRETS if name != "redis_url"])
+def test_a_secret_that_is_not_accepted_is_named_and_not_shown(name: str, tmp_path: Path) -> None:
+    variable = f"INTRASPLAT_{name.upper()}"
+    (tmp_path / "secret").write_text("too short to tell\n")
+    for given in ({variable: "too short to tell"}, {f"{variable}_FILE": str(tmp_path / "secret")}):
+        with pytest.raises(InputError, match=variable) as refused:
+            Settings.from_environment(given)
+        assert "at least 32 characters" in str(refused.value)
+        assert "too short to tell" not in f"{refused.value} {refused.value.__cause__}"
+
+
+def test_the_text_of_settings_shows_no_secret() -> None:
+    text = repr(Settings(**dict.fromkeys(SECRETS, "to be kept to those who may know it")))
+    assert "to be kept" not in text
+    assert "worker-1" in text
+
+
 def test_a_child_process_reads_the_settings_of_its_parent(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, redis_url="redis://here", hosts=("a.example",), retention_hours=2.5)
     assert Settings.from_environment(settings.to_environment()) == settings
