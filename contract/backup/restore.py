@@ -95,8 +95,9 @@ def restore_backup(
             (data_dir / RESTORING).touch(mode=0o600)
             with open_queue as queue:
                 if queue.records(limit=1):
-                    problem = "The queue is not empty: it holds jobs of another installation."
-                    raise UnavailableError(problem, "Give the restored service a queue of its own (REDIS_URL).")
+                    problem = "The queue is not empty: it holds jobs of another installation, or of a restore cut off."
+                    remedy = "Give the restored service a queue of its own (REDIS_URL), or empty this one."
+                    raise UnavailableError(problem, remedy)
                 _copy_files(backup, manifest, data_dir, since.purged)
                 restored = Restored(backup, manifest.created_at)
                 restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
@@ -135,13 +136,28 @@ def _since(audits: Sequence[Path]) -> _Since:
     """What these audits say was purged, or was begun to be, and which keys were revoked."""
     told: dict[str, set[str]] = {AuditAction.PURGED: set(), AuditAction.KEY_REVOKED: set()}
     for path in audits:
-        for line in audit_lines(path):
-            with suppress(ValueError):  # a line that was cut off by a crash
-                entry: dict[str, str] = json.loads(line)
-                about = entry.get("job_id") or entry.get("key_id")
-                if (action := entry.get("action")) in told and about is not None:
-                    told[action].add(about)
+        for entry in _acts(path):
+            about = entry.get("job_id") or entry.get("key_id")
+            if (action := entry["action"]) in told and about is not None:
+                told[action].add(about)
     return _Since(frozenset(told[AuditAction.PURGED]), frozenset(told[AuditAction.KEY_REVOKED]))
+
+
+def _acts(audit: Path) -> Iterator[dict[str, str]]:
+    """The entries of an audit, without lines that a crash has cut off.
+
+    Raises:
+        InputError: it cannot be read, or has lines and none is of an audit.
+    """
+    lines = acts = 0
+    for lines, line in enumerate(audit_lines(audit), 1):
+        with suppress(ValueError):
+            entry = json.loads(line)
+            if isinstance(entry, dict) and "action" in entry:
+                acts += 1
+                yield entry
+    if lines and not acts:
+        raise InputError("--audit", f"{audit} holds no line of an audit.", "Name audit.jsonl, or one that was rotated.")
 
 
 def _check_empty(data_dir: Path) -> None:

@@ -171,6 +171,9 @@ def test_a_line_costs_a_look_at_the_end_of_the_file_whatever_its_size(
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "audit.gz").write_bytes(b"no gzip")
-    for name in ("audit.gz", "absent", "."):
+    damaged = bytearray(gzip.compress(b"a line of an audit\n" * 100))
+    damaged[14] ^= 0xFF
+    (tmp_path / "damaged.gz").write_bytes(damaged)
+    for name in ("audit.gz", "damaged.gz", "absent", "."):
         with pytest.raises(InputError, match="cannot be read"):
             check_file(tmp_path / name)

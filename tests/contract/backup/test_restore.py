@@ -129,6 +129,19 @@ def test_what_later_audits_tell_was_purged_or_revoked_does_not_come_back(site: S
     assert KeyFile(new).list() == (other,)
 
 
+@pytest.mark.parametrize("text", ["audit\n", "12\n[]\n", '{"name": "a file of another kind"}\n'])
+def test_an_audit_that_is_none_is_refused_before_anything_comes_back(text: str, site: Site, tmp_path: Path) -> None:
+    site.done()
+    backup, queue, wrong = site.backup(tmp_path / "backups"), MemoryQueue(), tmp_path / "wrong.json"
+    wrong.write_text(text)
+    with pytest.raises(InputError, match="no line of an audit"):
+        restored(tmp_path / "new", queue, backup, site.settings.data_dir / AUDIT_FILE, wrong)
+    assert queue.records() == []
+    assert not (tmp_path / "new").exists()
+    wrong.write_text("")
+    assert restored(tmp_path / "new", queue, backup, wrong).jobs == {JobState.DONE: 1}
+
+
 def flip(path: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
