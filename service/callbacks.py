@@ -22,7 +22,7 @@ DEFAULT_PORTS = {"https": 443, "http": 80}
 URL_TEXT = re.compile(r"[!-~]+", re.ASCII)
 """Visible ASCII."""
 NAT64 = IPv6Network("64:ff9b::/96")
-METADATA = frozenset({ip_address("fd00:ec2::254")})
+METADATA = frozenset(map(ip_address, ("fd00:ec2::254", "fd20:ce::254", "fd00:c1::a9fe:a9fe")))
 """Where clouds tell their machines secrets; others lie among the link-local addresses."""
 URL_REMEDY = "Give a URL such as https://his.example.org/intrasplat, without a user, a password or a fragment."
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_WEBHOOK_HOSTS."
@@ -82,6 +82,8 @@ def _origin(url: str) -> str | None:
 def _is_permitted(text: str, private: bool) -> bool:
     address = _meant(ip_address(text.partition("%")[0]))
     if address.is_link_local or address.is_multicast or address.is_unspecified or address in METADATA:
+        return False
+    if address.is_reserved and not address.is_loopback:  # some stand for an IPv4 address that is not told
         return False
     return address.is_global or (private and (address.is_private or address.is_loopback))
 
