@@ -149,14 +149,14 @@ def _acts(audit: Path) -> Iterator[dict[str, str]]:
     Raises:
         InputError: it cannot be read, or has lines and none is of an audit.
     """
-    lines = acts = 0
-    for lines, line in enumerate(audit_lines(audit), 1):
+    line, acts = None, 0
+    for line in audit_lines(audit):
         with suppress(ValueError):
             entry = json.loads(line)
             if isinstance(entry, dict) and "action" in entry:
                 acts += 1
                 yield entry
-    if lines and not acts:
+    if line is not None and not acts:
         raise InputError("--audit", f"{audit} holds no line of an audit.", "Name audit.jsonl, or one that was rotated.")
 
 

@@ -70,8 +70,8 @@ def _check_names(source: Mapping[str, str], fields: Collection[str]) -> None:
 class Settings(BaseModel):
     """The settings. Each field `name` is read from `INTRASPLAT_NAME`, only redis_url from the customary REDIS_URL.
 
-    For secrets, a variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value. Secrets are the
-    fields with repr=False: neither an error nor the text of Settings shows them.
+    For secrets, a variable with _FILE after its name (REDIS_URL_FILE) names a file that holds the value. Fields with
+    repr=False are secrets: neither an error nor the text of Settings shows them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True)
