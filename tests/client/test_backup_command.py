@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -48,3 +49,16 @@ def test_a_folder_that_cannot_be_the_services_is_refused(
     assert main(backup) == ExitCode.BAD_INPUT
     assert told in capsys.readouterr().err
     assert not (tmp_path / "backups").exists()
+
+
+def test_another_user_than_the_services_is_refused_and_leaves_nothing_in_the_data_directory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store(tmp_path / "old")
+    before = sorted((tmp_path / "old").rglob("*"))
+    service = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: service + 1)
+    backup = ["backup", str(tmp_path / "backups"), "--data-dir", str(tmp_path / "old")]
+    assert main(backup) == ExitCode.UNAVAILABLE
+    assert f"belongs to another user (uid {service})" in capsys.readouterr().err
+    assert sorted((tmp_path / "old").rglob("*")) == before
