@@ -20,6 +20,8 @@ from worker.raster.step import camera_vector
 from worker.scene.scene import Scene
 from worker.train.targets import camera_in_units
 
+MAX_SIDE = 1 << 20
+"""Pixels as fine as the recording's along a side; a lens of 180 degrees needs fewer."""
 FADING = 1.0
 """Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2)."""
 
@@ -81,9 +83,13 @@ def nearest_recorder(scene: Scene, t: float, centre_mm: NDArray[np.float64]) -> 
 
 
 def as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
-    """The same view in pixels as fine as the recording's, whose lens is `own`: in these, confidence is calibrated."""
-    width, height = camera.width * own.fx / camera.fx, camera.height * own.fy / camera.fy
-    sampled = camera.resized(max(round(width), 1), max(round(height), 1))
+    """The same view in pixels as fine as the recording's, whose lens is `own`: in these, confidence is calibrated.
+
+    A field of view that is wider than any lens shows has at most MAX_SIDE of them along a side.
+    """
+    sides = camera.width * own.fx / camera.fx, camera.height * own.fy / camera.fy
+    width, height = (max(round(min(side, MAX_SIDE)), 1) for side in sides)
+    sampled = camera.resized(width, height)
     is_own = np.allclose([*sampled.numbers().values()], [*own.numbers().values()], rtol=1e-9)
     return own if is_own else sampled
 

@@ -44,6 +44,8 @@ HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not k
 COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
 MAX_JUDGED_PIXELS = 1 << 21
 """A smaller picture is drawn in the recording's pixels first, in at most so many: those of 1920 x 1080."""
+MAX_JUDGED_SIDE = 8192
+"""If they are so many, at most so many along a side: as many as a caller may ask for."""
 AS_FINE = 0.02
 """A picture whose pixels are by no more larger or smaller than the recording's is judged in its own."""
 MOST = 0.5
@@ -263,8 +265,12 @@ def judged_camera(asked: Intrinsics, own: Intrinsics) -> Intrinsics:
     fine = as_recorded(asked, own)
     if abs(_pixels(fine) / _pixels(asked) - 1) <= AS_FINE:
         return asked
-    share = math.sqrt(max(MAX_JUDGED_PIXELS, _pixels(asked)) / _pixels(fine))
-    return fine if share >= 1 else fine.resized(max(1, int(fine.width * share)), max(1, int(fine.height * share)))
+    most = max(MAX_JUDGED_PIXELS, _pixels(asked))
+    if _pixels(fine) <= most:
+        return fine
+    share = math.sqrt(most / _pixels(fine))
+    width = min(max(1, int(fine.width * share)), MAX_JUDGED_SIDE)
+    return fine.resized(width, min(max(1, int(fine.height * share)), MAX_JUDGED_SIDE))
 
 
 def _pixels(camera: Intrinsics) -> int:

@@ -25,6 +25,7 @@ from contract.wire.rendering import (
     Layer,
     RenderRequest,
     Unseen,
+    render_cost,
 )
 from tests.worker.exports import export_request, exported
 from worker.daemon.serve import GivenUpError, NotYetError
@@ -390,3 +391,14 @@ def test_a_picture_of_a_scene_that_is_purged_while_it_is_rendered_is_not_kept(st
     views.answer(large)
     assert views.held == ()
     assert views.cost(large) > 0
+
+
+@pytest.mark.parametrize("lens", [{"fx": 1e-5}, {"fx": 5e-324}, {"fy": 1e-200}, {"fx": 1e5, "fy": 1e-200}])
+def test_a_lens_that_sees_more_than_any_does_is_answered_in_pixels_that_are_not_too_many(
+    lens: dict[str, float], store: Store, scene_id: str
+) -> None:
+    views = Views(store)
+    views.answer(request_of(scene_id))
+    wide = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=16, height=12, **lens)})
+    assert views.cost(wide) <= render_cost(1 << 21, len(scene().gaussians))
+    assert np.load(io.BytesIO(views.answer(wide).body)).shape[:2] == (12, 16)
