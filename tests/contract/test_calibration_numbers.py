@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from contract.intake.calibration.text import read_calibration
-from contract.intake.limits import ClipLimits
+from contract.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from contract.intake.sniff import check_calibration_file, check_file
 from contract.wire.errors import InputError
 
@@ -53,3 +55,20 @@ def test_a_calibration_of_no_known_model_is_refused_in_plain_words(text: str, gi
     with pytest.raises(InputError) as refused:
         read_calibration(text)
     assert refused.value.problem == f"model is {given}, not rectified or raw."
+
+
+HANGS_AFTER_S = 60.0
+LOOK = "import sys; from contract.intake.calibration.opencv import look_at_calibration as look; look(sys.stdin.read())"
+
+
+@pytest.mark.parametrize(
+    ("again", "is_cut"), [(":!", False), (":[", True), (": !!a", False), ("::{", True), (":[}", True)]
+)
+def test_no_text_keeps_who_looks_at_it(again: str, is_cut: bool) -> None:
+    head, end = "%YAML:1.0\nM1: 1\nM2: 1\nR: 1\nT: 1\n", "" if is_cut else "]}"
+    text = head + again * ((MAX_CALIBRATION_BYTES - 100) // len(again)) + end
+    looked = subprocess.run(  # of a process of its own: a pattern that does not come to an end hears no signal
+        [sys.executable, "-c", LOOK], input=text, capture_output=True, text=True, timeout=HANGS_AFTER_S
+    )
+    assert ("was cut short" in looked.stderr) is is_cut
+    assert looked.returncode == int(is_cut)

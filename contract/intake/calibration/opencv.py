@@ -32,7 +32,8 @@ _REQUIRED = ("left_k", "right_k", "rotation", "translation")
 _NAMES = {spelling: name for name, spellings in OPENCV_KEYS.items() for spelling in spellings.split()}
 _WORD = re.compile(r"[\w.-]+")
 _QUOTED_OR_COMMENT = re.compile(r'"[^"\n]*"|#.*')
-_UNCLOSED = re.compile(r":\s*(?:!\S+\s*)?(?:\[[^\]]*|\{[^}]*)\Z")
+_OPENED = {end: re.compile(r":\s*(?:!!?[\w-]{1,40}\s*)?" + re.escape(begin)) for begin, end in ("[]", "{}")}
+"""A list or a map that is a value, by what closes it. No pattern here takes longer than the text is long."""
 
 
 def name_of(key: str) -> str | None:
@@ -63,6 +64,10 @@ def look_at_calibration(text: str) -> StereoCalibration | None:
 def _check_opencv_text(text: str) -> None:
     check_opencv_names({name_of(word) for word in _WORD.findall(text)})
     is_xml = text.lstrip().startswith("<?xml")
-    is_cut = "</opencv_storage>" not in text if is_xml else _UNCLOSED.search(_QUOTED_OR_COMMENT.sub('""', text))
-    if is_cut:
+    if "</opencv_storage>" not in text if is_xml else _is_unclosed(_QUOTED_OR_COMMENT.sub('""', text)):
         raise InputError(FIELD, "the OpenCV file was cut short: its end is missing.", "Copy or export it again.")
+
+
+def _is_unclosed(text: str) -> bool:
+    """Whether a list or a map is opened after the last one that is closed."""
+    return any(opened.search(text, text.rfind(end) + 1) for end, opened in _OPENED.items())
