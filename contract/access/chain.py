@@ -27,19 +27,34 @@ HEAD_PATTERN = r"[0-9a-f]{64}"
 CHAINED = re.compile(rb'\{"chain":"([0-9a-f]{64})",')
 TAIL_BYTES = 4096
 """The last line is looked for in so many bytes first; a line has about 350."""
+PIECE_BYTES = 1 << 20
+"""Then in pieces: an audit of version 0.2 may be larger than the memory."""
+BEGINNING_BYTES = len('{"chain":"",') + len(START)
 
 
 def head_of(descriptor: int) -> str | None:
     """The head of an open file; None if it is empty. Reads TAIL_BYTES, and more only where lines have no chain."""
-    size, window = os.fstat(descriptor).st_size, TAIL_BYTES
-    while size:
-        start = max(0, size - window)
-        tail = os.pread(descriptor, size - start, start).removesuffix(b"\n")
-        at = _last_chained(tail, is_whole=start == 0)
-        if at is not None or start == 0:
-            return hashlib.sha256(tail[at or 0 :]).hexdigest()
-        window *= 8
-    return None
+    size = os.fstat(descriptor).st_size
+    start = max(0, size - TAIL_BYTES)
+    tail = os.pread(descriptor, size - start, start)
+    at = _last_chained(tail, is_whole=start == 0)
+    if at is not None or start == 0:
+        return hashlib.sha256(tail[at or 0 :].removesuffix(b"\n")).hexdigest() if size else None
+    digest, end = hashlib.sha256(), size - tail.endswith(b"\n")
+    for begin in range(_chained_before(descriptor, start), end, PIECE_BYTES):
+        digest.update(os.pread(descriptor, min(PIECE_BYTES, end - begin), begin))
+    return digest.hexdigest()
+
+
+def _chained_before(descriptor: int, end: int) -> int:
+    """Where the last chained line begins that begins at this place or before; 0 if there is none."""
+    while end > 0:
+        start = max(0, end - PIECE_BYTES)
+        piece = os.pread(descriptor, end + BEGINNING_BYTES - start, start)
+        if (at := _last_chained(piece, is_whole=start == 0)) is not None:
+            return start + at
+        end = start
+    return 0
 
 
 def _last_chained(tail: bytes, *, is_whole: bool) -> int | None:

@@ -169,6 +169,26 @@ def test_a_line_costs_a_look_at_the_end_of_the_file_whatever_its_size(
     assert sum(read) <= chain.TAIL_BYTES + len(START) + 1
 
 
+@pytest.mark.parametrize("before", [0, 1, 70, 500])
+@pytest.mark.parametrize("end", [b"\n", b""])
+def test_many_lines_without_a_chain_are_read_in_pieces_wherever_the_last_chained_line_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int, end: bytes
+) -> None:
+    monkeypatch.setattr(chain, "PIECE_BYTES", 200, raising=False)
+    read: list[int] = []
+    pread = chain.os.pread
+    old, path = b'{"time":"then"}\n', tmp_path / AUDIT_FILE
+    for after in range(0, 420, 3):
+        path.write_bytes(old * before)
+        write(tmp_path)
+        with path.open("ab") as file:
+            file.write(b"x" * after + b"\n" + old * 300 + b"cut" + end)
+        with path.open("rb") as file, monkeypatch.context() as counting:
+            counting.setattr(chain.os, "pread", lambda *place: (read.append(place[1]), pread(*place))[1])
+            assert chain.head_of(file.fileno()) == check_file(path).head
+    assert max(read) <= chain.TAIL_BYTES
+
+
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "audit.gz").write_bytes(b"no gzip")
     damaged = bytearray(gzip.compress(b"a line of an audit\n" * 100))
