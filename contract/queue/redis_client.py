@@ -52,10 +52,13 @@ def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
         "socket_connect_timeout": min(timeout_s, MAX_CONNECT_TIMEOUT_S),
     }
     try:
-        return _by_sentinels(where, options) if where.sentinels else redis.Redis.from_url(where.url, **options)
-    except ValueError as error:  # its text may quote a part of the password
+        client: Any = _by_sentinels(where, options) if where.sentinels else redis.Redis.from_url(where.url, **options)
+        pool = client.connection_pool
+        pool.connection_class(**pool.connection_kwargs)  # connects to nothing, and refuses unknown options
+    except (ValueError, TypeError) as error:  # its text may quote a part of the password
         remedy = "Write / : @ # % in a password as %2F %3A %40 %23 %25, and check the options after the `?`."
         raise InputError(VARIABLE, "it cannot be read.", remedy) from error
+    return client
 
 
 def _by_sentinels(where: QueueUrl, options: dict[str, Any]) -> Any:

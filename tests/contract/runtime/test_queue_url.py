@@ -41,7 +41,16 @@ def test_a_url_of_another_kind_is_refused_at_the_start_without_being_repeated(ur
     assert "secret" not in str(refused.value)
 
 
-@pytest.mark.parametrize("url", ["redis://u:sec/ret@one", "redis+sentinel://one/name?socket_timeout=secret"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "redis://u:sec/ret@one",
+        "redis+sentinel://one/name?socket_timeout=secret",
+        "redis://u:secret@one?no_such_option=1",
+        "unix:///run/queue.sock?no_such_option=secret",
+        "redis+sentinel://u:secret@one/name?no_such_option=1",
+    ],
+)
 def test_a_password_or_option_that_cannot_be_read_is_refused_without_being_repeated(url: str) -> None:
     with pytest.raises(InputError, match="REDIS_URL") as refused:
         RedisQueue(url)
