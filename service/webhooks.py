@@ -13,6 +13,7 @@ import ssl
 import time
 import uuid
 from dataclasses import dataclass
+from http.cookiejar import CookieJar, DefaultCookiePolicy
 
 import httpx
 from starlette.concurrency import run_in_threadpool
@@ -63,9 +64,10 @@ class Webhooks:
         tls = await run_in_threadpool(ssl.create_default_context)
         timeout = httpx.Timeout(TRY_S, connect=CONNECT_S)
         limits = httpx.Limits(max_keepalive_connections=0)  # a connection belongs to the name it was made for
+        no_cookies = CookieJar(DefaultCookiePolicy(allowed_domains=[]))  # receivers may share an address
         # trust_env: no proxy of the environment comes between the address that was judged and the one connected to
         async with (
-            httpx.AsyncClient(verify=tls, trust_env=False, limits=limits, timeout=timeout) as http,
+            httpx.AsyncClient(verify=tls, trust_env=False, limits=limits, timeout=timeout, cookies=no_cookies) as http,
             asyncio.TaskGroup() as tries,
         ):
             while True:

@@ -97,6 +97,7 @@ class Receiver:
             return
         status = self._answers.pop(0) if self._answers else 204
         request.send_response(status)
+        request.send_header("Set-Cookie", "receivers=own")
         if 300 <= status < 400:
             request.send_header("Location", "/elsewhere")
         if not self._floods:

@@ -143,6 +143,12 @@ def test_of_an_answer_without_end_little_is_read(tmp_path: Path) -> None:
         assert receiver.flooded_bytes.get(timeout=LOG_WITHIN_S) < 2**24  # what buffers of the system hold
 
 
+def test_what_one_receiver_sets_as_a_cookie_is_sent_to_nobody(service: ServiceUnderTest, receiver: Receiver) -> None:
+    for _ in range(2):
+        log_of(service, cancelled(service, f"{receiver.origin}/"), lambda delivery: delivery["status"] == "delivered")
+        assert "cookie" not in receiver.next().headers
+
+
 def test_a_service_that_starts_delivers_what_is_owed(receiver: Receiver, tmp_path: Path) -> None:
     queue = MemoryQueue()
     for service in running_service(tmp_path, queue, webhook_secret=SECRET, webhook_hosts=(receiver.origin,)):
