@@ -15,6 +15,7 @@ from contract.wire.job import JobError
 from contract.wire.names import CURVE, MANIFEST, REPORT
 from contract.wire.notices import NoticeCode
 from contract.wire.rendering import WorkerAddress
+from contract.wire.webhooks import Delivery, TryFailure
 from tests.contract.queues import TRAINING, job
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 
@@ -38,6 +39,12 @@ def test_an_error_of_a_kind_that_came_later_is_unclassified_and_keeps_its_words(
     record = record_of("0" * 32, stored(error=json.dumps(told)))
     assert record is not None
     assert record.error == JobError(code=ErrorCode.UNCLASSIFIED, problem="The moon is full.", remedy="Wait.")
+
+
+def test_a_try_of_a_webhook_that_failed_for_a_reason_that_came_later_is_unclassified() -> None:
+    tries = [{"at_s": 1.0, "failure": "came_later"} | LATER, {"at_s": 9.0, "status_code": 204}]
+    told = {"event_id": "5f.1.done", "state": "done", "ended_at_s": 0.5, "tries": tries} | LATER
+    assert [each.failure for each in Delivery.model_validate(told).tries] == [TryFailure.UNCLASSIFIED, None]
 
 
 def test_a_report_with_more_fields_and_notices_that_came_later_is_read(tmp_path: Path) -> None:

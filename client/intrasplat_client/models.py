@@ -162,6 +162,7 @@ class TryFailure(StrEnum):
     STATUS = "status"
     TIMEOUT = "timeout"
     UNREACHABLE = "unreachable"
+    UNCLASSIFIED = "unclassified"
 
 
 class CameraPoses(Model):

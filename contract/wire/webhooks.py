@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from enum import StrEnum
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from contract.wire.codes import known_code
 from contract.wire.job import JobState
 from contract.wire.names import JOB_ID_PATTERN
 
@@ -37,6 +39,7 @@ class TryFailure(StrEnum):
     STATUS = "status"
     TIMEOUT = "timeout"
     UNREACHABLE = "unreachable"
+    UNCLASSIFIED = "unclassified"
 
 
 class DeliveryTry(BaseModel):
@@ -46,7 +49,9 @@ class DeliveryTry(BaseModel):
 
     at_s: float = Field(description="when it began, UNIX s")
     status_code: int | None = Field(default=None, description="the receiver's answer; None if there was none")
-    failure: TryFailure | None = Field(default=None, description="why it failed; None: the webhook was delivered")
+    failure: Annotated[TryFailure | None, known_code(TryFailure)] = Field(
+        default=None, description="why it failed; None: the webhook was delivered"
+    )
 
 
 class Delivery(BaseModel):

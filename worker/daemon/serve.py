@@ -250,7 +250,11 @@ class RequestServer:
             for begun in self._begun:
                 begun.is_given_up |= (begun.caller, begun.request_id) == (caller, request_id)
             return
-        cost = self._cost(request)
+        try:
+            cost = self._cost(request)
+        except Exception as error:  # what one caller asks must not end the loop for all
+            self._send(caller, request_id, WorkerReply(error=_reply_error(error)))
+            return
         seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
         arrived_s = time.monotonic()
         turn = Turn(caller, request_id, request, cost, seconds, least_s, arrived_s, trace=envelope.trace)

@@ -122,6 +122,17 @@ def test_who_sends_too_much_is_cut_off_and_others_are_answered(endpoint: str) ->
         assert ask(other, request(0))[0].error is None
 
 
+def test_a_request_whose_cost_cannot_be_told_gets_an_error_and_the_next_is_answered(endpoint: str) -> None:
+    def cost(asked: RenderRequest) -> float:
+        return 1 / asked.t
+
+    with RequestServer(endpoint, answer, cost=cost), connected(endpoint) as socket:
+        head, _ = ask(socket, request(0))
+        assert head.error is not None
+        assert head.error.kind == "internal"
+        assert ask(socket, request(0.5))[0].error is None
+
+
 def test_requests_of_one_caller_are_answered_in_their_order(socket: zmq.Socket[bytes]) -> None:
     for number in range(20):
         socket.send_multipart([bytes([number]), request(0)])
