@@ -25,6 +25,25 @@
  *   cy: number,
  * }} ClipCamera
  */
+/**
+ * @typedef {{
+ *   event_id: string,
+ *   state: JobState,
+ *   error_code?: string | null,
+ *   ended_at_s: number,
+ *   status?: DeliveryStatus,
+ *   tries?: DeliveryTry[],
+ *   next_try_at_s?: number | null,
+ * }} Delivery
+ */
+/** @typedef {"owed"|"delivered"|"failed"} DeliveryStatus */
+/**
+ * @typedef {{
+ *   at_s: number,
+ *   status_code?: number | null,
+ *   failure?: TryFailure | null,
+ * }} DeliveryTry
+ */
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
@@ -252,6 +271,7 @@
  * }} SceneCameras
  */
 /** @typedef {"info"|"warning"} Severity */
+/** @typedef {"address_refused"|"certificate"|"host_refused"|"status"|"timeout"|"unreachable"|"unclassified"} TryFailure */
 /** Each option's default, choices and limits. */
 export const LIMITS = {
   layout: {"default": "auto", "choices": ["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]},

@@ -123,8 +123,9 @@ def test_all_formats_hold_the_same_mesh(scene: Scene) -> None:
     np.testing.assert_allclose(stl.triangles, ply.triangles, rtol=1e-6)
     assert glb.faces.shape == ply.faces.shape
     np.testing.assert_allclose(glb.vertices, ply.vertices * [1e-3, -1e-3, -1e-3], rtol=1e-6)
-    normals = stl.face_normals * [1, -1, -1]
-    np.testing.assert_allclose(glb.face_normals, normals, atol=1e-3)
+    normals, is_sliver = stl.face_normals * [1, -1, -1], stl.area_faces < 1e-3 * np.median(stl.area_faces)
+    assert is_sliver.mean() < 0.01
+    np.testing.assert_allclose(glb.face_normals[~is_sliver], normals[~is_sliver], atol=1e-3)
 
 
 def test_without_scikit_image_the_remedy_is_told(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

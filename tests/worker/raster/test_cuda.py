@@ -195,7 +195,7 @@ def test_what_the_kernels_would_misread_is_refused(memory: str) -> None:
     view = SceneFrames([scene_of()], memory)
     camera, state, logit, colour = view.arguments()
     rasterizer = view.rasterizer()
-    with pytest.raises(ValueError, match=r"camera is contiguous torch.float32 \[1, 20\], not .* torch.float64"):
+    with pytest.raises(ValueError, match=r"camera is contiguous torch.float32 \[1, 26\], not .* torch.float64"):
         rasterizer.project(camera.float(), state, logit, colour)
     with pytest.raises(ValueError, match=r"state is strided"):
         rasterizer.project(camera, state.transpose(1, 2).contiguous().transpose(1, 2), logit, colour)
