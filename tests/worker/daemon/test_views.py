@@ -1,4 +1,5 @@
 """Renders of stored scenes: the requested camera, and no picture of a scene that is gone."""
+# long: every picture, measurement and file that views of one store answer
 
 from __future__ import annotations
 
