@@ -7,16 +7,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from tests.worker.evaluate.rivals.cases import (
-    check_gradient,
-    depth_error_mm,
-    fitted,
-    frame_of,
-    numbers_of,
-    score_db,
-    small_clip,
-    without_held_out,
-)
+from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, drawn_edges, excess, importance
 from worker.evaluate.rivals.rival import Seen
 
@@ -65,19 +56,11 @@ def test_samples_gather_where_the_proposals_have_weight() -> None:
 
 
 def test_it_overfits_one_frame_above_30_db() -> None:
-    clip = small_clip(2)
-    rival = fitted(small, clip, [1], 180)
-    assert score_db(rival, clip, 1) > 30
-    assert depth_error_mm(rival, clip, 1) < 1
+    check_overfit(small, 180)
 
 
 def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
-    clip = small_clip(9)
-    first, spoilt = (fitted(small, each, [0, 8], 40) for each in (clip, without_held_out(clip, 4)))
-    assert numbers_of(first) == numbers_of(spoilt)
-    np.testing.assert_array_equal(frame_of(first, clip, 4).rgb, frame_of(spoilt, clip, 4).rgb)
-    assert np.abs(frame_of(first, clip, 8).rgb - frame_of(first, clip, 0).rgb).max() > 0.01
-    assert numbers_of(fitted(small, clip, [0, 8], 40, seed=1)) != numbers_of(first)
+    check_what_counts(small)
 
 
 def test_pixels_that_change_and_tissue_that_hides_are_drawn_more_often() -> None:
