@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from contract.queue.interface import Queue
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.names import MANIFEST
+from tests.contract.queues import claimed
 
 BUCKET_URL = "s3://clips/of/all"
 
@@ -40,6 +42,14 @@ def published(store: Store, job_id: str, attempt: int, content: bytes = b"tensor
     digest = hashlib.sha256(content).hexdigest()
     (folder / MANIFEST).write_text(json.dumps({"files": {"scene.safetensors": {"sha256": digest}}}))
     return store.publish_scene(job_id, attempt)
+
+
+def finished(store: Store, queue: Queue, job_id: str) -> str:
+    """The job, which is the next in the queue, done: its scene is published."""
+    _, claim = claimed(queue)
+    published(store, job_id, claim.attempt)
+    assert queue.finish(claim)
+    return job_id
 
 
 def lead_to(environment: pytest.MonkeyPatch, server: str) -> None:

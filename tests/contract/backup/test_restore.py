@@ -25,7 +25,7 @@ from contract.store.store import RESTORING, Store, open_store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobFiles, JobRecord, JobState
 from tests.contract.queues import ERROR, claimed, job, known
-from tests.contract.stores import BUCKET_URL, files_no_larger_than, published
+from tests.contract.stores import BUCKET_URL, files_no_larger_than, finished, published
 
 
 class Site:
@@ -43,11 +43,7 @@ class Site:
         return self.queue.submit(record).job_id
 
     def done(self) -> str:
-        job_id = self.queued()
-        _, claim = claimed(self.queue)
-        published(self.store, job_id, claim.attempt)
-        assert self.queue.finish(claim)
-        return job_id
+        return finished(self.store, self.queue, self.queued())
 
     def backup(self, shelf: Path) -> Path:
         return take_backup(self.settings, self.queue, shelf).path

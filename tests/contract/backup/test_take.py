@@ -20,8 +20,7 @@ from contract.store.store import PURGING, UNSCORED, Store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import Labels
-from tests.contract.queues import claimed
-from tests.contract.stores import accepted, files_no_larger_than, published
+from tests.contract.stores import accepted, files_no_larger_than, finished
 
 
 class Site:
@@ -37,11 +36,7 @@ class Site:
         return self.queue.submit(accepted(self.store)).job_id
 
     def done(self) -> str:
-        job_id = self.queued()
-        _, claim = claimed(self.queue)
-        published(self.store, job_id, claim.attempt)
-        assert self.queue.finish(claim)
-        return job_id
+        return finished(self.store, self.queue, self.queued())
 
     def backup(self, *, full: bool = False) -> Taken:
         return take_backup(self.settings, self.queue, self.shelf, full=full)
