@@ -119,7 +119,8 @@ class Feeds:
                 if feed.is_over or has_ended or time.monotonic() > ends_at_s:
                     return
                 try:
-                    await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
+                    async with asyncio.timeout(HEARTBEAT_S):
+                        await changed.wait()
                 except TimeoutError:
                     yield format_sse_event(comment="still here")
 

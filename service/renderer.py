@@ -97,12 +97,14 @@ class ZmqRenderer:
         first, *others = workers
         if others:
             with contextlib.suppress(WorkerGoneError, TimeoutError):
-                answer = await asyncio.wait_for(self._ask(first, request, patiently=False), self._timeout_s / 2)
+                async with asyncio.timeout(self._timeout_s / 2):
+                    answer = await self._ask(first, request, patiently=False)
                 if answer.head.error is None or answer.head.error.kind != "busy":
                     return answer
             first = others[0]
         try:
-            return await asyncio.wait_for(self._ask(first, request), until_s - time.monotonic())
+            async with asyncio.timeout(until_s - time.monotonic()):
+                return await self._ask(first, request)
         except TimeoutError:
             problem = f"The worker did not answer within {self._timeout_s:g} s."
             raise UnavailableError(problem, _remedy(first)) from None

@@ -171,7 +171,8 @@ class _Viewer:
             except Exception as error:
                 await self._tell(error, document.get("id") if isinstance(document, dict) else None)
             else:
-                await asyncio.wait_for(self._websocket.send_bytes(answer), SEND_TIMEOUT_S)
+                async with asyncio.timeout(SEND_TIMEOUT_S):
+                    await self._websocket.send_bytes(answer)
 
     async def _answer(self, document: dict[str, Any] | Problem, start: float) -> bytes:
         """The message with the view."""
@@ -199,7 +200,8 @@ class _Viewer:
         if isinstance(problem, Refusal):
             await self._services.audit.refused(problem)
         document = {**problem.document(), "id": message_id}
-        await asyncio.wait_for(self._websocket.send_text(json.dumps(document)), SEND_TIMEOUT_S)
+        async with asyncio.timeout(SEND_TIMEOUT_S):
+            await self._websocket.send_text(json.dumps(document))
 
     async def _hang_up(self, reason: _HangUp) -> None:
         if isinstance(reason.problem, Refusal):

@@ -168,9 +168,10 @@ class Bridge:
                 return wanted
             if self._shown is not None and time.monotonic() - since_s > CHECK_S:
                 return self._shown.view
+            plays = self.link.has_peers and self._playback.plays
             with contextlib.suppress(TimeoutError):
-                plays = self.link.has_peers and self._playback.plays
-                await asyncio.wait_for(self._woken.wait(), LOOK_S if plays else CHECK_S)
+                async with asyncio.timeout(LOOK_S if plays else CHECK_S):
+                    await self._woken.wait()
 
     async def _show_view(self, wanted: _View) -> None:
         """Render a view and send it with what belongs to it; nothing if it is the one that was sent."""

@@ -173,7 +173,8 @@ class _Peer:
                 device = next(iter(self._waiting))
                 self._is_sending = True
                 self._writer.write(self._waiting.pop(device))
-                await asyncio.wait_for(self._writer.drain(), SEND_TIMEOUT_S)
+                async with asyncio.timeout(SEND_TIMEOUT_S):
+                    await self._writer.drain()
                 self._is_sending = False
 
     async def _read(self) -> None:

@@ -219,4 +219,5 @@ def submitted() -> tuple[WatchedQueue, str]:
 
 async def limited(work: Any) -> Any:
     """What the work comes to; TimeoutError if it does not end."""
-    return await asyncio.wait_for(work, PATIENCE_S)
+    async with asyncio.timeout(PATIENCE_S):
+        return await work

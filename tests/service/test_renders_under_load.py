@@ -65,14 +65,20 @@ def test_one_caller_holds_few_large_renders_at_a_time_and_its_small_ones_are_mad
 
 
 def test_a_render_whose_caller_has_gone_is_not_made(tmp_path: Path) -> None:
-    with live_service(tmp_path, painter := HeldPainter()) as service:
+    with live_service(tmp_path, painter := HeldPainter()) as service, ThreadPoolExecutor() as pool:
         scene = service.finished_scene()
-        for t in ("0.1", "0.2", "0.3"):
+
+        def ask(t: str, timeout_s: float) -> httpx.Response:
+            return httpx.get(f"{service.url}/render", params={"scene": scene, "t": t}, timeout=timeout_s)
+
+        first = pool.submit(ask, "0.1", 30)
+        assert painter.began.wait(30)
+        for t in ("0.2", "0.3"):
             with pytest.raises(httpx.ReadTimeout):
-                httpx.get(f"{service.url}/render", params={"scene": scene, "t": t}, timeout=0.3)
+                ask(t, 0.5)
         time.sleep(0.2)  # the service notices
         painter.go_on.set()
-        assert httpx.get(f"{service.url}/render", params={"scene": scene, "t": "0.4"}).status_code == 200
+        assert first.result().status_code == ask("0.4", 30).status_code == 200
     assert painter.asked == [0.1, 0.4]
 
 
@@ -81,9 +87,10 @@ class HeldPainter:
 
     def __init__(self) -> None:
         self.asked: list[float] = []
-        self.go_on = threading.Event()
+        self.began, self.go_on = threading.Event(), threading.Event()
 
     def __call__(self, request: RenderRequest | ExportRequest) -> Reply:
         self.asked.append(request.t)
+        self.began.set()
         assert self.go_on.wait(10)
         return Reply(b"picture", "image/png", request.t, gaussians=50_000, clip_size=(640, 512))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import struct
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +27,14 @@ async def opened(link: Link) -> tuple[asyncio.Task[None], int]:
 async def read_message(reader: asyncio.StreamReader) -> tuple[str, bytes]:
     header = messages.read_header(await reader.readexactly(messages.HEADER_BYTES))
     return str(header.fields["device_name"]), await reader.readexactly(header.body_bytes)
+
+
+def run(use: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def in_time() -> None:
+        async with asyncio.timeout(60):
+            await use()
+
+    asyncio.run(in_time())
 
 
 async def until(what: object) -> None:
@@ -55,7 +66,7 @@ def test_a_slow_peer_skips_to_the_newest_picture_and_other_devices_are_not_lost(
         writer.close()
         listening.cancel()
 
-    asyncio.run(asyncio.wait_for(use(), 60))
+    run(use)
 
 
 def test_a_late_peer_gets_the_newest_of_each_device() -> None:
@@ -72,7 +83,7 @@ def test_a_late_peer_gets_the_newest_of_each_device() -> None:
         writer.close()
         listening.cancel()
 
-    asyncio.run(asyncio.wait_for(use(), 60))
+    run(use)
 
 
 def test_what_a_peer_sends_is_heard_and_long_texts_of_other_kinds_are_passed_over() -> None:
@@ -93,7 +104,7 @@ def test_what_a_peer_sends_is_heard_and_long_texts_of_other_kinds_are_passed_ove
         writer.close()
         listening.cancel()
 
-    asyncio.run(asyncio.wait_for(use(), 60))
+    run(use)
 
 
 def test_a_message_that_is_far_too_long_ends_the_connection_before_it_is_read() -> None:
@@ -107,7 +118,7 @@ def test_a_message_that_is_far_too_long_ends_the_connection_before_it_is_read() 
             writer.close()
         listening.cancel()
 
-    asyncio.run(asyncio.wait_for(use(), 60))
+    run(use)
 
 
 def test_more_peers_than_a_few_are_turned_away() -> None:
@@ -123,4 +134,23 @@ def test_more_peers_than_a_few_are_turned_away() -> None:
             writer.close()
         listening.cancel()
 
-    asyncio.run(asyncio.wait_for(use(), 60))
+    run(use)
+
+
+def test_a_peer_that_is_shown_out_while_it_is_sent_to_is_let_go() -> None:
+    async def use() -> None:
+        link = Link(lambda heard: None, lambda: None)
+        listening, port = await opened(link)
+        for each in range(200):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            for _ in range(each % 10):
+                await asyncio.sleep(0)
+            link.send(messages.STATUS, messages.text(messages.STATUS, "here"))
+            writer.write(b"GET / HTTP/1.1".ljust(messages.HEADER_BYTES))
+            with contextlib.suppress(ConnectionResetError):
+                await reader.read()
+            writer.close()
+        await until(lambda: not link.has_peers)
+        listening.cancel()
+
+    run(use)
