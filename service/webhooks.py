@@ -80,7 +80,7 @@ class Webhooks:
                     tries.create_task(self._deliver(http, loan)).add_done_callback(lambda _: places.release())
 
     def _lent(self) -> Loan | None:
-        """A delivery that is due; None also while the queue is away."""
+        """A delivery that is due; None also while the queue is away, and for one that cannot be read."""
         try:
             loan = self._queue.lend_delivery(uuid.uuid4().hex)
         except UnavailableError as error:
@@ -88,10 +88,21 @@ class Webhooks:
                 logger.warning("webhooks wait for the queue: %s", error.problem)
             self._is_away = True
             return None
+        except Exception:  # its loan runs out, and the others are lent meanwhile
+            logger.exception("a webhook that is owed cannot be read")
+            return None
         self._is_away = False
         return loan
 
     async def _deliver(self, http: httpx.AsyncClient, loan: Loan) -> None:
+        """Try once, and note it. What nobody foresaw ends this try alone, whose loan then runs out."""
+        try:
+            await self._note(loan, await self._tried(http, loan))
+        except Exception:
+            logger.exception("what became of a webhook is not noted", extra={"job_id": loan.delivery.job_id})
+
+    async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
+        """The delivery after one more try."""
         began_s, status_code, failure = time.time(), None, None
         try:
             async with asyncio.timeout(TRY_S):
@@ -100,7 +111,12 @@ class Webhooks:
             failure = TryFailure.TIMEOUT
         except TryFailed as error:
             failure, status_code = error.failure, error.status_code
-        delivery = _after(loan.delivery, DeliveryTry(at_s=began_s, status_code=status_code, failure=failure))
+        except Exception:
+            logger.exception("a webhook was not sent by a fault of ours", extra={"job_id": loan.delivery.job_id})
+            failure = TryFailure.FAULT
+        return _after(loan.delivery, DeliveryTry(at_s=began_s, status_code=status_code, failure=failure))
+
+    async def _note(self, loan: Loan, delivery: Delivery) -> None:
         _log(delivery)
         wait_s = wait_after(len(delivery.tries)) if delivery.status is DeliveryStatus.OWED else None
         try:

@@ -43,15 +43,17 @@ class Webhook:
 class Receiver:
     """Keeps what comes and answers with `answers`, one after the other, then with 204; a context manager.
 
-    tls: it speaks https with this certificate. hangs: it takes a request and never answers it. floods: its answers have
+    tls: it speaks https with this certificate. waits: it answers a request only after go_on(). floods: its answers have
     bodies without end.
     """
 
-    def __init__(self, *answers: int, tls: ssl.SSLContext | None = None, hangs: bool = False, floods: bool = False):
+    def __init__(self, *answers: int, tls: ssl.SSLContext | None = None, waits: bool = False, floods: bool = False):
         self._answers = list(answers)
-        self._hangs = hangs
         self._floods = floods
         self._end = threading.Event()
+        self._may_answer = threading.Event()
+        if not waits:
+            self._may_answer.set()
         self.came: queue.Queue[Webhook] = queue.Queue()
         self.all: list[Webhook] = []
         self.flooded_bytes: queue.Queue[int] = queue.Queue()
@@ -59,7 +61,8 @@ class Receiver:
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
-                receiver._take(self)
+                with suppress(OSError):  # the service may have hung up
+                    receiver._take(self)
 
             def log_message(self, *_: object) -> None:
                 pass
@@ -78,9 +81,14 @@ class Receiver:
 
     def __exit__(self, *exception: object) -> None:
         self._end.set()
+        self.go_on()
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
+
+    def go_on(self) -> None:
+        """Answer what came and what comes."""
+        self._may_answer.set()
 
     def next(self) -> Webhook:
         """The next that comes; queue.Empty if none does."""
@@ -92,9 +100,7 @@ class Receiver:
         webhook = Webhook(request.path, headers, body)
         self.all.append(webhook)
         self.came.put(webhook)
-        if self._hangs:
-            self._end.wait()
-            return
+        self._may_answer.wait()
         status = self._answers.pop(0) if self._answers else 204
         request.send_response(status)
         request.send_header("Set-Cookie", "receivers=own")

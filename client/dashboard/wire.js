@@ -271,7 +271,7 @@
  * }} SceneCameras
  */
 /** @typedef {"info"|"warning"} Severity */
-/** @typedef {"address_refused"|"certificate"|"host_refused"|"status"|"timeout"|"unreachable"|"unclassified"} TryFailure */
+/** @typedef {"address_refused"|"certificate"|"fault"|"host_refused"|"status"|"timeout"|"unreachable"|"unclassified"} TryFailure */
 /** Each option's default, choices and limits. */
 export const LIMITS = {
   layout: {"default": "auto", "choices": ["auto", "endonerf", "stereomis", "sbs", "tb", "frames"]},

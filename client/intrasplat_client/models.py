@@ -158,6 +158,7 @@ class TryFailure(StrEnum):
 
     ADDRESS_REFUSED = "address_refused"
     CERTIFICATE = "certificate"
+    FAULT = "fault"
     HOST_REFUSED = "host_refused"
     STATUS = "status"
     TIMEOUT = "timeout"

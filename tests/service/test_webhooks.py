@@ -14,9 +14,11 @@ import pytest
 from client.cli import main as command_line
 from contract.access.keys import KeyScope
 from contract.access.webhook_secrets import tenant_secret
+from contract.queue.deliveries import Loan
 from contract.queue.memory import MemoryQueue
+from contract.store.shelf import new_job_id
 from contract.wire.errors import ErrorCode, UnavailableError
-from contract.wire.job import LOCAL_TENANT, JobError
+from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from service import webhooks
 from service.webhooks import FIRST_WAIT_S, JITTER, MAX_TRIES, MAX_WAIT_S, wait_after
 from tests.receiver import Receiver, Webhook
@@ -132,7 +134,7 @@ def test_waits_grow_fourfold_from_seconds_to_hours_and_differ_a_little() -> None
 
 def test_a_receiver_that_does_not_answer_costs_one_try(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(webhooks, "TRY_S", 0.3)
-    with Receiver(hangs=True) as receiver, telling(receiver, tmp_path) as service:
+    with Receiver(waits=True) as receiver, telling(receiver, tmp_path) as service:
         assert failure_of(service, cancelled(service, f"{receiver.origin}/")) == ("timeout", None)
 
 
@@ -187,6 +189,56 @@ def test_while_the_queue_is_away_nothing_is_lost(
     assert receiver.came.empty()
     monkeypatch.setattr(service.queue, "lend_delivery", lend)
     assert receiver.next().document["data"]["job_id"] == job_id
+
+
+def ended_after_the_last_day(queue: MemoryQueue, url: str) -> str:
+    """A job whose webhook no service can write: no calendar has the day on which it ended."""
+    ended = {"state": JobState.DONE, "attempt": 1, "finished_at_s": 1e20, "callback_url": url}
+    record = JobRecord(job_id=new_job_id(), files=JobFiles(clip="clip.mp4"), created_at_s=1.0).model_copy(update=ended)
+    queue.restore(record)
+    return record.job_id
+
+
+def test_a_fault_in_one_try_ends_neither_the_loop_nor_the_tries_under_way(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    queue = MemoryQueue()
+    with Receiver(waits=True) as slow, Receiver() as receiver:
+        with telling(receiver, tmp_path, queue, webhook_hosts=(slow.origin, receiver.origin)) as service:
+            under_way = cancelled(service, f"{slow.origin}/")
+            slow.next()
+            faulty = ended_after_the_last_day(queue, f"{receiver.origin}/")
+            assert failure_of(service, faulty) == ("fault", None)
+            job_id = cancelled(service, f"{receiver.origin}/")
+            assert receiver.next().document["data"]["job_id"] == job_id
+            slow.go_on()
+            delivery = log_of(service, under_way, lambda delivery: delivery["status"] == "delivered")
+            assert len(delivery["tries"]) == 1
+        assert slow.came.empty()
+    (tried,) = queue.deliveries(faulty)
+    assert (tried.status, [each.failure for each in tried.tries]) == ("owed", ["fault"])
+    (fault,) = [each for each in caplog.records if each.exc_info]
+    assert fault.__dict__["job_id"] == faulty
+
+
+def test_a_delivery_that_cannot_be_read_is_logged_and_the_others_go_out(
+    receiver: Receiver,
+    service: ServiceUnderTest,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lend, left = service.queue.lend_delivery, [ValueError("of a later version")]
+
+    def damaged(*arguments: str) -> Loan | None:
+        if left:
+            raise left.pop()
+        return lend(*arguments)
+
+    monkeypatch.setattr(service.queue, "lend_delivery", damaged)
+    with caplog.at_level(logging.ERROR, "intrasplat.service"):
+        job_id = cancelled(service, f"{receiver.origin}/")
+        assert receiver.next().document["data"]["job_id"] == job_id
+    assert [each.getMessage() for each in caplog.records] == ["a webhook that is owed cannot be read"]
 
 
 def test_the_same_idempotency_key_with_another_callback_is_refused(

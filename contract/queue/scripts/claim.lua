@@ -25,13 +25,19 @@ end
 
 -- Fail a job whose hash no script can work with, so that it does not block the queue.
 local function set_aside(id, priority)
-  redis.pcall('HSET', document(id), 'state', 'failed', 'error', RULES.unreadable, 'finished', now())
+  local ended = {id = id, state = 'failed', error = RULES.unreadable, finished = now()}
+  redis.pcall('HSET', document(id), 'state', ended.state, 'error', ended.error, 'finished', ended.finished)
   redis.call('ZREM', waiting(priority), id)
   redis.call('ZREM', P .. 'queued', id)
-  local tenant = redis.pcall('HGET', document(id), 'tenant')
-  if type(tenant) == 'string' then redis.call('SREM', waiting_of(tenant), id) end
-  redis.call('HINCRBY', P .. 'ended', 'failed', 1)
-  redis.call('ZADD', P .. 'dead', now(), id)
+  redis.call('HINCRBY', P .. 'ended', ended.state, 1)
+  redis.call('ZADD', P .. 'dead', ended.finished, id)
+  local flat = redis.pcall('HGETALL', document(id))
+  if flat.err then return end -- no hash: whose job it was is not known
+  local left = table_of(flat)
+  ended.tenant, ended.callback, ended.attempt = left.tenant, left.callback, tonumber(left.attempt) or 0
+  if not ended.tenant then return end
+  redis.call('SREM', waiting_of(ended.tenant), id)
+  owe(ended)
 end
 
 -- Give the owner the job of a stream's entry; nil if the entry had no job to give. Then it is removed.

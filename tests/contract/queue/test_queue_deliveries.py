@@ -7,10 +7,12 @@ from collections.abc import Callable
 from itertools import count
 
 import pytest
+import redis
 
 from contract.queue import memory_deliveries, redis_queue
 from contract.queue.deliveries import Loan
 from contract.queue.interface import MAX_ATTEMPTS, Claim, Queue
+from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobState
 from contract.wire.webhooks import DeliveryStatus, DeliveryTry, TryFailure
 from tests.contract.queues import ERROR, claimed, job
@@ -81,6 +83,23 @@ def test_a_queued_job_that_is_cancelled_owes_one_and_a_job_without_a_callback_ow
     assert loan.delivery.job_id == first.job_id
     assert lent(queue) is None
     assert queue.deliveries(second.job_id) == []
+
+
+@pytest.mark.parametrize("damage", [{"priority": "low"}, {"state": "paused"}, {"document": "{"}])
+def test_a_job_that_is_set_aside_because_its_record_is_damaged_owes_a_webhook(
+    served: RedisQueue, client: redis.Redis, damage: dict[str, str]
+) -> None:
+    job_id = served.submit(job(callback_url=CALLBACK)).job_id
+    client.hset(f"{PREFIX}job:{job_id}", mapping=damage)
+    assert served.claim("worker-1", 0.0) is None
+    loan = lent(served)
+    assert loan is not None
+    assert (loan.url, loan.tenant, loan.delivery.job_id) == (CALLBACK, "ward-1", job_id)
+    assert (loan.delivery.state, loan.delivery.error_code) == (JobState.FAILED, "record_unreadable")
+    assert loan.delivery.ended_at_s == pytest.approx(time.time(), abs=60.0)
+    assert tried(served, loan, None, None)
+    assert [each.status for each in served.deliveries(job_id)] == [DeliveryStatus.DELIVERED]
+    assert served.forget(job_id)
 
 
 def test_a_failed_delivery_is_lent_again_when_it_is_due_and_a_delivered_one_never(queue: Queue) -> None:
