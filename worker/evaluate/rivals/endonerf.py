@@ -23,8 +23,6 @@ from worker.input.camera import Intrinsics
 from worker.stereo.right_eye import nearest_known
 from worker.train.hooks import RenderedFrame
 
-RENDERED_RAYS = 4096
-"""At a time."""
 GUIDES = 8
 """Training frames nearest in time whose depth guides the rays of a render."""
 
@@ -71,7 +69,7 @@ class EndoNerf(Rival):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.field = _Field(self.settings).to(seen.rgb)
-        self.optimizer = torch.optim.Adam(self.field.parameters())
+        self.optimizer = torch.optim.Adam(self.field.parameters(), fused=True)
 
     def rates(self, progress: float) -> Sequence[float]:
         first, last = self.settings.rate, self.settings.last_rate
@@ -108,7 +106,7 @@ class EndoNerf(Rival):
         def show(part: slice, origin: Tensor, direction: Tensor) -> Shown:
             return self._shown(origin, direction, (about[part, None] + offsets).clamp(0, 1), t)
 
-        return picture(self._box, intrinsics, pose, show, RENDERED_RAYS)
+        return picture(self._box, intrinsics, pose, show, self.settings.samples)
 
     def _shown(self, origin: Tensor, direction: Tensor, s: Tensor, t: float) -> Shown:
         """What is shown by rays whose samples lie at ascending s [M, S]."""
@@ -158,7 +156,7 @@ class _Trunk(nn.Module):
     def forward(self, given: Tensor) -> Tensor:
         value = given
         for k, layer in enumerate(self.layers):
-            value = torch.relu(layer(torch.cat([value, given], 1) if k == self.again and k else value))
+            value = torch.relu_(layer(torch.cat([value, given], 1) if k == self.again and k else value))
         return value
 
 
@@ -183,7 +181,7 @@ class _Field(nn.Module):
             place = place + self.displacement(self.displace(torch.cat([_encoded(place, octaves), time], 1)))
         known = self.trunk(_encoded(place, octaves))
         branch = self.branch(torch.cat([self.feature(known), _encoded(view, self.settings.view_octaves)], 1))
-        return torch.relu(self.density(known))[:, 0], torch.sigmoid(self.colour(torch.relu(branch)))
+        return torch.relu(self.density(known))[:, 0], torch.sigmoid(self.colour(torch.relu_(branch)))
 
 
 def _encoded(value: Tensor, octaves: int) -> Tensor:

@@ -28,6 +28,8 @@ SOLID = 1e10
 """Length of a ray's last sample: whatever is dense there ends the ray."""
 OUTLIERS = 0.001
 """Share of the depths beyond each end of the box."""
+RENDERED_SAMPLES = {"cpu": 1 << 16, "gpu": 1 << 20}
+"""At a time: a processor's caches hold what few samples need, a GPU wants many."""
 MAX_SAMPLED = 1 << 20
 """Pixels that decide the box: torch.quantile takes no more than 2^24."""
 
@@ -109,12 +111,14 @@ Shown = tuple[Tensor, Tensor, Tensor]
 
 
 def picture(
-    box: Box, camera: Intrinsics, pose: Tensor, show: Callable[[slice, Tensor, Tensor], Shown], at_a_time: int
+    box: Box, camera: Intrinsics, pose: Tensor, show: Callable[[slice, Tensor, Tensor], Shown], samples: int
 ) -> RenderedFrame:
-    """The picture of a camera at world_from_camera [4, 4], made of so many rays at a time.
+    """The picture of a camera at world_from_camera [4, 4].
 
     show: what rays show, given which of all pixels (row by row) they belong to, their origins and their directions.
+    samples: a ray has at most; they decide how many rays are shown at a time.
     """
+    at_a_time = max(1, RENDERED_SAMPLES["cpu" if pose.device.type == "cpu" else "gpu"] // samples)
     pixel = torch.arange(camera.height * camera.width, device=pose.device)
     origin, direction = rays(camera, pixel // camera.width, pixel % camera.width, pose)
     parts = []

@@ -26,11 +26,18 @@ from worker.evaluate.rivals.rival import Rival, Seen
 from worker.input.camera import Intrinsics
 from worker.train.hooks import RenderedFrame
 
-RENDERED_RAYS = 2048
-"""At a time."""
 MAX_LOG_DENSITY = 15.0
 WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
+
+
+@dataclass(frozen=True)
+class Evenness:
+    """Weights of how planes of space vary, how far planes of time are from 1, and their second difference in time."""
+
+    variation: float
+    unrest: float
+    jerk: float
 
 
 @dataclass(frozen=True)
@@ -62,10 +69,8 @@ class LerPlaneSettings:
     most: float = 0.1
     depth_weight: float = 1.0
     proposal_weight: float = 1.0
-    variation_weight: float = 1e-4
-    unrest_weight: float = 1e-4
-    jerk_weight: float = 0.03
-    proposal_jerk_weight: float = 1e-4
+    evenness: Evenness = Evenness(variation=1e-3, unrest=1e-3, jerk=0.05)
+    proposal_evenness: Evenness = Evenness(variation=1e-4, unrest=1e-4, jerk=1e-4)
 
 
 class LerPlane(Rival):
@@ -82,7 +87,7 @@ class LerPlane(Rival):
             time_cells = max(2, min(self.settings.time_cells, len(seen)))
             self.field = _Field(self.settings, time_cells).to(seen.rgb)
             self.proposal = _Proposal(self.settings, time_cells).to(seen.rgb)
-        self.optimizer = torch.optim.Adam([*self.field.parameters(), *self.proposal.parameters()])
+        self.optimizer = torch.optim.Adam([*self.field.parameters(), *self.proposal.parameters()], fused=True)
 
     def rates(self, progress: float) -> Sequence[float]:
         warm_up = self.settings.warm_up
@@ -115,7 +120,8 @@ class LerPlane(Rival):
             del part
             return self._shown(origin, direction, torch.full_like(origin[:, 0], t), 1.0, None)[0]
 
-        return picture(self._box, intrinsics, pose, show, RENDERED_RAYS)
+        most = max(self.settings.samples, *self.settings.proposal_samples)
+        return picture(self._box, intrinsics, pose, show, most)
 
     def _shown(
         self, origin: Tensor, direction: Tensor, t: Tensor, sharpness: float, random: torch.Generator | None
@@ -148,11 +154,11 @@ class LerPlane(Rival):
         return self._box.place(origin[:, None] + depth_mm[..., None] * direction[:, None]).flatten(0, 1)
 
     def _unevenness(self) -> Tensor:
-        chosen, total = self.settings, self._seen.rgb.new_zeros(())
-        jerks = (chosen.jerk_weight, chosen.proposal_jerk_weight)
-        for planes, jerk_weight in zip((self.field.planes, self.proposal.planes), jerks, strict=True):
-            total = total + chosen.variation_weight * planes.variation()
-            total = total + chosen.unrest_weight * planes.unrest() + jerk_weight * planes.jerk()
+        total = self._seen.rgb.new_zeros(())
+        weights = (self.settings.evenness, self.settings.proposal_evenness)
+        for planes, weight in zip((self.field.planes, self.proposal.planes), weights, strict=True):
+            total = total + weight.variation * planes.variation()
+            total = total + weight.unrest * planes.unrest() + weight.jerk * planes.jerk()
         return total
 
 

@@ -5,10 +5,13 @@ Symbols: M points, R cells of a spatial axis, Q cells of time, C features a plan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
 from torch.nn.functional import grid_sample
 
 SPACE_PAIRS, TIME_PAIRS = ((0, 1), (0, 2), (1, 2)), ((0, 3), (1, 3), (2, 3))
@@ -39,20 +42,46 @@ class Planes(nn.Module):
 
     def variation(self) -> Tensor:
         """Mean squared difference of neighbouring cells of the planes of space."""
-        found = [(each[..., 1:, :] - each[..., :-1, :]).square().mean() for each in self.space]
-        return torch.stack([*found, *((each[..., 1:] - each[..., :-1]).square().mean() for each in self.space)]).sum()
+        return torch.stack([_mean_squared_difference(each, axis, 1) for each in self.space for axis in (2, 3)]).sum()
 
     def jerk(self) -> Tensor:
         """Mean squared second difference in time of the planes of time; 0 where they have fewer than three cells."""
         total = torch.zeros((), dtype=self.time[0].dtype, device=self.time[0].device)
-        for each in self.time:
-            if each.shape[2] > 2:
-                total = total + (each[:, :, 2:] - 2 * each[:, :, 1:-1] + each[:, :, :-2]).square().mean()
-        return total
+        return total + sum(_mean_squared_difference(each, 2, 2) for each in self.time if each.shape[2] > 2)
 
     def unrest(self) -> Tensor:
         """Mean distance of the planes of time from 1, where they change nothing."""
         return torch.stack([(1 - each).abs().mean() for each in self.time]).sum()
+
+
+class _MeanSquaredDifference(Function):
+    """Its gradient is written down: autograd fills and adds whole planes for each slice of a difference."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, axis: int, order: int) -> Tensor:
+        difference = values.diff(order, axis)
+        ctx.save_for_backward(difference)
+        ctx.axis, ctx.order = axis, order
+        return difference.square().mean()
+
+    @staticmethod
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor, None, None]:
+        (difference,) = ctx.saved_tensors
+        length, axis = difference.shape[ctx.axis], ctx.axis
+        share = difference * (2 * given[0] / difference.numel())
+        shape = list(difference.shape)
+        shape[axis] += ctx.order
+        found = difference.new_zeros(shape)
+        for place in range(ctx.order + 1):
+            sign = (-1) ** (ctx.order - place) * math.comb(ctx.order, place)
+            found.narrow(axis, place, length).add_(share, alpha=sign)
+        return found, None, None
+
+
+def _mean_squared_difference(values: Tensor, axis: int, order: int) -> Tensor:
+    """Of neighbours along an axis (order 1), or of their differences (order 2)."""
+    found: Tensor = _MeanSquaredDifference.apply(values, axis, order)  # type: ignore[no-untyped-call]
+    return found
 
 
 def _sampled(planes: Tensor, at: Tensor) -> Tensor:

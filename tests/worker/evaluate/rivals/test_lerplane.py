@@ -9,6 +9,7 @@ import torch
 
 from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, drawn_edges, excess, importance
+from worker.evaluate.rivals.planes import Planes
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = LerPlaneSettings(
@@ -44,6 +45,20 @@ def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_w
     proposed.requires_grad_()
     assert torch.autograd.gradcheck(lambda each: excess(edges, weight, proposed_edges, each), (proposed / 9,))
     assert float(excess(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
+
+
+def test_how_uneven_planes_are_has_the_gradient_of_finite_differences() -> None:
+    planes = Planes((3, 5), 4, 2).double()
+    with torch.no_grad():
+        for each in planes.time:
+            each.normal_(1.0, 0.2, generator=torch.Generator().manual_seed(2))
+
+    def uneven(*_: torch.Tensor) -> torch.Tensor:
+        return planes.variation() + planes.jerk()
+
+    assert torch.autograd.gradcheck(uneven, tuple(planes.parameters()))
+    first, second = planes.time[0].diff(dim=2).diff(dim=2), planes.time[1].diff(dim=2).diff(dim=2)
+    assert torch.isclose(planes.jerk(), first.square().mean() + second.square().mean())
 
 
 def test_samples_gather_where_the_proposals_have_weight() -> None:
