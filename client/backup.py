@@ -11,7 +11,8 @@ from pathlib import Path
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError, UnavailableError
+from contract.store.owner import check_owner
+from contract.wire.errors import InputError
 from contract.wire.job import JobState
 
 
@@ -62,6 +63,7 @@ def _restore(options: argparse.Namespace) -> int:
     from contract.queue.installed import installed_queue
 
     settings = settings_of(options)
+    check_owner(settings.data_dir)
     restored = restore_backup(settings, installed_queue(settings), options.source, options.audit)
     _say(f"restored the backup of {restored.created_at}, every hash compared: {_counts(restored.jobs)}")
     _say_left_out("had been purged and did not come back", restored.purged)
@@ -76,14 +78,11 @@ def _restore(options: argparse.Namespace) -> int:
 
 def _check_installation(settings: Settings) -> None:
     """Refuse to back up what cannot be the data directory, or the queue, of the service that is meant."""
+    check_owner(settings.data_dir)
     data_dir = settings.data_dir.expanduser()
-    spool = data_dir / "spool"
-    if not os.path.isdir(spool):  # nor where this user may not look
+    if not os.path.isdir(data_dir / "spool"):  # nor where this user may not look
         remedy = "Name that of the service (--data-dir, or INTRASPLAT_DATA_DIR), and run the command as its user."
         raise InputError("--data-dir", f"{data_dir} is no data directory.", remedy)
-    if (owner := spool.stat().st_uid) != os.getuid():  # root would leave files that the service cannot write
-        problem = f"{data_dir} belongs to another user (uid {owner})."
-        raise UnavailableError(problem, "Run the backup as that user, who is the service's.")
     if settings.redis_url is None and not (data_dir / "valkey").is_dir():
         problem = f"it is not set, and {data_dir} has no queue of its own."
         raise InputError("REDIS_URL", problem, "Set it as the service has it.")

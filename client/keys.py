@@ -11,14 +11,17 @@ import argparse
 import re
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now, utc_text
-from contract.access.keys import DAY_S, DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope, no_such_key
+from contract.access.keys import DAY_S, DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope, new_key
 from contract.access.webhook_secrets import tenant_secret
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
+from contract.store.owner import check_owner
 from contract.wire.errors import InputError
 from contract.wire.job import TENANT_PATTERN
 
@@ -57,33 +60,24 @@ def add_keys(commands: Commands) -> None:
 
 
 def _create(options: argparse.Namespace) -> int:
-    keys = KeyFile(settings_of(options).data_dir)
-    expires_at_s = _expires_at_s(options)
-    key, text = keys.create(options.tenant, _scopes(options.scopes), options.label, expires_at_s)
-    try:
-        _record(options, AuditAction.KEY_CREATED, key)
-    except BaseException:
-        keys.revoke(key.key_id)  # it was never shown
-        raise
-    _show(key, text)
+    key, text = new_key(options.tenant, _scopes(options.scopes), options.label, _expires_at_s(options))
+    keys = _own_keys(options)
+    with _recorded(options, (AuditAction.KEY_CREATED, key, "")):
+        keys.add(key)
+        _show(key, text)
     return ExitCode.OK
 
 
 def _rotate(options: argparse.Namespace) -> int:
-    keys, expires_at_s = KeyFile(settings_of(options).data_dir), _expires_at_s(options)
+    keys, expires_at_s = _own_keys(options), _expires_at_s(options)
     ends_at_s = _until("--overlap", options.overlap)
-    new, text = keys.create_successor(options.key_id, expires_at_s)
-    try:
-        _record(options, AuditAction.KEY_CREATED, new)
-        old = next(key for key in keys.list() if key.key_id == options.key_id).ending(ends_at_s)
-        outcome = f"followed by {new.key_id}, ends {utc_text(old.expires_at_s or ends_at_s)}"
-        _record(options, AuditAction.KEY_ROTATED, old, outcome)
-        keys.end(old.key_id, ends_at_s)
-    except BaseException:
-        keys.revoke(new.key_id)  # it was never shown
-        raise
-    _show(new, text)
-    print(f"the old one: {_line(old)}", file=sys.stderr)
+    old = keys.get(options.key_id).ending(ends_at_s)
+    new, text = old.successor(expires_at_s)
+    how = f" (followed by {new.key_id}, ends {utc_text(old.refused_from_s or ends_at_s)})"
+    with _recorded(options, (AuditAction.KEY_CREATED, new, ""), (AuditAction.KEY_ROTATED, old, how)):
+        old = keys.rotate(old.key_id, new, ends_at_s)
+        _show(new, text)
+        print(f"the old one: {_line(old)}", file=sys.stderr)
     return ExitCode.OK
 
 
@@ -99,11 +93,11 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _revoke(options: argparse.Namespace) -> int:
-    key = KeyFile(settings_of(options).data_dir).revoke(options.key_id)
-    if key is None:
-        raise no_such_key(options.key_id)
-    print(f"revoked {_line(key)}", file=sys.stderr)
-    _record(options, AuditAction.KEY_REVOKED, key)
+    keys = _own_keys(options)
+    key = keys.get(options.key_id)
+    with _recorded(options, (AuditAction.KEY_REVOKED, key, "")):
+        keys.revoke(key.key_id)
+        print(f"revoked {_line(key)}", file=sys.stderr)
     return ExitCode.OK
 
 
@@ -118,9 +112,27 @@ def _webhook_secret(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def _record(options: argparse.Namespace, action: AuditAction, key: ApiKey, outcome: str = "ok") -> None:
-    entry = AuditEntry(time=utc_now(), action=action, outcome=outcome, tenant=key.tenant, key_id=key.key_id)
-    AuditLog(settings_of(options).data_dir).append(entry)
+def _own_keys(options: argparse.Namespace) -> KeyFile:
+    """The keys of an installation of this user, to be changed."""
+    data_dir = settings_of(options).data_dir
+    check_owner(data_dir)
+    return KeyFile(data_dir)
+
+
+@contextmanager
+def _recorded(options: argparse.Namespace, *acts: tuple[AuditAction, ApiKey, str]) -> Iterator[None]:
+    """The time in which keys are changed: the audit says what begins, and what was done. An act that was begun and
+    not done failed or was cut off."""
+    log = AuditLog(settings_of(options).data_dir)
+
+    def note(state: str) -> None:
+        for action, key, how in acts:
+            about = {"outcome": f"{state}{how}", "tenant": key.tenant, "key_id": key.key_id}
+            log.append(AuditEntry(time=utc_now(), action=action, **about))
+
+    note("begun")
+    yield
+    note("done")
 
 
 def _scopes(text: str) -> frozenset[KeyScope]:
@@ -157,8 +169,8 @@ def _expires_at_s(options: argparse.Namespace) -> float | None:
 def _line(key: ApiKey) -> str:
     created = utc_text(key.created_at_s)[: len("2026-01-31")]
     expires = "never expires"
-    if key.expires_at_s is not None:
+    if key.refused_from_s is not None:
         word = "expired" if key.has_expired(time.time()) else "expires"
-        expires = f"{word} {utc_text(key.expires_at_s)}"
+        expires = f"{word} {utc_text(key.refused_from_s)}"
     scopes = ",".join(sorted(key.scopes))
     return f"{key.key_id}  {key.tenant}  {scopes}  {created}  {expires}  {key.label or ''}".rstrip()

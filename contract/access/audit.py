@@ -51,6 +51,7 @@ class AuditAction(StrEnum):
     REFUSED = "refused"
     """A missing or wrong key, a missing scope, another tenant's job. The outcome is the HTTP status."""
     KEY_CREATED = "key-created"
+    """This and the next two: two lines, "begun", then "done"."""
     KEY_REVOKED = "key-revoked"
     KEY_ROTATED = "key-rotated"
     """It has a successor; the outcome says which, and when this one ends."""

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from contract.runtime.locks import held
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.store.disk_errors import disk_errors
 from contract.store.durable import replace_file
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TENANT_PATTERN
@@ -68,15 +69,61 @@ class ApiKey(BaseModel):
     created_at_s: float
     label: str | None = Field(default=None, max_length=MAX_LABEL_CHARACTERS)
     expires_at_s: float | None = Field(default=None, gt=0, lt=1e11, allow_inf_nan=False)
-    """From then on it is refused, UNIX time; None: never."""
+    """Until then it was made to last, UNIX time; None: for ever."""
+    ends_at_s: float | None = Field(default=None, gt=0, lt=1e11, allow_inf_nan=False)
+    """Until then it lasts at most, because it has a successor; None: it has none."""
+
+    @property
+    def refused_from_s(self) -> float | None:
+        """The UNIX time from which on it is refused; None: never."""
+        return min((at_s for at_s in (self.expires_at_s, self.ends_at_s) if at_s is not None), default=None)
 
     def has_expired(self, now_s: float) -> bool:
         """Whether it is refused at that UNIX time."""
-        return self.expires_at_s is not None and self.expires_at_s <= now_s
+        return self.refused_from_s is not None and self.refused_from_s <= now_s
 
     def ending(self, at_s: float) -> ApiKey:
-        """The same key, which expires at that UNIX time at the latest."""
-        return self.model_copy(update={"expires_at_s": min(at_s, self.expires_at_s or at_s)})
+        """The same key, which ends at that UNIX time at the latest."""
+        return self.model_copy(update={"ends_at_s": min(at_s, self.ends_at_s or at_s)})
+
+    def successor(self, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
+        """A new key with this one's tenant, scopes and label, and its text.
+
+        Args:
+            expires_at_s: of the new key; None: it lasts as long as this one was made to last.
+        """
+        if self.expires_at_s is not None:
+            expires_at_s = expires_at_s or time.time() + self.expires_at_s - self.created_at_s
+        return new_key(self.tenant, self.scopes, self.label, expires_at_s)
+
+
+def new_key(
+    tenant: str,
+    scopes: Collection[KeyScope] = DEFAULT_SCOPES,
+    label: str | None = None,
+    expires_at_s: float | None = None,
+) -> tuple[ApiKey, str]:
+    """A key that no file holds yet, and its text, which is kept nowhere.
+
+    Raises:
+        InputError: the tenant, the scopes or the label is not accepted.
+    """
+    secret = secrets.token_hex(SECRET_BYTES)
+    try:
+        key = ApiKey(
+            key_id=secrets.token_hex(6),
+            tenant=tenant,
+            scopes=frozenset(scopes),
+            secret_sha256=_sha256(secret),
+            created_at_s=time.time(),
+            label=label,
+            expires_at_s=expires_at_s,
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{str(first['input'])[:80]!r} is not accepted: {first['msg']}."
+        raise InputError(str(first["loc"][0]), problem, "A tenant is 1 to 40 of a-z, 0-9 and -.") from error
+    return key, f"{KEY_PREFIX}_{key.key_id}_{secret}"
 
 
 class _Stored(BaseModel):
@@ -103,52 +150,44 @@ class KeyFile:
         label: str | None = None,
         expires_at_s: float | None = None,
     ) -> tuple[ApiKey, str]:
-        """A new key and its text, which is kept nowhere.
+        """A new key that is accepted from now on, and its text. Raises as new_key() and add()."""
+        key, text = new_key(tenant, scopes, label, expires_at_s)
+        self.add(key)
+        return key, text
+
+    def add(self, key: ApiKey) -> None:
+        """Accept a key from now on.
 
         Raises:
-            InputError: the tenant, the scopes or the label is not accepted.
-            UnavailableError: the file is damaged, or another process keeps it locked.
+            UnavailableError: the file is damaged or cannot be written, or another process keeps it locked.
         """
-        secret = secrets.token_hex(SECRET_BYTES)
-        try:
-            key = ApiKey(
-                key_id=secrets.token_hex(6),
-                tenant=tenant,
-                scopes=frozenset(scopes),
-                secret_sha256=_sha256(secret),
-                created_at_s=time.time(),
-                label=label,
-                expires_at_s=expires_at_s,
-            )
-        except ValidationError as error:
-            first = error.errors()[0]
-            problem = f"{str(first['input'])[:80]!r} is not accepted: {first['msg']}."
-            raise InputError(str(first["loc"][0]), problem, "A tenant is 1 to 40 of a-z, 0-9 and -.") from error
         with self._changing() as keys:
             self._write((*keys, key))
-        return key, f"{KEY_PREFIX}_{key.key_id}_{secret}"
 
-    def create_successor(self, key_id: str, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
-        """A new key with the tenant, the scopes and the label of another, and its text; the other stays as it is.
-
-        Args:
-            expires_at_s: of the new key; None: it lasts as long as the other was made to last.
+    def rotate(self, key_id: str, successor: ApiKey, ends_at_s: float) -> ApiKey:
+        """Accept the successor of a key, and let that key end at that UNIX time, unless it does so before: both or
+        neither. Returns the key that ends.
 
         Raises:
             InputError: no key has that id.
-            UnavailableError: as create().
+            UnavailableError: as add().
         """
-        old = next((key for key in self.list() if key.key_id == key_id), None)
-        if old is None:
-            raise no_such_key(key_id)
-        if old.expires_at_s is not None:
-            expires_at_s = expires_at_s or time.time() + old.expires_at_s - old.created_at_s
-        return self.create(old.tenant, old.scopes, old.label, expires_at_s)
-
-    def end(self, key_id: str, at_s: float) -> None:
-        """Let a key expire at that UNIX time, unless it does so before. Raises UnavailableError as create()."""
         with self._changing() as keys:
-            self._write(tuple(key.ending(at_s) if key.key_id == key_id else key for key in keys))
+            ending = self.get(key_id).ending(ends_at_s)
+            self._write((*(ending if key.key_id == key_id else key for key in keys), successor))
+        return ending
+
+    def get(self, key_id: str) -> ApiKey:
+        """The key with that id.
+
+        Raises:
+            InputError: no key has it.
+            UnavailableError: the file is damaged.
+        """
+        found = next((key for key in self.list() if key.key_id == key_id), None)
+        if found is None:
+            raise InputError("ID", f"there is no key {key_id[:40]!r}.", "See `intrasplat keys list`.")
+        return found
 
     def list(self) -> tuple[ApiKey, ...]:
         """All keys, oldest first.
@@ -159,16 +198,16 @@ class KeyFile:
         self._refresh()
         return tuple(self._by_id.values())
 
-    def revoke(self, key_id: str) -> ApiKey | None:
-        """Remove a key, so that it is refused from now on; None if no key has that id.
+    def revoke(self, key_id: str) -> ApiKey:
+        """Remove a key, which is refused from now on; the key that it was.
 
         Raises:
-            UnavailableError: the file is damaged, or another process keeps it locked.
+            InputError: no key has that id.
+            UnavailableError: as add().
         """
         with self._changing() as keys:
-            revoked = next((key for key in keys if key.key_id == key_id), None)
-            if revoked is not None:
-                self._write(tuple(key for key in keys if key is not revoked))
+            revoked = self.get(key_id)
+            self._write(tuple(key for key in keys if key != revoked))
         return revoked
 
     def find(self, text: str) -> ApiKey | None:
@@ -210,22 +249,19 @@ class KeyFile:
     @contextlib.contextmanager
     def _changing(self) -> Iterator[tuple[ApiKey, ...]]:
         """The present keys, while this process holds the lock."""
-        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with held(self._path.with_name("keys.lock"), "the keys"):
-            yield self.list()
+        with disk_errors():
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with held(self._path.with_name("keys.lock"), "the keys"):
+                yield self.list()
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
         replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1, exclude_none=True).encode())
 
 
 def expiring_keys(keys: Iterable[ApiKey], now_s: float) -> list[ApiKey]:
-    """Those that expire within WARN_BEFORE_S after that UNIX time, and have not yet."""
-    return [key for key in keys if not key.has_expired(now_s) and key.has_expired(now_s + WARN_BEFORE_S)]
-
-
-def no_such_key(key_id: str) -> InputError:
-    """The error of an id that no key has."""
-    return InputError("ID", f"there is no key {key_id[:40]!r}.", "See `intrasplat keys list`.")
+    """Those without a successor that expire within WARN_BEFORE_S after that UNIX time, and have not yet."""
+    lasting = (key for key in keys if key.ends_at_s is None and not key.has_expired(now_s))
+    return [key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S)]
 
 
 def check_keys(settings: Settings) -> None:

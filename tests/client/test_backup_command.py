@@ -11,8 +11,10 @@ from client.cli import main
 from contract.queue.installed import installed_queue
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
+from contract.store.owner import check_owner
 from contract.store.store import Store
-from tests.contract.stores import accepted
+from contract.wire.errors import UnavailableError
+from tests.contract.stores import SERVICE, accepted, given_to
 
 
 @pytest.fixture(autouse=True)
@@ -51,14 +53,26 @@ def test_a_folder_that_cannot_be_the_services_is_refused(
     assert not (tmp_path / "backups").exists()
 
 
-def test_another_user_than_the_services_is_refused_and_leaves_nothing_in_the_data_directory(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may give a folder to another user")
+@pytest.mark.parametrize("command", ["backup", "restore"])
+def test_root_is_refused_where_its_files_would_shut_out_the_service_and_leaves_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     Store(tmp_path / "old")
+    given_to(SERVICE, tmp_path / "old")
     before = sorted((tmp_path / "old").rglob("*"))
-    service = os.getuid()
-    monkeypatch.setattr(os, "getuid", lambda: service + 1)
-    backup = ["backup", str(tmp_path / "backups"), "--data-dir", str(tmp_path / "old")]
-    assert main(backup) == ExitCode.UNAVAILABLE
-    assert f"belongs to another user (uid {service})" in capsys.readouterr().err
+    assert main([command, str(tmp_path / "backups"), "--data-dir", str(tmp_path / "old")]) == ExitCode.UNAVAILABLE
+    assert f"belongs to another user (uid {SERVICE}). Run the command as that user" in capsys.readouterr().err
     assert sorted((tmp_path / "old").rglob("*")) == before
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may give a folder to another user")
+def test_a_volume_of_roots_whose_group_the_service_is_in_is_the_services(tmp_path: Path) -> None:
+    """As in Kubernetes: root may not write where the service has, the service may."""
+    check_owner(tmp_path)
+    (tmp_path / "spool").mkdir()
+    check_owner(tmp_path)
+    given_to(SERVICE, tmp_path / "spool")
+    with pytest.raises(UnavailableError, match="another user"):
+        check_owner(tmp_path)
+    check_owner(tmp_path / "absent")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,14 @@ from contract.wire.names import MANIFEST
 from tests.contract.queues import claimed
 
 BUCKET_URL = "s3://clips/of/all"
+SERVICE = 12345
+"""The id of a user that is not this one."""
+
+
+def given_to(user_id: int, folder: Path) -> None:
+    """Make a folder with all in it a user's own, as root may."""
+    for path in (folder, *folder.rglob("*")):
+        os.chown(path, user_id, user_id)
 
 
 def received(store: Store) -> JobRecord:

@@ -304,7 +304,11 @@ def test_a_wrong_key_or_one_that_may_not_see_is_refused_before_the_handshake(gua
         assert refused.value.response.status_code == status
 
 
-@pytest.mark.parametrize("end", [KeyFile.revoke, lambda keys, key_id: keys.end(key_id, time.time())])
+def rotate_at_once(keys: KeyFile, key_id: str) -> None:
+    keys.rotate(key_id, keys.get(key_id).successor()[0], time.time())
+
+
+@pytest.mark.parametrize("end", [KeyFile.revoke, rotate_at_once])
 def test_a_key_that_is_revoked_or_expires_ends_its_streams(
     guarded: LiveService, end: Callable[[KeyFile, str], object]
 ) -> None:

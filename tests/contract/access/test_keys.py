@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from contract.access.keys import KEYS_FILE, WARN_BEFORE_S, KeyFile, KeyScope, check_keys, expiring_keys
+from contract.access.keys import (
+    DAY_S,
+    KEYS_FILE,
+    WARN_BEFORE_S,
+    KeyFile,
+    KeyScope,
+    check_keys,
+    expiring_keys,
+)
 from contract.runtime.settings import Settings
 from contract.wire.errors import InputError, UnavailableError
 
@@ -46,7 +54,8 @@ def test_a_revoked_key_is_refused_at_once_by_services_that_run(tmp_path: Path) -
     second, second_text = command.create("b")
     assert (service.find(first_text), service.find(second_text)) == (first, second)
     assert command.revoke(first.key_id) == first
-    assert command.revoke(first.key_id) is None
+    with pytest.raises(InputError, match="no key"):
+        command.revoke(first.key_id)
     assert (service.find(first_text), service.find(second_text)) == (None, second)
     assert service.list() == (second,)
 
@@ -126,16 +135,33 @@ def test_a_key_expires_at_its_time_and_old_files_are_read_and_new_ones_stay_read
 def test_a_successor_is_like_the_key_before_and_lasts_as_long_which_ends_after_the_overlap(tmp_path: Path) -> None:
     keys = KeyFile(tmp_path)
     old, old_text = keys.create("ward-3", {KeyScope.VIEW}, "theatre 2", time.time() + 1000.0)
-    new, text = keys.create_successor(old.key_id)
-    keys.end(old.key_id, time.time() + 10.0)
-    found = keys.find(old_text)
-    assert found is not None
-    assert found.expires_at_s is not None
-    assert old.expires_at_s is not None
-    assert found.expires_at_s < old.expires_at_s <= (new.expires_at_s or 0.0)
+    new, text = old.successor()
+    ending = keys.rotate(old.key_id, new, time.time() + 10.0)
+    assert keys.find(old_text) == ending
+    assert (ending.refused_from_s or 0.0) < (old.refused_from_s or 0.0) <= (new.refused_from_s or 0.0)
     assert (new.tenant, new.scopes, new.label) == (old.tenant, old.scopes, old.label)
     assert keys.find(text) == new
-    keys.end(old.key_id, 3e9)
-    assert keys.find(old_text) == found
+    assert keys.rotate(old.key_id, old.successor()[0], 3e9) == ending
     with pytest.raises(InputError, match="no key"):
-        keys.create_successor("000000000000")
+        keys.rotate("000000000000", new, 3e9)
+
+
+@pytest.mark.parametrize("lasts_s", [None, 90 * DAY_S])
+def test_whoever_rotates_a_key_twice_gets_two_keys_that_last_as_long_as_it_was_made_to(
+    tmp_path: Path, lasts_s: float | None
+) -> None:
+    keys = KeyFile(tmp_path)
+    key, _ = keys.create("ward-3", expires_at_s=lasts_s and time.time() + lasts_s)
+    for _ in range(2):
+        new, _ = keys.get(key.key_id).successor()
+        keys.rotate(key.key_id, new, time.time() + DAY_S)
+        lasting_s = new.refused_from_s and new.refused_from_s - new.created_at_s
+        assert lasting_s == (lasts_s and pytest.approx(lasts_s, abs=60.0))
+
+
+def test_a_key_that_has_a_successor_is_not_among_those_to_be_rotated(tmp_path: Path) -> None:
+    keys, soon_s = KeyFile(tmp_path), time.time() + DAY_S
+    old, _ = keys.create("ward-3", expires_at_s=soon_s)
+    assert expiring_keys(keys.list(), time.time()) == [old]
+    keys.rotate(old.key_id, old.successor(soon_s + WARN_BEFORE_S)[0], soon_s)
+    assert expiring_keys(keys.list(), time.time()) == []
