@@ -21,6 +21,9 @@ from service.server import Server
 QUEUE_PATIENCE_S = 2.7
 """Callers hear within 3 s that the queue does not answer."""
 KNOWN_WORKERS = "workers.json"
+SWITCH_S = 0.0005
+"""After so long a thread that computes gives Python's lock to one that waits for it. The loop takes the lock several
+times for each answer, and at the usual 5 ms every upload that is looked at would delay all others by tens of ms."""
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -34,6 +37,7 @@ def main() -> int:
         return end_by(error)
     if settings.redis_url is None:
         return end_by(UnavailableError("REDIS_URL is not set.", "`intrasplat up` starts a queue of its own."))
+    sys.setswitchinterval(SWITCH_S)
     configure(settings, "service")
     traces.configure("service")
     try:

@@ -9,7 +9,7 @@ import { suffixOf } from "./upload.js";
 /** @typedef {import("./api.js").Finding} Finding */
 
 const HEAD_BYTES = 16;
-const MAX_CALIBRATION_BYTES = 1_000_000;
+const MAX_CALIBRATION_BYTES = 250_000;
 const VIDEOS = [".mp4", ".mov", ".mkv", ".webm"];
 const PARTS_OF_FRAMES = ["clip", "left", "right"];
 /** A browser that cannot read a video may never say so. */

@@ -32,7 +32,7 @@ MEMORY_PARTS = 2  # a clip gets one of this many parts of the machine's memory; 
 EYES = 2  # of a stereo clip; the largest picture accepted holds both
 
 MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and each frame's 17 numbers
-MAX_CALIBRATION_BYTES = 1_000_000  # a calibration has a few kB
+MAX_CALIBRATION_BYTES = 250_000  # a calibration has a few kB, with the points that it was made from some ten
 MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and each pixel as uncompressed 16-bit RGBA
 
 

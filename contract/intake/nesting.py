@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import re
 
-_BRACKETS = re.compile(r"[\[\]{}]")
+_SQUARE = bytes.maketrans(b"{}", b"[]")
+_BRACKETS = b"[]{}"
+_OTHERS = bytes(set(range(256)) - set(_BRACKETS))
+_EMPTY_TAG = re.compile(rb"<[^<>]*/>")
+_SIGNS_OF_TAGS = ((b"</", b"]"), (b"<?", b""), (b"<!", b""), (b"<", b"["))
+MAX_COUNTED = 100
+"""More levels than a file of ours has. What nests deeper is told as deep as the brackets that are left are many."""
 
 
 def nesting(text: str) -> int:
@@ -12,26 +18,29 @@ def nesting(text: str) -> int:
 
     Levels that YAML tells by indentation are not counted: a file of a megabyte cannot have many.
     """
-    return max(_of_brackets(text), _of_tags(text), max(map(_of_line, text.splitlines()), default=0))
+    data = text.encode("ascii", "replace")
+    deepest = max(_of_pairs(data.translate(_SQUARE, _OTHERS)), _of_tags(data))
+    return deepest if deepest > MAX_COUNTED else max(deepest, max(map(_of_line, text.splitlines()), default=0))
 
 
-def _of_brackets(text: str) -> int:
-    depth = deepest = 0
-    for found in _BRACKETS.finditer(text):
-        depth += 1 if found.group() in "[{" else -1
-        deepest = max(deepest, depth)
-    return deepest
+def _of_tags(data: bytes) -> int:
+    data = _EMPTY_TAG.sub(b"", data.translate(None, _BRACKETS))
+    for sign, bracket in _SIGNS_OF_TAGS:
+        data = data.replace(sign, bracket)
+    return _of_pairs(data.translate(None, _OTHERS))
 
 
-def _of_tags(text: str) -> int:
-    depth = deepest = 0
-    for tag in text.split("<")[1:]:
-        if tag.startswith("/"):
-            depth -= 1
-        elif not tag.startswith(("?", "!")) and not tag.partition(">")[0].endswith("/"):
-            depth += 1
-            deepest = max(deepest, depth)
-    return deepest
+def _of_pairs(brackets: bytes) -> int:
+    """Levels of square brackets, those that nothing closes included.
+
+    The innermost pairs are taken out again and again. A loop over the brackets would take a hundred times as long, and
+    other threads would wait for it.
+    """
+    levels = 0
+    while levels < MAX_COUNTED and b"[]" in brackets:
+        brackets = brackets.replace(b"[]", b"")
+        levels += 1
+    return levels + brackets.count(b"[")
 
 
 def _of_line(line: str) -> int:
@@ -40,4 +49,6 @@ def _of_line(line: str) -> int:
     for word in line.split():
         run = run + 1 if word == "-" or word.endswith(":") else 0
         longest = max(longest, run)
+        if longest > MAX_COUNTED:
+            break
     return longest

@@ -29,7 +29,8 @@ _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or Stereo
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
 _NOT_FINITE = re.compile(r"(?<![\w\"'./-])[-+]?\.?(nan|inf|infinity)(?![\w\"'.=:-])", re.IGNORECASE)
-_COMMENT = re.compile(r"[#;].*|<!--.*?-->")
+_COMMENT = re.compile(r"[#;].*|<!--(?:(?!<!--).)*?-->")
+"""The last of several beginnings counts: a search for the end from each of them would take the square of the length."""
 
 
 def check_file(path: Path, part: str, limits: ClipLimits) -> None:
@@ -82,10 +83,11 @@ def check_calibration_file(text: str, field: str, label: str) -> None:
 
 def _check_numbers(text: str, field: str, label: str) -> None:
     """InputError for a number that is none or not finite, as a calibration that failed writes it."""
-    for number, line in enumerate(text.splitlines(), 1):
-        if found := _NOT_FINITE.search(_COMMENT.sub("", line)):
-            problem = f"{label} holds {found.group()[:20]}, which is not a finite number, in line {number}."
-            raise InputError(field, problem, "Calibrate again, or give the calibration of this recording.")
+    text = _COMMENT.sub("", "\n".join(text.splitlines()))
+    if found := _NOT_FINITE.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        problem = f"{label} holds {found.group()[:20]}, which is not a finite number, in line {line}."
+        raise InputError(field, problem, "Calibrate again, or give the calibration of this recording.")
 
 
 def _text_of(path: Path, part: str) -> str:

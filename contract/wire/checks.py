@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 HEAD_BYTES = 32
 """Of a file, at most."""
-MAX_TEXT_CHARACTERS = 1_000_000
+MAX_TEXT_CHARACTERS = 250_000
 
 
 class FindingCode(StrEnum):

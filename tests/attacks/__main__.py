@@ -1,6 +1,6 @@
 """`make attacks`: replay what stopped everybody once, and measure what the other tenant feels of it.
 
-python -m tests.attacks --seconds 10 --out docs/results/attacks.md
+python -m tests.attacks --seconds 10 --rounds 3 --out docs/results/attacks.md
 
 Starts `intrasplat up` on a folder of its own, with two tenants. One attacks; the other asks for one view of 320x256 of
 its own scene after the other. Its p99 during an attack is compared with that of the quiet seconds before and after.
@@ -57,28 +57,34 @@ def main(argv: list[str] | None = None) -> int:
     """Run them all, print the table; 1 if one of them got through."""
     parser = argparse.ArgumentParser(prog="python -m tests.attacks", description=__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each attack, and of the quiet around it")
+    parser.add_argument("--rounds", type=int, default=3, help="of quiet, attack and quiet; their views count together")
     parser.add_argument("--only", default="", help="attacks whose name holds this")
     parser.add_argument("--out", type=Path, help="write the table here as well")
     options = parser.parse_args(argv)
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="intrasplat-attacks-") as folder, standing(Path(folder)) as arena:
-        rows = [_measured(arena, each, options.seconds) for each in ATTACKS if options.only in each.name]
-    table = _table(rows, options.seconds, (load, os.getloadavg()[0]))
+        rows = [
+            _measured(arena, each, options.seconds, options.rounds) for each in ATTACKS if options.only in each.name
+        ]
+    table = _table(rows, (options.seconds, options.rounds), (load, os.getloadavg()[0]))
     print(table)
     if options.out is not None:
         options.out.write_text(table)
     return 0 if all(row.holds for row in rows) else 1
 
 
-def _measured(arena: Arena, attack: Attack, seconds: float) -> Row:
-    time.sleep(SETTLE_S)
-    quiet = _quiet(arena, attack, seconds / 2)
-    began_s = time.time()
-    heard = attack.run(arena, seconds)
-    during = arena.views(began_s, time.time())
-    time.sleep(SETTLE_S)
-    quiet += _quiet(arena, attack, seconds / 2)
-    row = Row(attack, heard, quiet, during)
+def _measured(arena: Arena, attack: Attack, seconds: float, rounds: int) -> Row:
+    """Quiet and attack in turn, so that both see the machine's other load."""
+    heard, quiet, during = list[Heard](), list[View](), list[View]()
+    for _ in range(rounds):
+        time.sleep(SETTLE_S)
+        quiet += _quiet(arena, attack, seconds / 2)
+        began_s = time.time()
+        heard.append(attack.run(arena, seconds))
+        during += arena.views(began_s, time.time())
+        time.sleep(SETTLE_S)
+        quiet += _quiet(arena, attack, seconds / 2)
+    row = Row(attack, Heard.all_of(heard), quiet, during)
     print(_line(row), file=sys.stderr, flush=True)
     return row
 
@@ -98,18 +104,21 @@ def _quiet(arena: Arena, attack: Attack, seconds: float) -> list[View]:
     return arena.views(began_s, time.time())
 
 
-def _table(rows: list[Row], seconds: float, load: tuple[float, float]) -> str:
-    held = sum(row.holds for row in rows)
+def _table(rows: list[Row], length: tuple[float, int], load: tuple[float, float]) -> str:
+    """length: seconds and rounds."""
+    (seconds, rounds), held = length, sum(row.holds for row in rows)
     lines = [
         "# Attacks, replayed",
         "",
-        f"Command: `python -m tests.attacks --seconds {seconds:g}` (`make attacks`), commit {commit()}, {machine()}, "
+        f"Command: `python -m tests.attacks --seconds {seconds:g} --rounds {rounds}` (`make attacks`), "
+        f"commit {commit()}, {machine()}, "
         f"Python {platform.python_version()}, load average {load[0]:.1f} at the start and {load[1]:.1f} at the end, of "
         f"niceness {os.nice(0)}. The numbers are rows of a review that found these attacks to stop everybody.",
         "",
         f"{held} of {len(rows)} hold: the attacker gets no more than it may, and the other tenant's p99 of a view of "
-        f"320x256 stays within {MAX_RATIO:g} times its quiet value, measured in the {seconds:g} s around the attack; "
-        "where a job of the attack trains, beside an honest job of the same tenant. In brackets: views.",
+        f"320x256 stays within {MAX_RATIO:g} times its quiet value. {rounds} rounds count together, each of "
+        f"{seconds:g} s of attack between twice {seconds / 2:g} s of quiet; where a job of the attack trains, quiet is "
+        "beside an honest job of the same tenant. In brackets: views.",
         "",
         "| row | attack | answers | bounded | quiet p99, ms | p99, ms | ratio | |",
         "|---|---|---|---|---|---|---|---|",

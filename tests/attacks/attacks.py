@@ -18,6 +18,7 @@ from typing import Any
 import httpx
 
 from benchmarks.bm_service import process
+from contract.intake.limits import MAX_CALIBRATION_BYTES
 from intrasplat_client import JobRejected
 from tests.attacks.arena import GIB, Arena
 from tests.worker.input.clip.hostile import CALIBRATION, VIDEO
@@ -39,6 +40,13 @@ class Heard:
     answers: Counter[str]
     is_bounded: bool
     note: str = ""
+
+    @classmethod
+    def all_of(cls, rounds: list[Heard]) -> Heard:
+        """What was heard in all rounds."""
+        answers = sum((each.answers for each in rounds), Counter[str]())
+        notes = dict.fromkeys(each.note for each in rounds if each.note)
+        return cls(answers, all(each.is_bounded for each in rounds), "; ".join(notes))
 
     def __str__(self) -> str:
         counts = ", ".join(f"{answer} x {count}" for answer, count in sorted(self.answers.items()))
@@ -210,6 +218,13 @@ def deep_nesting(arena: Arena, seconds: float) -> Heard:
     return _sent(arena, seconds, [*bodies, json_body], "422", "400", "413")
 
 
+def slow_texts(arena: Arena, seconds: float) -> Heard:
+    """Calibrations as large as they may be, of what takes long to look at."""
+    pieces = (b"\n", b"[]", b"<!--", b"a: ", b"<a></a>", b"[[[[[[[[]]]]]]]]")
+    texts = [piece * (MAX_CALIBRATION_BYTES // len(piece)) for piece in pieces]
+    return _sent(arena, seconds, [_clip(text, "c.yaml") for text in texts], "422")
+
+
 def no_numbers(arena: Arena, seconds: float) -> Heard:
     """Calibrations of NaN, infinity and without a camera, and two eyes without any."""
     yaml = b"%YAML:1.0\n---\nD1: [0, 0, 0, 0, 0]\n"
@@ -266,6 +281,7 @@ ATTACKS = (
     Attack(4, "14 uploads of 4 GB announced, no byte sent", promises),
     Attack(5, "high priority, budget_s 3600, 1e6 iterations without their scopes", without_scope),
     Attack(7, "JSON and YAML nested 100,000 deep", deep_nesting),
+    Attack(7, "calibrations of 250 kB that take long to look at", slow_texts),
     Attack(9, "calibrations of NaN, infinity, without a camera; two eyes without one", no_numbers),
     Attack(11, "query names that no route knows", unknown_names),
     Attack(11, "HEAD of what GET answers", heads),

@@ -61,6 +61,20 @@ HANGS_AFTER_S = 60.0
 LOOK = "import sys; from contract.intake.calibration.opencv import look_at_calibration as look; look(sys.stdin.read())"
 
 
+CHECK = "import sys; from contract.intake.sniff import check_calibration_file as c; c(sys.stdin.read(), 'f', 'it')"
+
+
+def test_many_comments_that_do_not_end_keep_nobody() -> None:
+    text = "<!--" * (MAX_CALIBRATION_BYTES // 4)
+    subprocess.run([sys.executable, "-c", CHECK], input=text, check=True, text=True, timeout=HANGS_AFTER_S)
+
+
+def test_a_number_that_is_none_is_told_with_its_line_whatever_ends_the_lines() -> None:
+    for end in ("\n", "\r\n", "\r"):
+        with pytest.raises(InputError, match="holds nan, which is not a finite number, in line 3"):
+            check_calibration_file(end.join(("# inf", "<!-- nan --> a: 1", "b: nan")), "calibration", "it")
+
+
 @pytest.mark.parametrize(
     ("again", "is_cut"), [(":!", False), (":[", True), (": !!a", False), ("::{", True), (":[}", True)]
 )

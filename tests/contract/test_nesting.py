@@ -23,4 +23,6 @@ def test_a_long_file_of_few_levels_is_not_deep() -> None:
     rows = [[float(j) for j in range(100)] for _ in range(100)]
     assert nesting(json.dumps({"a": {"b": rows}, "c": rows})) == 4
     assert nesting("M1: !!opencv-matrix\n   rows: 3\n   data: [ 1., 2.,\n       3. ]\n" * 1000) < MAX_NESTING
+    assert nesting("[]{}<a></a>" * 10_000) == 1
+    assert nesting("[" * 60 + "]" * 60) == nesting("<a>" * 60 + "</a>" * 60) == nesting("- " * 60) == 60
     assert nesting("<a>" + "<b>1</b><c d='e'/>" * 1000 + "</a>") == 2
