@@ -1,8 +1,8 @@
 """The systems of the paper's table 1, written anew from their papers to be measured beside ours, and for that alone: no
 scene of theirs is stored or served.
 
-Read in this order: rival (what a rival is), fields (what radiance fields share), endonerf, planes, lerplane, run (how
-one is trained and judged). docs/decisions/078 says where they differ from what was published.
+Read in this order: rival (what a rival is), fields (what radiance fields share), endonerf, planes, lerplane,
+endogaussian, run (how one is trained and judged). docs/decisions/078 says where they differ from what was published.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.run import Make
 
-RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType({"endonerf": EndoNerf, "lerplane": LerPlane})
+RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType({"endonerf": EndoNerf, "lerplane": LerPlane, "endogaussian": EndoGaussian})
 """By the name of their series."""
 RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""

@@ -60,12 +60,14 @@ def numbers_of(rival: Rival) -> list[bytes]:
     return [each.detach().numpy().tobytes() for each in rival.parameters()]
 
 
-def check_gradient(rival: Rival, parameters: Iterable[torch.Tensor], step: float = 1e-6) -> None:
+def check_gradient(
+    rival: Rival, parameters: Iterable[torch.Tensor], step: float = 1e-6, progress: float = 0.0
+) -> None:
     """The loss falls along a random direction as autograd says, by central differences in float64."""
     moved = list(parameters)
     random = torch.Generator().manual_seed(5)
     directions = [torch.randn(each.shape, generator=random, dtype=torch.float64) for each in moved]
-    found = torch.autograd.grad(rival.loss(1, 0.0), moved)
+    found = torch.autograd.grad(rival.loss(1, progress), moved)
     slope = float(sum((a * b).sum() for a, b in zip(found, directions, strict=True)))
     assert all(bool((each != 0).any()) for each in found), "each parameter has a part in the loss"
 
@@ -73,7 +75,7 @@ def check_gradient(rival: Rival, parameters: Iterable[torch.Tensor], step: float
         with torch.no_grad():
             for each, direction in zip(moved, directions, strict=True):
                 each.add_(direction, alpha=distance)
-            found = float(rival.loss(1, 0.0))
+            found = float(rival.loss(1, progress))
             for each, direction in zip(moved, directions, strict=True):
                 each.sub_(direction, alpha=distance)
         return found

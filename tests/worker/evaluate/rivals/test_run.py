@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
-from tests.worker.evaluate.rivals.cases import small_clip
+from tests.worker.evaluate.rivals.cases import Make, small_clip
+from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIANS
 from tests.worker.evaluate.rivals.test_endonerf import TINY
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, plan, preset_of
 from worker.evaluate.measure import Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
+from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
-from worker.evaluate.rivals.rival import Seen
+from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.rivals.run import Length, train_rival
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from worker.evaluate.sources import source_of
@@ -32,17 +34,36 @@ def tiny(seen: Seen, seed: int) -> EndoNerf:
     return EndoNerf(seen, seed, TINY)
 
 
-def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why() -> None:
+def tiny_gaussians(seen: Seen, seed: int) -> EndoGaussian:
+    return EndoGaussian(seen, seed, TINY_GAUSSIANS)
+
+
+@pytest.mark.parametrize(
+    ("series", "make", "not_measured"),
+    [("endonerf", tiny, ("motion", "confidence")), ("endogaussian", tiny_gaussians, ("confidence",))],
+)
+def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
+    series: str, make: Make, not_measured: tuple[str, ...]
+) -> None:
     source = source_of(CLIP)
-    bench = Bench({source.name: source}, "cpu", {"endonerf": tiny})
-    row, curve = bench.measure(Cell(source.name, "endonerf", "every8", 0, iterations=2), TrainingHooks())
+    made: list[Rival] = []
+
+    def kept(seen: Seen, seed: int) -> Rival:
+        made.append(make(seen, seed))
+        return made[-1]
+
+    bench = Bench({source.name: source}, "cpu", {series: kept})
+    row, curve = bench.measure(Cell(source.name, series, "every8", 0, iterations=2), TrainingHooks())
     empty = {name for name in RUN_FIELDS if row.get(name) in (None, "") or row[name] != row[name]}
     of_the_right_eye = {"psnr_right_db", "psnr_right_clear_db", "warp_db", "warp_clear_db"}
-    of_scenes = {"gaussians", "bases", "floats_a_gaussian", "stored_loss_held_out_db"}
-    motion_and_trust = {name for name in TRUTH if name.startswith(("rank_", "mo"))}
-    assert empty == {"error", *of_the_right_eye, *of_scenes, *motion_and_trust}
-    assert str(row["not_measured"]).startswith("motion: ")
-    assert row["scene_bytes"] == 4 * sum(each.numel() for each in tiny(Seen.of(small_clip(2), [1]), 0).parameters())
+    of_scenes = {"bases", "floats_a_gaussian", "stored_loss_held_out_db"}
+    of_moving = {"moving_mm", "moving_error_mm"}  # nothing moves a millimetre in so short a clip
+    of_gaussians: set[str] = set() if made[0].gaussians else {"gaussians"}
+    figures = {"motion": "mo", "confidence": "rank_"}
+    cannot = {name for name in TRUTH if name.startswith(tuple(figures[each] for each in not_measured))}
+    assert empty == {"error", *of_the_right_eye, *of_scenes, *of_moving, *of_gaussians, *cannot}
+    assert [each.partition(":")[0] for each in str(row["not_measured"]).split("; ")] == list(not_measured)
+    assert row["scene_bytes"] == 4 * sum(each.numel() for each in made[0].parameters())
     end = curve[-1]  # a slow machine has points on the way, too
     assert set(CURVE_FIELDS) - set(KEY) == set(end)
     assert (end["iteration"], end["t_train_s"]) == (2, row["t_train_s"])

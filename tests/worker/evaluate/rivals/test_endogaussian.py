@@ -1,0 +1,92 @@
+"""Gaussians from the depth of all frames, moved by factor planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
+from worker.evaluate.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
+from worker.evaluate.rivals.rival import Seen
+
+SMALL = EndoGaussianSettings(
+    share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3), field_rate=(5e-2, 5e-3),
+    log_scale_rate=1e-2, colour_rate=1e-2,
+)  # fmt: skip
+"""What learns 64x48 pixels in seconds."""
+TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=2)
+
+
+def small(seen: Seen, seed: int) -> EndoGaussian:
+    return EndoGaussian(seen, seed, SMALL)
+
+
+def test_its_gradient_is_that_of_finite_differences() -> None:
+    seen = Seen.of(small_clip(2), [0, 1], dtype=torch.float64)
+    rival = EndoGaussian(seen, 3, TINY)
+    random = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # at 0 the planes have no part in the loss
+        rival.field.decode.weight.copy_(torch.randn(rival.field.decode.weight.shape, generator=random) / 10)
+    # a step so small that no Gaussian reaches another pixel, where the rasteriser cuts it off
+    check_gradient(rival, rival.parameters(), step=1e-9, progress=0.9)
+
+
+def test_it_overfits_one_frame_above_30_db() -> None:
+    check_overfit(small, 300)
+
+
+def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
+    check_what_counts(small)
+
+
+def test_gaussians_start_at_the_measured_tissue_of_all_frames_up_to_a_limit() -> None:
+    clip = small_clip(9)
+    seen = Seen.of(clip, range(9))
+    measured = (seen.depth_mm > 0).sum((1, 2)).tolist()
+    assert EndoGaussian(seen, 0, TINY).gaussians == sum(round(0.01 * each) for each in measured)
+    few = EndoGaussianSettings(share=0.5, most=200, cells=(3,), features=2)
+    mean = EndoGaussian(seen, 0, few)._moves[0]
+    assert len(mean) == 200
+    camera, median_mm = clip.intrinsics, float(np.median(seen.depth_mm[seen.depth_mm > 0]))
+    x, y, z_mm = (mean.detach() * median_mm / 60).numpy().T
+    column, row = (camera.fx * x / z_mm + camera.cx - 0.5, camera.fy * y / z_mm + camera.cy - 0.5)
+    for each in (column, row):
+        np.testing.assert_allclose(each, each.round(), atol=1e-3)
+    found_mm = seen.depth_mm[:, row.round().astype(int), column.round().astype(int)].numpy()
+    nearest = np.abs(found_mm - z_mm).argmin(0)
+    np.testing.assert_allclose(found_mm[nearest, np.arange(200)], z_mm, rtol=1e-5)
+    assert len(set(nearest.tolist())) > 3, "more than one frame gives Gaussians"
+
+
+def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -> None:
+    rival = small(Seen.of(small_clip(3), range(3)), 0)
+
+    def losses(progress: float) -> set[float]:
+        return {float(rival.loss(iteration, progress).detach()) for iteration in range(1, 10)}
+
+    assert len(losses(0.2)) == 1
+    rival.loss(1, 0.2).backward()
+    assert all(each.grad is None for each in rival.field.parameters())
+    assert len(losses(0.3)) == 3
+    rival.loss(1, 0.3).backward()
+    assert float(rival.field.decode.weight.grad.abs().max()) > 0  # type: ignore[union-attr]
+
+
+def test_its_motion_is_the_displacement_of_the_gaussians_that_a_pixel_shows() -> None:
+    clip = small_clip(2)
+    rival = small(Seen.of(clip, [0, 1]), 0)
+    with torch.no_grad():
+        for space in rival.field.planes.space:
+            space.fill_(1.0)
+        for time in rival.field.planes.time:  # the product of the three is t^3
+            time.copy_(torch.linspace(0, 1, time.shape[2])[:, None].expand(time.shape))
+        rival.field.decode.weight[0] = 2.0 / rival.field.planes.size
+        rival._moves[3].fill_(5.0)  # nearly opaque
+    pose, camera = clip.world_from_camera[0], clip.intrinsics
+    moved_mm = rival.motion_mm(0.5, pose, camera)
+    covered = np.isfinite(moved_mm[..., 0])
+    np.testing.assert_array_equal(covered, rival.render(0.0, pose, camera).alpha >= 0.5)
+    assert covered.mean() > 0.9
+    want_mm = np.array([2.0 * 0.5**3 / rival._scale, 0, 0])
+    np.testing.assert_allclose(moved_mm[covered], np.broadcast_to(want_mm, moved_mm[covered].shape), rtol=1e-4)
+    assert float(np.abs(rival.motion_mm(0.0, pose, camera)[covered]).max()) == 0.0

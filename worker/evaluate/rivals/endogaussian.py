@@ -1,0 +1,216 @@
+"""`endogaussian`: Gaussians from the depth of all frames, moved by factor planes (Liu et al., 2024; own text).
+
+Symbols: N Gaussians, M pixels, F training frames, H W pixels. docs/decisions/078 lists what differs from the paper,
+and why. Lengths are in optimiser units: the median depth is 60.
+
+The features of a Gaussian's place and a time are decoded, linearly, into how far it has moved, turned, grown and faded.
+The Gaussians are learnt without motion first, from the first frame, then with motion from all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from contract.wire.errors import TrainingDiverged
+from worker.evaluate.rivals.fields import rays
+from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.rival import Rival, Seen
+from worker.input.camera import Intrinsics
+from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
+from worker.model.loss import LossSettings, training_loss
+from worker.model.metrics import COVERED_ALPHA
+from worker.raster import Camera, Rendered
+from worker.train.hooks import RenderedFrame
+from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
+
+MEAN, QUATERNION, LOG_SCALE, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), 10
+"""Columns of what moves."""
+MOVING = 11
+PUBLISHED_LOSS = LossSettings(normalised_depth=False)
+PUBLISHED_WIDTH = 640
+"""Pixels. In a picture half as wide neighbours differ twice as much."""
+
+
+@dataclass(frozen=True)
+class EndoGaussianSettings:
+    """As published, or as the methods say that it builds on: 3D and 4D Gaussian splatting.
+
+    share, most     share of each frame's measured pixels that become Gaussians, and how many they are at most
+    opacity         at the start
+    sh_degree       of the harmonics at the end; it rises evenly from 0
+    cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
+    resting         share of the training without motion
+    *_rate          of Adam; a pair falls exponentially from the end of rest
+    evenness        weight of the total variation of the rendered colour and depth, of pictures as wide as those published
+    """
+
+    share: float = 0.01
+    most: int = 30_000
+    opacity: float = 0.1
+    sh_degree: int = 3
+    cells: tuple[int, ...] = (64, 128, 256)
+    features: int = 16
+    time_cells: int = 150
+    resting: float = 0.25
+    mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
+    field_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
+    quaternion_rate: float = 1e-3
+    log_scale_rate: float = 5e-3
+    opacity_rate: float = 5e-2
+    colour_rate: float = 2.5e-3
+    harmonics_rate: float = 1.25e-4
+    evenness: float = 0.03
+
+
+class EndoGaussian(Rival):
+    """A training EndoGaussian."""
+
+    not_measured = "confidence: it has none"
+
+    def __init__(self, seen: Seen, seed: int, settings: EndoGaussianSettings | None = None) -> None:
+        self.seed, self.settings, self._seen = seed, settings or EndoGaussianSettings(), seen
+        self._scale = MEDIAN_DEPTH_UNITS / float(seen.depth_mm[seen.depth_mm > 0].median())
+        self._measured = [frame for frame in range(len(seen)) if bool(seen.tissue[frame].any())]
+        poses = seen.world_from_camera.double().cpu().numpy()
+        self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
+        start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
+        moves = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
+        self._moves = [nn.Parameter(each.to(seen.rgb)) for each in moves]
+        self._colour, self._harmonics = (nn.Parameter(each.to(seen.rgb)) for each in (start.sh[:, :1], start.sh[:, 1:]))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)
+        self.field.to(seen.rgb)
+        groups = [[self._moves[0]], list(self.field.parameters()), *([each] for each in self._moves[1:])]
+        groups += [[self._colour], [self._harmonics]]
+        self.optimizer = torch.optim.Adam([{"params": each} for each in groups], eps=1e-15, fused=True)
+
+    @property
+    def gaussians(self) -> int:
+        return len(self._colour)
+
+    def rates(self, progress: float) -> Sequence[float]:
+        chosen = self.settings
+        moved = max(0.0, progress - chosen.resting) / (1 - chosen.resting)
+        falling = [first * (last / first) ** moved for first, last in (chosen.mean_rate, chosen.field_rate)]
+        of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
+        return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
+        seen, frame = self._seen, self._measured[0]
+        rests = progress < self.settings.resting
+        if not rests:
+            drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
+            frame = self._measured[int(drawn)]
+        degree = min(self.settings.sh_degree, int((self.settings.sh_degree + 1) * progress))
+        moved = torch.cat(self._moves, 1) if rests else self._moved(float(seen.t[frame]))
+        shown = self._shown(moved, self._cameras[frame], degree)
+        depth = seen.depth_mm[frame] * self._scale
+        true = seen.rgb[frame], depth, seen.tissue[frame]
+        loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
+        evenness = self.settings.evenness * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
+        return loss + evenness * (variation(shown.rgb) + variation(shown.depth[..., None]))
+
+    @torch.no_grad()
+    def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        camera = camera_in_units(intrinsics, world_from_camera, self._scale)
+        shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
+        rgb, depth, alpha = (each.float().cpu().numpy() for each in (shown.rgb, shown.depth, shown.alpha))
+        return RenderedFrame(rgb, solid_depth_mm(depth, alpha, self._scale), alpha)
+
+    @torch.no_grad()
+    def motion_mm(
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+    ) -> NDArray[np.float32]:
+        """The displacements of the Gaussians that a pixel is blended of, blended with the same weights."""
+        first, moved = self._moved(0.0), self._moved(t)
+        distance_mm = (moved[:, MEAN] - first[:, MEAN]) / self._scale
+        camera = camera_in_units(intrinsics, world_from_camera, self._scale)
+        shown = _rasterized(first, distance_mm, camera)
+        alpha = shown.alpha[..., None]
+        motion = torch.where(alpha >= COVERED_ALPHA, shown.rgb / alpha.clamp(min=COVERED_ALPHA), torch.nan)
+        return motion.float().cpu().numpy()
+
+    def _moved(self, t: float) -> Tensor:
+        """What moves, at time t: [N, MOVING].
+
+        Raises:
+            TrainingDiverged: a place is not finite. Torch would look it up outside the planes' memory and crash.
+        """
+        mean = self._moves[0]
+        if not bool(torch.isfinite(mean).all()):
+            raise TrainingDiverged("A Gaussian's place is no longer a number.")
+        return torch.cat(self._moves, 1) + self.field(mean, t)
+
+    def _shown(self, moved: Tensor, camera: Camera, degree: int) -> Rendered:
+        """The picture of Gaussians [N, MOVING], with harmonics up to the degree."""
+        sh = torch.cat([self._colour, self._harmonics[:, : (degree + 1) ** 2 - 1]], 1)
+        direction = nn.functional.normalize(moved[:, MEAN] - camera.centre(moved), dim=-1)
+        return _rasterized(moved, sh_colour(sh, direction), camera)
+
+
+def starting_gaussians(
+    seen: Seen, units_per_mm: float, settings: EndoGaussianSettings, random: torch.Generator
+) -> Gaussians:
+    """Round Gaussians at measured places of all frames: the same share of each frame's pixels, drawn at random."""
+    chosen = []
+    for frame in range(len(seen)):
+        pixels = torch.nonzero(seen.depth_mm[frame] > 0)
+        count = min(len(pixels), max(1, round(settings.share * len(pixels))))
+        drawn = pixels[torch.randperm(len(pixels), generator=random)[:count].to(pixels.device)]
+        chosen.append(torch.cat([torch.full_like(drawn[:, :1], frame), drawn], 1))
+    every = torch.cat(chosen)
+    kept = every[torch.randperm(len(every), generator=random)[: settings.most].to(every.device)]
+    frame, row, column = kept.unbind(1)
+    origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
+    points = units_per_mm * (origin + seen.depth_mm[frame, row, column][:, None] * direction)
+    place, rgb = points.cpu().numpy(), seen.rgb[frame, row, column].cpu().numpy()
+    return initial_gaussians(place, rgb, sh_degree=settings.sh_degree, opacity=settings.opacity)
+
+
+def variation(image: Tensor) -> Tensor:
+    """Mean squared difference of neighbouring pixels of [H, W, C], down and across."""
+    return (image[1:] - image[:-1]).square().mean() + (image[:, 1:] - image[:, :-1]).square().mean()
+
+
+class _Field(nn.Module):
+    """By how much Gaussians at places [N, 3] have changed at a time: [N, MOVING], nothing at the start.
+
+    low, high [3]: the box of the places at the start, which is [-1, 1]^3 of the planes
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, settings: EndoGaussianSettings, time_cells: int, places: Tensor) -> None:
+        super().__init__()
+        self.planes = Planes(settings.cells, time_cells, settings.features)
+        self.decode = nn.Linear(self.planes.size, MOVING)  # a linear decoder for each of what moves, side by side
+        nn.init.zeros_(self.decode.weight)
+        nn.init.zeros_(self.decode.bias)
+        self.register_buffer("low", places.amin(0))
+        self.register_buffer("high", places.amax(0))
+
+    def forward(self, place: Tensor, t: float) -> Tensor:
+        inside = 2 * (place - self.low) / (self.high - self.low).clamp(min=1e-6) - 1
+        changed: Tensor = self.decode(self.planes(inside, torch.full_like(inside[:, 0], t)))
+        return changed
+
+
+def _rasterized(moved: Tensor, colour: Tensor, camera: Camera) -> Rendered:
+    """Gaussians [N, MOVING] of colours [N, 3], by the rasteriser of their device; that of float64 is the reference."""
+    if moved.is_cuda:
+        from worker.raster.cuda import rasterize
+    elif moved.dtype == torch.float64:
+        from worker.raster.reference import rasterize
+    else:
+        from worker.raster.cpu import rasterize
+    opacity = torch.sigmoid(moved[:, OPACITY])
+    return rasterize(moved[:, MEAN], moved[:, QUATERNION], moved[:, LOG_SCALE].exp(), opacity, colour, camera)
