@@ -15,7 +15,9 @@ from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.run import Make
 
-RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType({"endonerf": EndoNerf, "lerplane": LerPlane, "endogaussian": EndoGaussian})
+RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType(
+    {"endonerf": EndoNerf, "lerplane": LerPlane, "endogaussian": EndoGaussian}
+)
 """By the name of their series."""
 RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""

@@ -60,9 +60,7 @@ def numbers_of(rival: Rival) -> list[bytes]:
     return [each.detach().numpy().tobytes() for each in rival.parameters()]
 
 
-def check_gradient(
-    rival: Rival, parameters: Iterable[torch.Tensor], step: float = 1e-6, progress: float = 0.0
-) -> None:
+def check_gradient(rival: Rival, parameters: Iterable[torch.Tensor], step: float = 1e-6, progress: float = 0.0) -> None:
     """The loss falls along a random direction as autograd says, by central differences in float64."""
     moved = list(parameters)
     random = torch.Generator().manual_seed(5)
