@@ -47,7 +47,7 @@ class EndoGaussianSettings:
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
     resting         share of the training without motion
     *_rate          of Adam; a pair falls exponentially from the end of rest
-    evenness        weight of the total variation of the rendered colour and depth, of pictures as wide as those published
+    evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
     """
 
     share: float = 0.01
