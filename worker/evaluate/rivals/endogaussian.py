@@ -81,7 +81,7 @@ class EndoGaussian(Rival):
         self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
         moves = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
-        self._moves = [nn.Parameter(each.to(seen.rgb)) for each in moves]
+        self._moves: list[Tensor] = [nn.Parameter(each.to(seen.rgb)) for each in moves]
         self._colour, self._harmonics = (nn.Parameter(each.to(seen.rgb)) for each in (start.sh[:, :1], start.sh[:, 1:]))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -147,7 +147,8 @@ class EndoGaussian(Rival):
         mean = self._moves[0]
         if not bool(torch.isfinite(mean).all()):
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
-        return torch.cat(self._moves, 1) + self.field(mean, t)
+        changed: Tensor = self.field(mean, t)
+        return torch.cat(self._moves, 1) + changed
 
     def _shown(self, moved: Tensor, camera: Camera, degree: int) -> Rendered:
         """The picture of Gaussians [N, MOVING], with harmonics up to the degree."""
@@ -161,11 +162,11 @@ def starting_gaussians(
 ) -> Gaussians:
     """Round Gaussians at measured places of all frames: the same share of each frame's pixels, drawn at random."""
     chosen = []
-    for frame in range(len(seen)):
-        pixels = torch.nonzero(seen.depth_mm[frame] > 0)
+    for index in range(len(seen)):
+        pixels = torch.nonzero(seen.depth_mm[index] > 0)
         count = min(len(pixels), max(1, round(settings.share * len(pixels))))
         drawn = pixels[torch.randperm(len(pixels), generator=random)[:count].to(pixels.device)]
-        chosen.append(torch.cat([torch.full_like(drawn[:, :1], frame), drawn], 1))
+        chosen.append(torch.cat([torch.full_like(drawn[:, :1], index), drawn], 1))
     every = torch.cat(chosen)
     kept = every[torch.randperm(len(every), generator=random)[: settings.most].to(every.device)]
     frame, row, column = kept.unbind(1)
