@@ -12,6 +12,8 @@ import random
 import ssl
 import time
 import uuid
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 
@@ -21,6 +23,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.webhook_secrets import signature, tenant_secret
 from contract.queue.deliveries import Loan
 from contract.queue.interface import Queue
+from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.runtime.version import version
 from contract.wire.errors import UnavailableError
@@ -28,8 +31,8 @@ from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnd
 from service.callbacks import is_allowed, permitted_addresses
 
 LOOK_PERIOD_S = 0.5
-MAX_AT_ONCE = 16
-"""Tries under way at a time: a receiver that does not answer holds one for TRY_S."""
+MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
+"""Tries under way at a time, in all and of one tenant: a receiver that does not answer holds one for TRY_S."""
 TRY_S = 10.0
 """How long one try may take, from looking up the name to the head of the answer."""
 CONNECT_S = 4.0
@@ -57,10 +60,12 @@ class Webhooks:
         self._settings = settings
         self._queue = queue
         self._is_away = False
+        self._under_way: Counter[str] = Counter()
+        """By tenant."""
 
     async def run(self) -> None:
         """Deliver whatever is due, until cancelled."""
-        places = asyncio.Semaphore(MAX_AT_ONCE)
+        self._under_way.clear()
         tls = await run_in_threadpool(ssl.create_default_context)
         timeout = httpx.Timeout(TRY_S, connect=CONNECT_S)
         limits = httpx.Limits(max_keepalive_connections=0)  # a connection belongs to the name it was made for
@@ -71,18 +76,20 @@ class Webhooks:
             asyncio.TaskGroup() as tries,
         ):
             while True:
-                await places.acquire()
-                loan = await run_in_threadpool(self._lent)
+                loan = None
+                if self._under_way.total() < MAX_AT_ONCE:
+                    full = [tenant for tenant, count in self._under_way.items() if count >= MAX_OF_TENANT]
+                    loan = await run_in_threadpool(self._lent, full)
                 if loan is None:
-                    places.release()
                     await asyncio.sleep(LOOK_PERIOD_S)
                 else:
-                    tries.create_task(self._deliver(http, loan)).add_done_callback(lambda _: places.release())
+                    self._under_way[loan.tenant] += 1
+                    tries.create_task(self._deliver(http, loan))
 
-    def _lent(self) -> Loan | None:
+    def _lent(self, full: Collection[str]) -> Loan | None:
         """A delivery that is due; None also while the queue is away, and for one that cannot be read."""
         try:
-            loan = self._queue.lend_delivery(uuid.uuid4().hex)
+            loan = self._queue.lend_delivery(uuid.uuid4().hex, full)
         except UnavailableError as error:
             if not self._is_away:
                 logger.warning("webhooks wait for the queue: %s", error.problem)
@@ -100,11 +107,15 @@ class Webhooks:
             await self._note(loan, await self._tried(http, loan))
         except Exception:
             logger.exception("what became of a webhook is not noted", extra={"job_id": loan.delivery.job_id})
+        finally:
+            self._under_way[loan.tenant] -= 1
 
     async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
         """The delivery after one more try."""
-        began_s, status_code, failure = time.time(), None, None
+        began_s, status_code, failure, job_id = time.time(), None, None, loan.delivery.job_id
+        span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=traces.Kind.CLIENT, job_id=job_id)
         try:
+            span.set(method="POST", host=_host_of(httpx.URL(loan.url)))
             async with asyncio.timeout(TRY_S):
                 status_code = await self._post(http, loan)
         except TimeoutError:
@@ -112,8 +123,12 @@ class Webhooks:
         except TryFailed as error:
             failure, status_code = error.failure, error.status_code
         except Exception:
-            logger.exception("a webhook was not sent by a fault of ours", extra={"job_id": loan.delivery.job_id})
+            logger.exception("a webhook was not sent by a fault of ours", extra={"job_id": job_id})
             failure = TryFailure.FAULT
+        finally:
+            if status_code is not None:
+                span.set(status=status_code)
+            span.end(failed=failure or ("cancelled" if status_code is None else None))
         return _after(loan.delivery, DeliveryTry(at_s=began_s, status_code=status_code, failure=failure))
 
     async def _note(self, loan: Loan, delivery: Delivery) -> None:

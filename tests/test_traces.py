@@ -13,6 +13,7 @@ import httpx
 import pytest
 from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanKind
 
 from client.demo import free_port, started_service
 from contract.queue.embedded import EmbeddedServer
@@ -20,8 +21,11 @@ from contract.runtime import traces
 from contract.runtime.otlp import OtlpRecorder
 from contract.runtime.settings import Settings
 from intrasplat_client import Client
+from service import webhooks
 from tests.collector import Seen, collecting
+from tests.receiver import Receiver
 from tests.service.live import live_service
+from tests.service.telling import cancelled, log_of, telling
 from tests.service.test_logs import MARKER, say_it_everywhere
 from tests.service.under_test import CLIP, Painter, ServiceUnderTest, running_service
 from tests.test_repository import REPOSITORY
@@ -146,6 +150,25 @@ def test_a_job_of_the_queue_names_the_trace_and_no_json_of_it_does(
     submission = service.store.submission(job_id)
     assert submission is not None
     assert submission.trace is None
+
+
+def test_each_try_of_a_webhook_is_a_span_in_the_trace_of_its_job(
+    tmp_path: Path, exporter: InMemorySpanExporter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhooks, "FIRST_WAIT_S", 0.001)
+    with Receiver(503) as receiver, telling(receiver, tmp_path) as service:
+        job_id = cancelled(service, f"{receiver.origin}/{MARKER}?token={MARKER}", traceparent=TRACEPARENT)
+        log_of(service, job_id, lambda delivery: delivery["status"] == "delivered")
+    traces.flush()
+    tries = [each for each in exporter.get_finished_spans() if each.name == "deliver webhook"]
+    assert {each.context and format(each.context.trace_id, "032x") for each in tries} == {CALLERS_TRACE}
+    assert {each.kind for each in tries} == {SpanKind.CLIENT}
+    of_each = {"http.request.method": "POST", "server.address": "127.0.0.1", "intrasplat.job_id": job_id}
+    assert [dict(each.attributes or {}) for each in tries] == [
+        of_each | {"http.response.status_code": 503, "error.type": "status"},
+        of_each | {"http.response.status_code": 204},
+    ]
+    assert not any(MARKER in each.to_json() for each in tries)
 
 
 class Away(SpanExporter):

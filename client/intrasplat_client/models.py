@@ -220,7 +220,7 @@ class Delivery(Model):
     status: Annotated[DeliveryStatus | str, Field(union_mode="left_to_right")] = DeliveryStatus.OWED
     tries: tuple[DeliveryTry, ...] = ()
     next_try_at_s: float | None = None
-    """when it is tried next, UNIX s; None: never again"""
+    """when it is tried next, UNIX s; None: of one that is owed, a try is under way"""
 
 
 class DeliveryTry(Model):

@@ -7,6 +7,7 @@ lent the delivery. So each is made at least once, and twice only if a service di
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,15 +29,17 @@ class Loan:
     url: str
     tenant: str
     mark: str
+    trace: str | None = None
+    """The traceparent of the job."""
 
 
 class Deliveries(Protocol):
     """Every method is atomic, and may be repeated when its answer was lost; all raise UnavailableError."""
 
-    def lend_delivery(self, token: str) -> Loan | None:
+    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
         """The delivery that has been due for longest, which is lent to nobody else for LOAN_S; None if none is due.
 
-        token: of this call; the same token gets the same delivery again.
+        token: of this call; the same token gets the same delivery again. passed: tenants whose deliveries have to wait.
         """
         ...
 
@@ -48,5 +51,8 @@ class Deliveries(Protocol):
         ...
 
     def deliveries(self, job_id: str) -> list[Delivery]:
-        """What a job's ends owe and owed, the first end first; nothing if the job has no callback."""
+        """What a job's ends owe and owed, the first end first; nothing if the job has no callback.
+
+        While one is lent, it has no next_try_at_s.
+        """
         ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Collection
 
 from contract.queue.deliveries import OWED_FOR_S, Loan
 from contract.queue.interface import (
@@ -212,13 +213,12 @@ class MemoryQueue:
             self._idempotent = {key: held for key, held in self._idempotent.items() if held[0] != job_id}
             return True
 
-    def lend_delivery(self, token: str) -> Loan | None:
+    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
         with self._changed:
-            if (lent := self._deliveries.lend(token)) is None:
+            if (lent := self._deliveries.lend(token, passed)) is None:
                 return None
-            delivery, mark = lent
-            record = self._records[delivery.job_id]
-            return Loan(delivery, record.callback_url or "", record.tenant, mark)
+            record = self._records[lent[0].job_id]
+            return Loan(lent[0], record.callback_url or "", record.tenant, lent[1], record.trace)
 
     def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
         with self._changed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Collection
 
 from contract.queue.deliveries import LOAN_S, Loan
 from contract.wire.job import JobRecord
@@ -20,6 +21,10 @@ class MemoryDeliveries:
         self._due_at_s: dict[str, float] = {}
         self._lent: dict[str, str] = {}
         """Event by token."""
+        self._tenants: dict[str, str] = {}
+        """By event."""
+        self._trying: dict[str, float] = {}
+        """By event: when the loan runs out, UNIX s."""
 
     @property
     def owed(self) -> int:
@@ -35,17 +40,22 @@ class MemoryDeliveries:
         ended_at_s = record.finished_at_s or time.time()
         self._all[event] = Delivery(event_id=event, state=record.state, error_code=error_code, ended_at_s=ended_at_s)
         self._due_at_s[event] = time.time()
+        self._tenants[event] = record.tenant
 
-    def lend(self, token: str) -> tuple[Delivery, str] | None:
+    def lend(self, token: str, passed: Collection[str]) -> tuple[Delivery, str] | None:
         """The delivery and the mark of its loan."""
         event = self._lent.get(token)
         if event not in self._due_at_s:
             now_s = time.time()
-            due = [each for each, due_at_s in self._due_at_s.items() if due_at_s <= now_s]
+            due = [
+                each
+                for each, due_at_s in self._due_at_s.items()
+                if due_at_s <= now_s and self._tenants[each] not in passed
+            ]
             if not due:
                 return None
             event = self._lent[token] = min(due, key=self._due_at_s.__getitem__)
-            self._due_at_s[event] = now_s + LOAN_S
+            self._due_at_s[event] = self._trying[event] = now_s + LOAN_S
         return self._all[event], repr(self._due_at_s[event])
 
     def note(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
@@ -56,6 +66,7 @@ class MemoryDeliveries:
         if event not in self._due_at_s or repr(self._due_at_s[event]) != loan.mark:
             return False
         self._all[event] = delivery
+        self._trying.pop(event, None)
         if wait_s is None:
             del self._due_at_s[event]
             self.ended[delivery.status] += 1
@@ -66,10 +77,16 @@ class MemoryDeliveries:
     def of(self, job_id: str) -> list[Delivery]:
         """The deliveries of a job, with when they are tried next."""
         found = [each for each in self._all.values() if each.job_id == job_id]
-        return [each.model_copy(update={"next_try_at_s": self._due_at_s.get(each.event_id)}) for each in found]
+        return [each.model_copy(update={"next_try_at_s": self._next_at_s(each.event_id)}) for each in found]
 
     def forget(self, job_id: str) -> None:
         """Owe nothing of a job that is removed, and remember nothing of it."""
         for delivery in self.of(job_id):
             del self._all[delivery.event_id]
+            del self._tenants[delivery.event_id]
             self._due_at_s.pop(delivery.event_id, None)
+            self._trying.pop(delivery.event_id, None)
+
+    def _next_at_s(self, event: str) -> float | None:
+        is_tried = self._trying.get(event, 0.0) > time.time()
+        return None if is_tried else self._due_at_s.get(event)

@@ -26,7 +26,8 @@ Indexes, written by the same scripts as the hashes:
     {intrasplat}:dead                   sorted set of dead letters, by time of failure
     {intrasplat}:ended                  hash, jobs that ever came to each terminal state
     {intrasplat}:durations              list, seconds that the last done jobs ran
-    {intrasplat}:owed                   sorted set of the events whose webhook is owed, by when it is due
+    {intrasplat}:owed-by                hash, how many webhooks each tenant owes; their events stand, by when they are
+                                        due, in sorted set tenant:<tenant>:owed
     {intrasplat}:delivered              hash, webhooks that ever came to each DeliveryStatus but owed
     {intrasplat}:sequence               counter
     {intrasplat}:workers                set of names that may have a {intrasplat}:worker:<name>
@@ -36,6 +37,7 @@ These expire:
     {intrasplat}:yield:<id>             owner that was told to make way for that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
     {intrasplat}:lent:<token>           event that was lent to that call
+    {intrasplat}:trying:<event>         while a service tries to deliver it
 
 A user who may do this and nothing else:
     ACL SETUSER intrasplat on >PASSWORD ~{intrasplat}:* resetchannels +@all -@dangerous +bgrewriteaof
@@ -52,7 +54,7 @@ import logging
 import time
 import uuid
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import redis
@@ -93,7 +95,7 @@ HIGH, STANDARD = PREFIX + "jobs:high", PREFIX + "jobs:standard"
 HELD = PREFIX + "held"
 QUEUED = PREFIX + "queued"
 WORKERS = PREFIX + "workers"
-OWED = PREFIX + "owed"
+OWED = PREFIX + "owed-by"
 
 BLOCK_S = 2.0
 """How long one read may block. The client notices a cut connection within this and the socket's timeout."""
@@ -235,20 +237,31 @@ class RedisQueue:
         idempotency_key = (record and record.idempotency_key) or ""
         return bool(self._scripts.run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
 
-    def lend_delivery(self, token: str) -> Loan | None:
-        answer = self._scripts.run("lend", token, round(LOAN_S * 1000))
-        return Loan(Delivery.model_validate_json(answer[0]), *answer[1:]) if answer else None
+    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
+        answer = self._scripts.run("lend", token, round(LOAN_S * 1000), *passed)
+        if not answer:
+            return None
+        document, url, tenant, mark, trace = answer
+        return Loan(Delivery.model_validate_json(document), url, tenant, mark, trace or None)
 
     def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
         wait_ms = "" if wait_s is None else round(wait_s * 1000)
         document = delivery.model_dump_json(exclude={"next_try_at_s"})
-        return bool(self._scripts.run("note", delivery.event_id, loan.mark, document, delivery.status.value, wait_ms))
+        told = (delivery.event_id, loan.mark, document, delivery.status.value, wait_ms, loan.tenant)
+        return bool(self._scripts.run("note", *told))
 
     def deliveries(self, job_id: str) -> list[Delivery]:
         with reachable():
             found = [Delivery.model_validate_json(each) for each in self._client.hvals(_deliveries_key(job_id))]
-            due = self._client.zmscore(OWED, [each.event_id for each in found]) if found else []
-        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, due, strict=True)]
+            tenant = self._client.hget(_job_key(job_id), "tenant")
+            if not found:
+                return []
+            with self._client.pipeline(transaction=True) as batch:
+                batch.zmscore(f"{PREFIX}tenant:{tenant}:owed", [each.event_id for each in found])
+                batch.mget([f"{PREFIX}trying:{each.event_id}" for each in found])
+                due, trying = batch.execute()
+        next_s = [None if is_tried else at_s for at_s, is_tried in zip(due, trying, strict=True)]
+        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
         return sorted(told, key=lambda each: each.ended_at_s)
 
     def rewrite_log(self) -> bool:
@@ -279,7 +292,7 @@ class RedisQueue:
             batch.zrange(QUEUED, 0, 0, withscores=True)
             batch.hlen(HELD)
             batch.hgetall(f"{PREFIX}ended")
-            batch.zcard(OWED)
+            batch.hvals(OWED)
             batch.hgetall(f"{PREFIX}delivered")
             batch.time()
             queued, oldest, running, ended, owed, delivered, (seconds, microseconds) = batch.execute()
@@ -287,7 +300,7 @@ class RedisQueue:
         counts = {state: int(ended.get(state, 0)) for state in TERMINAL_STATES}
         webhooks = {DeliveryStatus(status): int(count) for status, count in delivered.items()}
         oldest_s = max(0.0, seconds + microseconds / 1e6 - since_s)
-        return QueueFigures(queued, running, oldest_s, counts, webhooks | {DeliveryStatus.OWED: owed})
+        return QueueFigures(queued, running, oldest_s, counts, webhooks | {DeliveryStatus.OWED: sum(map(int, owed))})
 
     def ping(self) -> None:
         with reachable():

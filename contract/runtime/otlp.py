@@ -21,7 +21,12 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 from contract.runtime.traces import TRACEPARENT, Attributes, Kind, Span, flush
 from contract.runtime.version import version
 
-NAMES = {"method": "http.request.method", "route": "http.route", "status": "http.response.status_code"}
+NAMES = {
+    "method": "http.request.method",
+    "route": "http.route",
+    "status": "http.response.status_code",
+    "host": "server.address",
+}
 """Attributes that OpenTelemetry has names for; all others have ours."""
 MAX_CHARACTERS = 200
 FLUSH_LOOK_S = 0.01

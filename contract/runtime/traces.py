@@ -40,6 +40,7 @@ class Attributes(TypedDict, total=False):
     route: str
     status: int
     outcome: str
+    host: str
     input_bytes: int
     width: int
     height: int

@@ -66,7 +66,9 @@ class Delivery(BaseModel):
     ended_at_s: float = Field(description="when the job ended, UNIX s")
     status: DeliveryStatus = DeliveryStatus.OWED
     tries: tuple[DeliveryTry, ...] = ()
-    next_try_at_s: float | None = Field(default=None, description="when it is tried next, UNIX s; None: never again")
+    next_try_at_s: float | None = Field(
+        default=None, description="when it is tried next, UNIX s; None: of one that is owed, a try is under way"
+    )
 
     @property
     def job_id(self) -> str:

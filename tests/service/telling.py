@@ -36,8 +36,8 @@ def accepted(service: ServiceUnderTest, url: str, **headers: str) -> str:
     return job_id
 
 
-def cancelled(service: ServiceUnderTest, url: str) -> str:
-    job_id = accepted(service, url)
+def cancelled(service: ServiceUnderTest, url: str, **headers: str) -> str:
+    job_id = accepted(service, url, **headers)
     service.http.delete(f"/jobs/{job_id}")
     return job_id
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -178,8 +179,8 @@ def test_while_the_queue_is_away_nothing_is_lost(
     job_id, lend = accepted(service, f"{receiver.origin}/"), service.queue.lend_delivery
     asked = []
 
-    def away(token: str) -> None:
-        asked.append(token)
+    def away(*arguments: object) -> None:
+        asked.append(arguments)
         raise UnavailableError("The queue is away.", "Wait.")
 
     monkeypatch.setattr(service.queue, "lend_delivery", away)
@@ -189,6 +190,39 @@ def test_while_the_queue_is_away_nothing_is_lost(
     assert receiver.came.empty()
     monkeypatch.setattr(service.queue, "lend_delivery", lend)
     assert receiver.next().document["data"]["job_id"] == job_id
+
+
+def test_a_tenant_whose_receivers_hang_holds_up_no_other_tenant(tmp_path: Path) -> None:
+    with (
+        Receiver(waits=True) as hanging,
+        Receiver() as receiver,
+        telling(receiver, tmp_path, webhook_hosts=(hanging.origin, receiver.origin)) as service,
+    ):
+        own = {accepted(service, f"{hanging.origin}/{n}", **bearer(service, "ward-1")) for n in range(20)}
+        for job_id in own:
+            service.queue.cancel(job_id)
+        for _ in range(webhooks.MAX_OF_TENANT):
+            hanging.next()
+        job_id = accepted(service, f"{receiver.origin}/", **bearer(service, "ward-2"))
+        service.queue.cancel(job_id)
+        assert receiver.next().document["data"]["job_id"] == job_id
+        assert hanging.came.empty()
+        hanging.go_on()
+        told = {webhook.document["data"]["job_id"] for webhook in hanging.all}
+        told |= {hanging.next().document["data"]["job_id"] for _ in range(20 - webhooks.MAX_OF_TENANT)}
+        assert told == own
+
+
+def test_while_a_try_is_under_way_no_next_one_is_told(tmp_path: Path) -> None:
+    with Receiver(500, waits=True) as receiver, telling(receiver, tmp_path) as service:
+        job_id = cancelled(service, f"{receiver.origin}/")
+        receiver.next()
+        under_way = log_of(service, job_id, lambda delivery: True)
+        assert (under_way["status"], under_way["tries"], under_way["next_try_at_s"]) == ("owed", [], None)
+        receiver.go_on()
+        failed = log_of(service, job_id, lambda delivery: bool(delivery["tries"]))
+        assert failed["status"] == "owed"
+        assert failed["next_try_at_s"] > failed["tries"][0]["at_s"]
 
 
 def ended_after_the_last_day(queue: MemoryQueue, url: str) -> str:
@@ -229,7 +263,7 @@ def test_a_delivery_that_cannot_be_read_is_logged_and_the_others_go_out(
 ) -> None:
     lend, left = service.queue.lend_delivery, [ValueError("of a later version")]
 
-    def damaged(*arguments: str) -> Loan | None:
+    def damaged(*arguments: Any) -> Loan | None:
         if left:
             raise left.pop()
         return lend(*arguments)

@@ -1,7 +1,8 @@
 #!lua flags=allow-oom
 -- CANCEL: end a queued job; ask the worker of a running one to stop.
 -- ARGV   2 id
--- Keys   job:<id>, the indexes of queued jobs, ended, jobs:<priority>, events:<id>, owed, deliveries:<id>
+-- Keys   job:<id>, the indexes of queued jobs, ended, jobs:<priority>, events:<id>, owed-by, tenant:<tenant>:owed,
+--        deliveries:<id>
 -- Answer the job's hash afterwards.
 
 local job = read(ARGV[2])

@@ -2,7 +2,8 @@
 -- CLAIM: give a worker the next job and a lease on it. The lease is the idle time of the job's stream entry: claiming
 -- and beating (beat.lua) set it to 0 (common.lua: renew). Any worker may claim an entry that was idle for lease_ms.
 -- ARGV   2 owner
--- Keys   held, jobs:high|standard, job:<id>, the indexes of its state, yield:<id>, ended, events:<id>, served, owed, deliveries:<id>
+-- Keys   held, jobs:high|standard, job:<id>, the indexes of its state, yield:<id>, ended, events:<id>, served,
+--        owed-by, tenant:<tenant>:owed, deliveries:<id>
 -- Answer {1, id, hash}: the owner's now. {0, last id of jobs:high, of jobs:standard, how many entries are pending}: none.
 
 local owner = ARGV[2]

@@ -8,8 +8,8 @@ local PRIORITIES = {'high', 'standard'}
 local GROUP, CONSUMER = 'workers', 'worker'
 -- A released entry counts as idle for longer than any lease, so that anybody may claim it at once.
 local LONG_MS = 86400000
--- The deliveries that are owed, by when they are due; a job's own are in deliveries:<id>, by event.
-local OWED = P .. 'owed'
+-- How many deliveries each tenant owes; the events are in tenant:<tenant>:owed, by when they are due.
+local OWED = P .. 'owed-by'
 
 local function now()
   local clock = redis.call('TIME')
@@ -23,6 +23,9 @@ local function stream(priority) return P .. 'jobs:' .. priority end
 local function waiting(priority) return P .. 'waiting:' .. priority end
 local function waiting_of(tenant) return P .. 'tenant:' .. tenant .. ':waiting' end
 local function document(id) return P .. 'job:' .. id end
+local function owed_of(tenant) return P .. 'tenant:' .. tenant .. ':owed' end
+-- Stands while a service tries.
+local function trying(event) return P .. 'trying:' .. event end
 local function deliveries(id) return P .. 'deliveries:' .. id end
 -- The job of an event (contract/wire/webhooks.py: event_id).
 local function job_of(event) return string.match(event, '^[^.]*') end
@@ -76,6 +79,14 @@ local function leave(job)
   end
 end
 
+-- When a delivery is due; nil: it is owed no more.
+local function set_due(tenant, event, at)
+  local own = owed_of(tenant)
+  if at then redis.call('ZADD', own, at, event) else redis.call('ZREM', own, event) end
+  local count = redis.call('ZCARD', own)
+  if count > 0 then redis.call('HSET', OWED, tenant, count) else redis.call('HDEL', OWED, tenant) end
+end
+
 -- A job has ended: if it has a callback, the delivery is due at once.
 local function owe(job)
   if not job.callback then return end
@@ -83,7 +94,7 @@ local function owe(job)
   local delivery = {event_id = job.id .. '.' .. job.attempt .. '.' .. job.state, state = job.state, ended_at_s = job.finished}
   if is_json and type(fault) == 'table' then delivery.error_code = fault.code end
   if redis.call('HSETNX', deliveries(job.id), delivery.event_id, cjson.encode(delivery)) == 1 then
-    redis.call('ZADD', OWED, now(), delivery.event_id)
+    set_due(job.tenant, delivery.event_id, now())
   end
 end
 

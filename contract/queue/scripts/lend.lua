@@ -1,26 +1,42 @@
 #!lua flags=allow-oom
--- LEND: lend a service the delivery that has been due for longest. Its score in `owed` is when the loan runs out.
--- ARGV   2 token of the call, 3 how long the loan lasts in ms
--- Keys   owed, lent:<token>, deliveries:<id>, job:<id>
--- Answer {delivery as JSON, callback, tenant, score}; {}: none is due.
+-- LEND: lend a service the delivery that has been due for longest. Its score is then when the loan runs out.
+-- ARGV   2 token of the call, 3 how long the loan lasts in ms, 4 and more: tenants whose deliveries are not lent
+-- Keys   owed-by, tenant:<tenant>:owed, lent:<token>, trying:<event>, deliveries:<id>, job:<id>
+-- Answer {delivery as JSON, callback, tenant, score, trace or ''}; {}: none is due.
 
-local lent = P .. 'lent:' .. ARGV[2]
+local lent, passed = P .. 'lent:' .. ARGV[2], {}
+for i = 4, #ARGV do passed[ARGV[i]] = true end
+
 local function answer(event)
   local id = job_of(event)
   local delivery = redis.call('HGET', deliveries(id), event)
-  local job = redis.call('HMGET', document(id), 'callback', 'tenant')
-  if delivery and job[1] and job[2] then return {delivery, job[1], job[2], redis.call('ZSCORE', OWED, event)} end
+  local job = redis.pcall('HMGET', document(id), 'callback', 'tenant', 'trace')
+  if not (delivery and job[1] and job[2]) then return nil end
+  local score = redis.call('ZSCORE', owed_of(job[2]), event)
+  return score and {delivery, job[1], job[2], score, job[3] or ''}
+end
+
+local function first_due()
+  local tenant, event, at
+  for _, each in ipairs(redis.call('HKEYS', OWED)) do
+    local head = passed[each] and {} or redis.call('ZRANGE', owed_of(each), 0, 0, 'WITHSCORES')
+    if head[1] and (not at or tonumber(head[2]) < at) then tenant, event, at = each, head[1], tonumber(head[2]) end
+  end
+  if at and at <= tonumber(now()) then return tenant, event end
 end
 
 local mine = redis.call('GET', lent)
-if mine and redis.call('ZSCORE', OWED, mine) then return answer(mine) or {} end
-for _, event in ipairs(redis.call('ZRANGE', OWED, '-inf', now(), 'BYSCORE', 'LIMIT', 0, 100)) do
-  redis.call('ZADD', OWED, later(ARGV[3]), event)
+local mine_still = mine and answer(mine)
+if mine_still then return mine_still end
+while true do
+  local tenant, event = first_due()
+  if not event then return {} end
+  set_due(tenant, event, later(ARGV[3]))
   local found = answer(event)
   if found then
     redis.call('SET', lent, event, 'PX', ARGV[3])
+    redis.call('SET', trying(event), '1', 'PX', ARGV[3])
     return found
   end
-  redis.call('ZREM', OWED, event)
+  set_due(tenant, event, nil)
 end
-return {}

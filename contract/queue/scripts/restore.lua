@@ -2,7 +2,8 @@
 -- RESTORE: put back the record of an ended job that the queue has lost. It does not count in `ended` again; whether its
 -- webhook was delivered is lost, too, so it is owed, unless the job ended long ago.
 -- ARGV   2 id, 3 fields of its hash as JSON, 4 created, 5 idempotency hash or '', 6 the rest of its life in ms, 7 token
--- Keys   job:<id>, idempotency:<tenant>:<hash>, dead, index, events:<id>, owed, deliveries:<id>
+-- Keys   job:<id>, idempotency:<tenant>:<hash>, dead, index, events:<id>, owed-by, tenant:<tenant>:owed,
+--        deliveries:<id>
 -- Answer 1: this call has restored it; 0: the queue knows the job.
 
 local id, changes = ARGV[2], cjson.decode(ARGV[3])

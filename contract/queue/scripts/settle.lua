@@ -1,7 +1,8 @@
 #!lua flags=allow-oom
 -- SETTLE: bring a running job to its end. A job whose cancellation was asked for ends as cancelled, and no other does.
 -- ARGV   2 id, 3 owner, 4 attempt, 5 target state, 6 error or ''
--- Keys   job:<id>, held, ended, jobs:<priority>, dead, durations, rests, events:<id>, owed, deliveries:<id>
+-- Keys   job:<id>, held, ended, jobs:<priority>, dead, durations, rests, events:<id>, owed-by,
+--        tenant:<tenant>:owed, deliveries:<id>
 -- Answer 1: this claim has brought the job to that end; 0: the claim does not hold, or a cancel is in the way.
 
 -- Whether a job takes in a scene that was made elsewhere: how long that takes says nothing of other jobs.

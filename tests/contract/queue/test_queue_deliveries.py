@@ -21,8 +21,8 @@ CALLBACK = "https://his.example/done"
 TOKENS = (f"{number:032x}" for number in count())
 
 
-def lent(queue: Queue) -> Loan | None:
-    return queue.lend_delivery(next(TOKENS))
+def lent(queue: Queue, *passed: str) -> Loan | None:
+    return queue.lend_delivery(next(TOKENS), passed)
 
 
 def tried(queue: Queue, loan: Loan, failure: TryFailure | None, wait_s: float | None) -> bool:
@@ -118,6 +118,31 @@ def test_a_failed_delivery_is_lent_again_when_it_is_due_and_a_delivered_one_neve
     assert len(delivery.tries) == 2
     assert delivery.next_try_at_s is not None
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 1}
+
+
+def test_a_delivery_that_is_lent_has_no_next_try_until_the_loan_ends(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    assert queue.deliveries(job_id)[0].next_try_at_s is not None
+    loan = lent(queue)
+    assert loan is not None
+    assert [(each.status, each.next_try_at_s) for each in queue.deliveries(job_id)] == [(DeliveryStatus.OWED, None)]
+    assert tried(queue, loan, TryFailure.TIMEOUT, 60.0)
+    assert queue.deliveries(job_id)[0].next_try_at_s is not None
+
+
+def test_tenants_that_are_passed_wait_and_the_others_deliveries_are_lent(queue: Queue) -> None:
+    first, second, third = (queue.submit(job(callback_url=CALLBACK, tenant=each)) for each in ("a", "a", "b"))
+    for record in (first, second, third):
+        queue.cancel(record.job_id)
+    assert queue.figures().webhooks == {DeliveryStatus.OWED: 3}
+    loan = lent(queue, "a", "c")
+    assert loan is not None
+    assert loan.delivery.job_id == third.job_id
+    assert lent(queue, "a") is None
+    assert [loan.delivery.job_id for loan in (lent(queue), lent(queue, "b")) if loan] == [first.job_id, second.job_id]
+    assert queue.forget(first.job_id)
+    assert queue.figures().webhooks == {DeliveryStatus.OWED: 2}
 
 
 def test_a_delivered_and_a_given_up_webhook_are_counted_and_stay_in_the_log(queue: Queue) -> None:
