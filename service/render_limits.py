@@ -45,8 +45,7 @@ class RenderLimits:
     def cost(self, request: RenderRequest) -> float:
         """What a render costs, as far as its scene is known."""
         gaussians, size = self._scenes.get(request.scene_id, (TYPICAL_GAUSSIANS, TYPICAL_SIZE))
-        width, height = request.camera.size(*size)
-        return render_cost(min(width * height, request.max_pixels), gaussians)
+        return render_cost(request.most_drawn(size), gaussians)
 
     @contextmanager
     def admitted(self, caller: Caller, request: RenderRequest) -> Iterator[None]:

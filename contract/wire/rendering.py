@@ -124,6 +124,14 @@ class RenderRequest(BaseModel):
     unseen: Unseen = Unseen.MARK
     highlights: Highlights = Highlights.ON
     max_pixels: int = Field(default=4096 * 2160, gt=0)
+    """The most that may be drawn for it."""
+
+    def most_drawn(self, clip_size: tuple[int, int]) -> int:
+        """Pixels that are drawn for it, at most: a wide lens shows more of the recording's pixels than the clip has."""
+        (width, height), (clip_width, clip_height) = self.camera.size(*clip_size), clip_size
+        is_own_lens = self.camera.fx is None and self.camera.fy is None
+        finest = clip_width * clip_height if is_own_lens else MAX_JUDGED_PIXELS
+        return min(max(width * height, min(finest, MAX_JUDGED_PIXELS)), self.max_pixels)
 
 
 class ExportRequest(BaseModel):
@@ -236,6 +244,8 @@ class WorkerReply(BaseModel):
     """Of depth in false colours: the depths of the brightest and the darkest colour, the same throughout the clip."""
 
 
+MAX_JUDGED_PIXELS = 1 << 21
+"""A picture smaller than the recording is drawn in the recording's pixels, in at most so many: those of 1920 x 1080."""
 TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
 """What a scene is taken to have of which nothing is known yet."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +45,14 @@ from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.export import DRAWN, export_parts
 from worker.input.camera import Intrinsics
 from worker.raster.backend import CPU, Device
+from worker.raster.cpu.threads import beside
 from worker.render.camera import endoscope_pose, right_eye
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.measure import WINDOW_PX
 from worker.render.measured import measured
 from worker.render.recorded import live_frame, stored_frame
-from worker.render.view import ROUNDING, Frame, judged_camera, no_pause, render_frame, renderer_of
+from worker.render.view import LARGE_PIXELS, ROUNDING, Frame, judged_camera, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
@@ -149,9 +151,10 @@ class Views:
             return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
         width, height = request.camera.size(*size)
         if scene is not None:
-            judged = judged_camera(_seen_through(scene.intrinsics, request.camera), scene.intrinsics)
+            asked = _seen_through(scene.intrinsics, request.camera)
+            judged = judged_camera(asked, scene.intrinsics, request.max_pixels)
             return render_cost(max(width * height, judged.width * judged.height), gaussians)
-        return render_cost(width * height, gaussians)
+        return render_cost(request.most_drawn(size), gaussians)
 
     def forget_purged(self) -> None:
         """Drop scenes whose folders are gone, and jobs that have ended. Call it now and then."""
@@ -224,12 +227,13 @@ class Views:
         with traces.span("draw", **told):
             frame = render_frame(
             drawn, request.t, pose, camera, self._device,
-            highlights=highlights, is_coarse=level > 0, pause=self.pause,
+            highlights=highlights, is_coarse=level > 0, max_pixels=request.max_pixels, pause=self.pause,
         )  # fmt: skip
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
-        reply = _reply(scene, frame.enlarged(*size) if level else frame, request, snapshot, level, range_mm)
+        frame = frame.enlarged(*size) if level else frame
+        reply = _reply(scene, frame, request, snapshot, level, range_mm, self.pause)
         return dataclasses.replace(reply, camera=taken_by)
 
     def _standing(self, scene: Scene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
@@ -287,13 +291,16 @@ def _reply(
     snapshot: Snapshot | None,
     level: int,
     depth_range_mm: tuple[float, float] | None,
+    pause: Callable[[], None],
 ) -> Reply:
-    """A frame as it is sent."""
+    """A frame as it is sent. pause: called while a large one is encoded."""
     iteration = None if snapshot is None else snapshot.iteration
+    if request.layer is Layer.CONFIDENCE:
+        _ = frame.confidence  # rendered by this thread, which has the buffers, and kept by the frame
+    how = request.layer, request.format, request.quality, request.unseen
+    encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
     with traces.span("encode", layer=request.layer.value, format=request.format.value):
-        body = encode_layer(
-            frame, request.layer, request.format, request.quality, request.unseen, depth_range_mm=depth_range_mm
-        )
+        body = beside(encode, pause) if frame.unseen.size > LARGE_PIXELS else encode()
     warnings = frame.warnings
     if snapshot is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.

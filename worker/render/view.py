@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from contract.wire.notices import Notice, NoticeCode
+from contract.wire.rendering import MAX_JUDGED_PIXELS
 from worker.input.camera import Intrinsics
 from worker.model.constants import SH_C0
 from worker.model.layout import COLOUR_ROW
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
+from worker.raster.cpu.threads import beside
 from worker.render.camera import as_recorded, endoscope_pose, view_camera
 from worker.render.confidence import confidence, evidence, seen_from_endoscope
 from worker.render.depth_range import DepthRange
@@ -42,16 +44,16 @@ MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
-MAX_JUDGED_PIXELS = 1 << 21
-"""A smaller picture is drawn in the recording's pixels first, in at most so many: those of 1920 x 1080."""
 MAX_JUDGED_SIDE = 8192
 """If they are so many, at most so many along a side: as many as a caller may ask for."""
 AS_FINE = 0.02
 """A picture whose pixels are by no more larger or smaller than the recording's is judged in its own."""
 MOST = 0.5
 """Of a pixel: more of it decides."""
-PART_PIXELS = 1 << 19
+PART_PIXELS = 1 << 18
 """Pixels between two pauses of a large render."""
+LARGE_PIXELS = 1 << 19
+"""What takes all pixels of more than these at once is done on another thread, and pauses go on meanwhile."""
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
 
@@ -213,18 +215,20 @@ def render_frame(
     *,
     highlights: bool = True,
     is_coarse: bool = False,
+    max_pixels: int = MAX_JUDGED_PIXELS,
     pause: Callable[[], None] = no_pause,
 ) -> Frame:
     """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
 
     highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
     is_coarse: draw and judge no more pixels than asked for, because time is short.
+    max_pixels: a picture of fewer is drawn and judged in no more.
     pause: called between the parts of the work (worker/raster/model.py).
     """
     shown, outside = held_in_clip(scene, t)
     pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     asked = intrinsics or scene.intrinsics
-    judged = asked if is_coarse else judged_camera(asked, scene.intrinsics)
+    judged = asked if is_coarse else judged_camera(asked, scene.intrinsics, max_pixels)
     drawn = max(asked, judged, key=_pixels)
     camera = (drawn, pose)
     image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
@@ -240,37 +244,42 @@ def render_frame(
         rgb[rows] = np.clip(part[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255)
         depth_mm[rows] = solid_depth_mm(part[3], alpha, scene.units_per_mm)
         pause()
-    unseen = unseen_pixels(solid, blended)
+    is_unseen = partial(unseen_pixels, solid, blended)
+    unseen = beside(is_unseen, pause) if solid.size > LARGE_PIXELS else is_unseen()
     pause()
     warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
     if not highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     pause()
     if _pixels(judged) < _pixels(drawn):
-        again = partial(render_frame, scene, shown, pose, judged, device, highlights=highlights)
+        again = partial(
+            render_frame, scene, shown, pose, judged, device,
+            highlights=highlights, max_pixels=max_pixels, pause=pause,
+        )  # fmt: skip
         layer: Callable[[], NDArray[np.float32]] = partial(_enlarged_confidence, again, depth_mm > 0)
     else:
-        own_view = partial(_endoscope_rgb, scene, shown, device, highlights)
+        own_view = partial(_endoscope_rgb, scene, shown, device, highlights, pause)
         view = (image[:3], depth_mm, trust)
         layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, view, own_view)
-    frame = Frame(rgb, depth_mm, unseen, float(unseen.mean()), warnings, layer)
+    frame = Frame(rgb, depth_mm, unseen, _share(unseen), warnings, layer)
     return frame if _pixels(drawn) == _pixels(asked) else frame.reduced(asked.width, asked.height)
 
 
-def judged_camera(asked: Intrinsics, own: Intrinsics) -> Intrinsics:
-    """The view in the pixels in which it is judged: the recording's, as far as they are not too many.
+def judged_camera(asked: Intrinsics, own: Intrinsics, max_pixels: int = MAX_JUDGED_PIXELS) -> Intrinsics:
+    """The view in the pixels in which it is judged: the recording's, as far as they are not too many. A smaller picture
+    is drawn in them, too.
 
     The right eye's lens, and sizes rounded to whole pixels, count as the recording's.
     """
     fine = as_recorded(asked, own)
     if abs(_pixels(fine) / _pixels(asked) - 1) <= AS_FINE:
         return asked
-    most = max(MAX_JUDGED_PIXELS, _pixels(asked))
+    most = max(min(MAX_JUDGED_PIXELS, max_pixels), _pixels(asked))
     if _pixels(fine) <= most:
         return fine
     share = math.sqrt(most / _pixels(fine))
-    width = min(max(1, int(fine.width * share)), MAX_JUDGED_SIDE)
-    return fine.resized(width, min(max(1, int(fine.height * share)), MAX_JUDGED_SIDE))
+    width = min(max(1, int(fine.width * share)), MAX_JUDGED_SIDE, most)
+    return fine.resized(width, min(max(1, int(fine.height * share)), MAX_JUDGED_SIDE, most // width))
 
 
 def _pixels(camera: Intrinsics) -> int:
@@ -300,9 +309,12 @@ def _parts(size: tuple[int, ...]) -> Iterator[slice]:
     return (slice(first, min(first + step, height)) for first in range(0, height, step))
 
 
-def _endoscope_rgb(scene: Scene, t: float, device: Device, highlights: bool) -> NDArray[np.float32]:
+def _endoscope_rgb(
+    scene: Scene, t: float, device: Device, highlights: bool, pause: Callable[[], None]
+) -> NDArray[np.float32]:
     """[3, H, W] of the endoscope's own view at t."""
-    image, _ = renderer_of(scene, device).layers(t, endoscope_pose(scene, t), scene.intrinsics, highlights=highlights)
+    own = endoscope_pose(scene, t), scene.intrinsics
+    image, _ = renderer_of(scene, device).layers(t, *own, highlights=highlights, pause=pause)
     return image[:3]
 
 
@@ -326,11 +338,16 @@ def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArr
     if distance > FAR_POSE:
         text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
-    if (share := float(unseen.mean())) > MAX_UNSEEN_SHARE:
+    if (share := _share(unseen)) > MAX_UNSEEN_SHARE:
         text = f"No frame saw {share:.0%} of this view. unseen=mark hatches it, unseen=guess shows a guess."
         yield Notice.warning(NoticeCode.UNSEEN, text)
-    if ((trust < LOW_TRUST) & ~unseen).mean() > MAX_LOW_SHARE:
+    if _share((trust < LOW_TRUST) & ~unseen) > MAX_LOW_SHARE:
         yield Notice.warning(NoticeCode.HARDLY_SEEN, HARDLY_SEEN)
+
+
+def _share(pixels: NDArray[np.bool_]) -> float:
+    """Of the pixels that are true. mean() would take ten times as long, and no pause can interrupt it."""
+    return float(np.count_nonzero(pixels) / pixels.size)
 
 
 def _distance_from_trained(scene: Scene, pose: NDArray[np.float64]) -> float:

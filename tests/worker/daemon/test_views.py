@@ -6,7 +6,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import shutil
+import threading
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ from contract.wire.errors import LimitError, SceneError
 from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
+    TYPICAL_GAUSSIANS,
     Highlights,
     ImageFormat,
     IntrinsicsOverride,
@@ -29,12 +32,15 @@ from contract.wire.rendering import (
     render_cost,
 )
 from tests.worker.exports import export_request, exported
+from worker.daemon import views as views_module
 from worker.daemon.serve import GivenUpError, NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
 from worker.model.deformation import GaussianFdm
 from worker.model.gaussians import Gaussians
+from worker.raster.cpu.rasterizer import Rasterizer
+from worker.render import view as view_module
 from worker.scene.checkpoint import save_scene
 from worker.scene.scene import Scene
 
@@ -403,3 +409,56 @@ def test_a_lens_that_sees_more_than_any_does_is_answered_in_pixels_that_are_not_
     wide = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=16, height=12, **lens)})
     assert views.cost(wide) <= render_cost(1 << 21, len(scene().gaussians))
     assert np.load(io.BytesIO(views.answer(wide).body)).shape[:2] == (12, 16)
+
+
+@pytest.mark.parametrize("layer", [Layer.RGB, Layer.CONFIDENCE])
+@pytest.mark.parametrize("lens", [{}, {"fx": 0.1, "fy": 0.1}, {"fx": 1e-5}])
+def test_no_more_is_drawn_for_a_small_picture_than_the_limit_and_that_is_what_it_costs(
+    lens: dict[str, float], layer: Layer, store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn, project = list[int](), Rasterizer.project
+
+    def noted(rasterizer: Rasterizer, *args: Any) -> None:
+        drawn.append(rasterizer.width * rasterizer.height)
+        project(rasterizer, *args)
+
+    monkeypatch.setattr(Rasterizer, "project", noted)
+    views = Views(store)
+    asked = {"camera": IntrinsicsOverride(width=16, height=12, **lens), "max_pixels": 4_000, "layer": layer}
+    small = request_of(scene_id, t=0.5).model_copy(update=asked)
+    before = views.cost(small) / TYPICAL_GAUSSIANS
+    views.answer(small)
+    views.answer(small.model_copy(update={"t": 0.25}))
+    cost = views.cost(small.model_copy(update={"t": 0.75}))
+    own = CLIP.width * CLIP.height  # confidence compares with the endoscope's own view
+    assert max(each for each in drawn if each != own or not lens) <= 4_000
+    assert cost == render_cost(max(each for each in drawn if each != own or not lens), len(scene().gaussians))
+    assert cost / len(scene().gaussians) <= before
+
+
+def test_a_small_picture_through_a_wide_lens_counts_what_is_drawn_for_it_towards_the_limits(scene_id: str) -> None:
+    small = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=16, height=12)})
+    wide = small.model_copy(update={"camera": IntrinsicsOverride(width=16, height=12, fx=0.01)})
+    assert small.most_drawn((640, 512)) == 640 * 512
+    assert wide.most_drawn((640, 512)) == 1 << 21
+    assert wide.model_copy(update={"max_pixels": 50_000}).most_drawn((640, 512)) == 50_000
+
+
+@pytest.mark.parametrize("name", ["encode_layer", "unseen_pixels"])
+def test_others_are_answered_while_a_large_picture_is_encoded(
+    name: str, store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = views_module if name == "encode_layer" else view_module
+    begun, paused, work = threading.Event(), threading.Event(), getattr(module, name)
+
+    def slow(*args: Any, **named: Any) -> Any:
+        begun.set()
+        assert paused.wait(60), "nobody was answered meanwhile"
+        return work(*args, **named)
+
+    monkeypatch.setattr(module, name, slow)
+    views = Views(store)
+    views.pause = lambda: paused.set() if begun.is_set() else None
+    large = {"camera": IntrinsicsOverride(width=1600, height=1200), "format": ImageFormat.JPEG}
+    assert views.answer(request_of(scene_id).model_copy(update=large)).body
+    assert paused.is_set()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
 from worker.raster.cpu.model import CpuModel
-from worker.raster.cpu.threads import THREADS_VARIABLE, alone, cpu_time_s, run, thread_count
+from worker.raster.cpu.threads import THREADS_VARIABLE, alone, beside, cpu_time_s, run, thread_count
 from worker.raster.step import camera_vector
 
 PATIENCE_S = 120.0
@@ -51,6 +51,23 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
     for iteration in range(1, steps + 1):
         model.step([seen], NORMALISED, RATES, iteration)
     return [np.array(each) for each in model.arrays().values()]
+
+
+def test_what_is_done_beside_counts_as_the_callers_and_its_error_is_the_callers() -> None:
+    begun, calls, before_s = threading.Event(), list[bool](), cpu_time_s()
+
+    def work() -> int:
+        begun.set()
+        start_s = time.thread_time()
+        while time.thread_time() - start_s < 0.05:
+            pass
+        return threading.get_ident()
+
+    assert beside(work, lambda: calls.append(begun.is_set())) != threading.get_ident()
+    assert any(calls)
+    assert cpu_time_s() - before_s >= 0.05
+    with pytest.raises(ZeroDivisionError):
+        beside(lambda: 1 // 0, lambda: None)
 
 
 def render(kind: str, frames: int) -> list[NDArray[np.float32]]:

@@ -16,10 +16,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from typing import TypeVar
 
 from contract.wire.errors import InputError
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
+
+WAKE_S = 0.002
+"""How often beside() calls: what comes meanwhile waits no longer."""
+
+T = TypeVar("T")
 
 _own = threading.local()
 """Of each calling thread: elsewhere_s, CPU seconds that its kernels used on other threads; is_alone."""
@@ -51,6 +57,12 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(1, thread_count() - 1), thread_name_prefix="raster")
 
 
+@cache
+def _beside(process_id: int) -> ThreadPoolExecutor:
+    del process_id  # as in _pool
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
+
+
 def run(kernel: Callable[..., object], *args: object) -> None:
     """Call kernel(thread, threads, *args) for each share, each on a thread of its own unless alone(), and wait for all.
 
@@ -80,6 +92,28 @@ def alone(*, is_alone: bool = True) -> Iterator[None]:
         yield
     finally:
         _own.is_alone = before
+
+
+def beside(work: Callable[[], T], meanwhile: Callable[[], None]) -> T:
+    """What work() returns. Another thread does it, and this one calls meanwhile() until it is done.
+
+    Its CPU seconds count as this thread's. An error of meanwhile() is raised at once: the work ends by itself.
+    """
+    spent_s = 0.0
+
+    def timed() -> T:
+        nonlocal spent_s
+        start_s = time.thread_time()
+        try:
+            return work()
+        finally:
+            spent_s = time.thread_time() - start_s
+
+    done = _beside(os.getpid()).submit(timed)
+    while not wait([done], WAKE_S).done:
+        meanwhile()
+    _own.elsewhere_s = getattr(_own, "elsewhere_s", 0.0) + spent_s
+    return done.result()
 
 
 def cpu_time_s() -> float:
