@@ -15,6 +15,10 @@ from contract.store.owner import check_owner
 from contract.wire.errors import InputError
 from contract.wire.job import JobState
 
+UNREADABLE = (
+    "have records that cannot be read, which were left out; a restored service queues those anew whose clips are there"
+)
+
 
 def add_backup(commands: Commands) -> None:
     """Add backup and restore."""
@@ -54,8 +58,9 @@ def _backup(options: argparse.Namespace) -> int:
     _say_left_out("were purged meanwhile and left out", taken.purged)
     why = "have no files here and were left out (is INTRASPLAT_STORE_URL that of the service?)"
     _say_left_out(why, taken.without_files)
+    _say_left_out(UNREADABLE, taken.unreadable)
     print(taken.path)
-    return ExitCode.OK
+    return ExitCode.FAILED if taken.unreadable else ExitCode.OK
 
 
 def _restore(options: argparse.Namespace) -> int:
@@ -68,6 +73,7 @@ def _restore(options: argparse.Namespace) -> int:
     _say(f"restored the backup of {restored.created_at}, every hash compared: {_counts(restored.jobs)}")
     _say_left_out("had been purged and did not come back", restored.purged)
     _say_left_out("have neither clip nor scene and did not come back", restored.lost)
+    _say_left_out(UNREADABLE, restored.unreadable)
     if restored.revoked_keys:
         _say(f"keys that had been revoked and did not come back: {', '.join(restored.revoked_keys)}")
     if not options.audit:

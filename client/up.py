@@ -24,7 +24,6 @@ from pathlib import Path
 from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer
-from contract.queue.installed import UP_LOCK
 from contract.runtime.locks import FolderLock
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
@@ -44,6 +43,8 @@ HEALTHY_AFTER_S = 60.0
 """A child that has lived this long works: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
 WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
+UP_LOCK = "up.lock"
+"""In run/ of a data directory."""
 EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """The loopback address of a service that listens at every address."""
 

@@ -50,7 +50,8 @@ class BackedUpFile(BaseModel):
 
 
 class Manifest(BaseModel):
-    """backup.json. store_url: the bucket that keeps clips and scenes; None: they are in the backup."""
+    """backup.json. store_url: the bucket that keeps clips and scenes; None: they are in the backup.
+    unreadable: jobs whose records could not be read and are missing."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -59,6 +60,7 @@ class Manifest(BaseModel):
     intrasplat: str
     created_at: str
     store_url: str | None = None
+    unreadable: tuple[str, ...] = ()
     files: dict[str, BackedUpFile]
 
     @field_validator("files")

@@ -1,20 +1,24 @@
 """Fill an empty data directory and an empty queue from a backup.
 
 Files come first, each compared with its hash, then the records. While a file `restoring` lies in the data directory,
-neither service nor worker starts on it. What was purged since, as the given audits tell, does not come back; nor do
-keys that were revoked since.
+neither service nor worker starts on it. It says which records are being entered into which queue, so that a restore
+that failed or was cut off there can be run again: files are copied anew, and records that the queue has stay. What was
+purged since, as the given audits tell, does not come back; nor do keys that were revoked since.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.chain import audit_lines
@@ -34,6 +38,7 @@ from contract.backup.manifest import (
     read_manifest,
 )
 from contract.queue.interface import IDEMPOTENCY_S, Queue
+from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
 from contract.store.disk import Disk
 from contract.store.disk_errors import NO_ROOM
@@ -45,6 +50,8 @@ from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 
 NO_CONTENT = frozenset({"lost+found"})
 """What may lie in an empty folder: the root of a disk has it."""
+EMBEDDED_QUEUE = frozenset({"valkey"})
+"""Its server may still run after a restore was killed."""
 
 
 @dataclass
@@ -57,6 +64,18 @@ class Restored:
     purged: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     revoked_keys: list[str] = field(default_factory=list)
+    unreadable: tuple[str, ...] = ()
+    """Jobs whose records the backup lacks."""
+
+
+class _Entering(BaseModel):
+    """The file `restoring`, once records are entered. backup: its time. queue: SHA-256 of REDIS_URL; None: the embedded
+    one."""
+
+    model_config = ConfigDict(frozen=True)
+
+    backup: str
+    queue: str | None
 
 
 @dataclass(frozen=True)
@@ -78,9 +97,11 @@ def restore_backup(
 
     Raises:
         InputError: there is no whole backup, it does not fit the settings, or an audit cannot be read.
-        UnavailableError: the data directory or the queue is not empty, cannot be written, or is full.
+        UnavailableError: the data directory or the queue is not empty, cannot be written, or is full; or another
+            restore fills them.
 
-    After an error the data directory is empty again, unless it was not empty before.
+    After an error the data directory is empty again, unless it was not empty before, or a queue elsewhere may have some
+    of the records: then the file `restoring` is left, and the same restore goes on when it is run again.
     """
     backup = _backup_in(source.expanduser().resolve())
     manifest = read_manifest(backup)
@@ -91,26 +112,58 @@ def restore_backup(
         data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         _check_empty(data_dir)
         data_dir.chmod(0o700)
+        marker, lock = data_dir / RESTORING, FolderLock(data_dir / RESTORING)
+        if not lock.take():
+            raise UnavailableError(f"Another restore fills {data_dir}.", "Wait until it has ended.")
+        queue_url = settings.redis_url
+        entering = _Entering(
+            backup=manifest.created_at, queue=queue_url and hashlib.sha256(queue_url.encode()).hexdigest()
+        )
         try:
-            (data_dir / RESTORING).touch(mode=0o600)
+            _empty(data_dir, {RESTORING} if queue_url else {RESTORING, *EMBEDDED_QUEUE})
             with open_queue as queue:
-                if queue.records(limit=1):
-                    problem = "The queue is not empty: it holds jobs of another installation, or of a restore cut off."
-                    remedy = "Give the restored service a queue of its own (REDIS_URL), or empty this one."
-                    raise UnavailableError(problem, remedy)
+                _check_queue(queue, _begun(marker), entering, backup)
                 _copy_files(backup, manifest, data_dir, since.purged)
-                restored = Restored(backup, manifest.created_at)
+                restored = Restored(backup, manifest.created_at, unreadable=manifest.unreadable)
                 restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
-                _fill_queue(queue, Store(data_dir, settings.store_url), read_jobs(backup), since.purged, restored)
+                records = list(read_jobs(backup))
+                marker.write_text(entering.model_dump_json())
+                flush(marker)
+                _fill_queue(queue, Store(data_dir, settings.store_url), records, since.purged, restored)
             outcome = f"backup of {manifest.created_at}"
             AuditLog(data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.RESTORED, outcome=outcome))
-            (data_dir / RESTORING).unlink()
+            marker.unlink()
             flush(data_dir)
         except BaseException:
             with suppress(OSError):
-                _empty(data_dir)
+                _empty(data_dir, {RESTORING} if queue_url and marker.stat().st_size else set())
             raise
+        finally:
+            lock.release()
     return restored
+
+
+def _begun(marker: Path) -> _Entering | None:
+    """What an earlier restore was entering when it failed or was cut off; None: nothing yet."""
+    try:
+        return _Entering.model_validate_json(marker.read_bytes())
+    except ValidationError:
+        return None
+
+
+def _check_queue(queue: Queue, begun: _Entering | None, entering: _Entering, backup: Path) -> None:
+    """Refuse a queue that has other records than a restore that goes on has entered."""
+    goes_on = begun == entering
+    found = queue.records(None, None) if goes_on else queue.records(limit=1)
+    own = {record.job_id for record in read_jobs(backup)} if goes_on else set()
+    if all(record.job_id in own for record in found):
+        return
+    problem, remedy = "The queue is not empty: it holds jobs of another installation, or of a restore cut off.", ""
+    if begun is not None and not goes_on and begun.queue == entering.queue:
+        remedy = f"Restore the backup of {begun.backup} again, which was being entered, or empty the queue. Or: "
+    raise UnavailableError(
+        problem, f"{remedy}Give the restored service a queue of its own (REDIS_URL), or empty this one."
+    )
 
 
 def _backup_in(source: Path) -> Path:
@@ -161,10 +214,10 @@ def _acts(audit: Path) -> Iterator[dict[str, str]]:
 
 
 def _check_empty(data_dir: Path) -> None:
+    """Refuse a folder with anything in it but what a restore has left that failed or was cut off."""
     found = sorted(each.name for each in data_dir.iterdir() if each.name not in NO_CONTENT)
-    if found:
-        cut_off = ", left by a restore that was cut off" if RESTORING in found else ""
-        problem = f"{data_dir} is not empty: it holds {', '.join(found[:5])}{cut_off}."
+    if found and RESTORING not in found:
+        problem = f"{data_dir} is not empty: it holds {', '.join(found[:5])}."
         raise UnavailableError(problem, "Restore into an empty data directory; move away or remove what is there.")
 
 
@@ -198,7 +251,7 @@ def _revoke(data_dir: Path, key_ids: frozenset[str]) -> list[str]:
 
 
 def _fill_queue(
-    queue: Queue, store: Store, records: Iterator[JobRecord], purged: frozenset[str], restored: Restored
+    queue: Queue, store: Store, records: Sequence[JobRecord], purged: frozenset[str], restored: Restored
 ) -> None:
     """Give the queue the jobs, in their order. A bucket may hold what was purged since: that is removed from it."""
     scenes: Mapping[str, list[int]] = store.finished_scenes()
@@ -208,6 +261,8 @@ def _fill_queue(
     for record in records:
         if record.job_id in purged:
             restored.purged.append(record.job_id)
+            queue.cancel(record.job_id)  # a restore that was cut off may have entered it
+            queue.forget(record.job_id)
         elif (found := _as_found(record, scenes.get(record.job_id, []), record.job_id in clips)) is None:
             restored.lost.append(record.job_id)
         else:
@@ -243,9 +298,9 @@ def _put(queue: Queue, record: JobRecord) -> JobState:
     return cancelled.state if cancelled else record.state
 
 
-def _empty(data_dir: Path) -> None:
+def _empty(data_dir: Path, kept: Collection[str]) -> None:
     for path in data_dir.iterdir():
-        if path.name not in NO_CONTENT:
+        if path.name not in NO_CONTENT and path.name not in kept:
             remove_tree(path)
 
 

@@ -47,7 +47,8 @@ COPIED = (Area.SPOOL, Area.SCENES)
 @dataclass(frozen=True)
 class Taken:
     """A finished backup. purged: jobs that were left out because they were removed meanwhile. without_files: jobs that
-    were left out because this machine has neither clip nor scene of them."""
+    were left out because this machine has neither clip nor scene of them. unreadable: jobs whose records cannot be read
+    and were left out; their files are in the backup."""
 
     path: Path
     jobs: Mapping[JobState, int]
@@ -56,6 +57,7 @@ class Taken:
     linked: int
     purged: tuple[str, ...]
     without_files: tuple[str, ...]
+    unreadable: tuple[str, ...]
 
 
 def take_backup(settings: Settings, queue: Queue, destination: Path, *, full: bool = False) -> Taken:
@@ -100,12 +102,13 @@ def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) ->
         with contextlib.suppress(InputError):  # a damaged one lends nothing
             for backup in before:
                 copier.link_to(backup, read_manifest(backup).files)
-        jobs, purged, without_files = _copy_all(settings, queue, copier)
+        jobs, purged, without_files, unreadable = _copy_all(settings, queue, copier)
         copier.write(JOBS_FILE, b"".join(record.model_dump_json().encode() + b"\n" for record in jobs))
         manifest = Manifest(
             intrasplat=version(),
             created_at=begun.isoformat(timespec="milliseconds"),
             store_url=settings.store_url,
+            unreadable=unreadable,
             files=copier.files,
         )
         (folder / MANIFEST_FILE).write_text(manifest.model_dump_json(indent=1))
@@ -117,21 +120,25 @@ def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) ->
         raise
     counts = {state: sum(record.state is state for record in jobs) for state in JobState}
     sizes = sum(file.bytes for file in manifest.files.values())
-    return Taken(destination / name, counts, len(manifest.files), sizes, copier.linked, purged, without_files)
+    return Taken(
+        destination / name, counts, len(manifest.files), sizes, copier.linked, purged, without_files, unreadable
+    )
 
 
 def _copy_all(
     settings: Settings, queue: Queue, copier: Copier
-) -> tuple[list[JobRecord], tuple[str, ...], tuple[str, ...]]:
-    """Copy what a restore needs; the records in their order, the jobs purged meanwhile, and those without files."""
+) -> tuple[list[JobRecord], tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Copy what a restore needs; the records in their order, the jobs purged meanwhile, those without files, and those
+    whose records cannot be read."""
     shelf = LocalShelf(settings.data_dir) if settings.store_url is None else None
     _copy_entries(shelf, copier)
     first = {record.job_id: record for record in queue.records(None, None)}
     _copy_entries(shelf, copier)
     noted = _noted(settings.data_dir)
     last = {record.job_id: record for record in queue.records(None, None)}
+    unreadable = set(queue.unreadable())
     noted |= _noted(settings.data_dir)
-    purged = noted | (first.keys() - last.keys())
+    purged = noted | (first.keys() - last.keys() - unreadable)
     copier.drop(lambda name: job_of(name) in purged)
     chosen, without_files = [], []
     for job_id, record in last.items():
@@ -150,7 +157,8 @@ def _copy_all(
         copier.write(f"{PURGING}/{job_id}", b"")
     for name in (KEYS_FILE, AUDIT_FILE, HEAD_FILE):
         copier.copy(name)
-    return _in_order(queue, chosen), tuple(sorted(purged)), tuple(sorted(without_files))
+    left_out = [tuple(sorted(job_ids)) for job_ids in (purged, without_files, unreadable - purged)]
+    return _in_order(queue, chosen), left_out[0], left_out[1], left_out[2]
 
 
 def _copy_entries(shelf: LocalShelf | None, copier: Copier) -> None:

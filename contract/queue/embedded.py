@@ -131,20 +131,21 @@ class EmbeddedServer:
         self._wait_until_it_answers()
 
     def ensure_running(self) -> bool:
-        """Start the server again if it has died; True if it had. Keeps room for its log. Raises as start()."""
+        """Start the server again if it has died, or whoever had started it has ended it; True if so. Keeps room for its
+        log. Raises as start()."""
         if self._server is not None:
             if self._server.watch() is None:
                 fill_reserve(self._folder)
                 return False
             self._wait_until_it_answers()
             return True
-        if not self._owner:
-            return False
         if self._adopted and self._listens():
             fill_reserve(self._folder)
             return False
+        if not self._lock.take():  # another process has started it, and still runs
+            return False
         self.start()
-        return True
+        return not self._adopted
 
     def stop(self) -> None:
         """End the server that this object has started or adopted; a shared one goes on."""
@@ -159,6 +160,8 @@ class EmbeddedServer:
     def _wait_until_it_answers(self) -> None:
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while not self._answers():
+            if not self._owner and self._lock.take():  # whoever had started it has ended it meanwhile
+                return self.start()
             ended = self._server.watch() if self._server else None
             if ended is not None:
                 self._server = None  # the next start() begins anew

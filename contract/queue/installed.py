@@ -8,17 +8,13 @@ from contextlib import contextmanager
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.interface import Queue
 from contract.queue.redis_queue import RedisQueue
-from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
-from contract.store.disk_errors import disk_errors
-
-UP_LOCK = "up.lock"
-"""In run/ of a data directory: held by `intrasplat up`, or by whoever keeps it from starting."""
 
 
 @contextmanager
 def installed_queue(settings: Settings) -> Iterator[Queue]:
-    """The queue of REDIS_URL, or else the embedded one, whose server is started for the time if none runs.
+    """The queue of REDIS_URL, or else the embedded one, whose server is started for the time if none runs. An
+    `intrasplat up` that starts meanwhile shares it, and starts another when it ends.
 
     Raises:
         UnavailableError: the queue does not answer, or there is no server program.
@@ -26,18 +22,12 @@ def installed_queue(settings: Settings) -> Iterator[Queue]:
     if settings.redis_url is not None:
         yield from _answering(settings.redis_url)
         return
-    data_dir = settings.data_dir.expanduser().resolve()
-    with disk_errors():
-        (data_dir / "run").mkdir(mode=0o700, parents=True, exist_ok=True)
-        alone = FolderLock(data_dir / "run" / UP_LOCK)
-        alone.take()  # else `up` runs, and its server
-    server = EmbeddedServer(data_dir)
+    server = EmbeddedServer(settings.data_dir.expanduser().resolve())
     try:
         server.start()
         yield from _answering(server.url)
     finally:
         server.stop()
-        alone.release()
 
 
 def _answering(url: str) -> Iterator[Queue]:

@@ -213,6 +213,10 @@ class Queue(Deliveries, Protocol):
         """
         ...
 
+    def unreadable(self) -> list[str]:
+        """The jobs whose records are there and cannot be read, in no order."""
+        ...
+
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         """The job's events after the one of that number, oldest first; does not wait for new ones."""
         ...

@@ -1,4 +1,5 @@
 """The queue inside one process: the plainest statement of contract/queue/interface.py, for tests."""
+# long: the whole interface is stated in one place
 
 from __future__ import annotations
 
@@ -193,6 +194,9 @@ class MemoryQueue:
             chosen = [record for record in self._records.values() if tenant in (None, record.tenant)]
         chosen.sort(key=place_of, reverse=True)
         return [record for record in chosen if before is None or place_of(record) < before][:limit]
+
+    def unreadable(self) -> list[str]:
+        return []
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         with self._changed:

@@ -221,6 +221,10 @@ class RedisQueue:
             before = places[-1]  # none of them can be read
         return []
 
+    def unreadable(self) -> list[str]:
+        hashes = self._hashes([each.job_id for each in self._places(INDEX, None, None)])
+        return [job_id for job_id, fields in hashes.items() if fields and record_of(job_id, fields) is None]
+
     def events(self, job_id: str, after: str = "0") -> list[Event]:
         milliseconds, count = event_order(after)
         with reachable(), self._client.pipeline(transaction=True) as batch:
@@ -348,6 +352,11 @@ class RedisQueue:
 
     def _get_all(self, job_ids: list[str]) -> dict[str, JobRecord]:
         """The records that exist and can be read, in the order of job_ids."""
+        found = {job_id: record_of(job_id, fields) for job_id, fields in self._hashes(job_ids).items()}
+        return {job_id: record for job_id, record in found.items() if record is not None}
+
+    def _hashes(self, job_ids: list[str]) -> dict[str, dict[str, str]]:
+        """The hashes of these jobs; empty where there is none."""
         with reachable():
             batch = self._client.pipeline(transaction=False)
             for job_id in job_ids:
@@ -358,8 +367,7 @@ class RedisQueue:
                     if not str(answer).startswith("WRONGTYPE"):
                         raise answer
                     answers[i] = {"document": "something that is not a hash"}
-        found = {job_id: record_of(job_id, answer) for job_id, answer in zip(job_ids, answers, strict=True)}
-        return {job_id: record for job_id, record in found.items() if record is not None}
+        return dict(zip(job_ids, answers, strict=True))
 
 
 def _address(name: str, document: str) -> WorkerAddress | None:

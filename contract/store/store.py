@@ -61,7 +61,7 @@ def open_store(settings: Settings) -> Store:
     """
     if (settings.data_dir.expanduser() / RESTORING).exists():
         problem = f"A restore into {settings.data_dir} was cut off, or goes on."
-        raise UnavailableError(problem, "Wait for it; if it was cut off, empty the folder and restore again.")
+        raise UnavailableError(problem, "Wait for it; if it was cut off, restore again: it goes on.")
     return Store(settings.data_dir, settings.store_url)
 
 

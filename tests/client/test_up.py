@@ -6,8 +6,9 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ import pytest
 from client import up
 from client.up import Installation, check_port, worker_names
 from contract.queue.embedded import EmbeddedServer
+from contract.queue.installed import installed_queue
+from contract.queue.redis_queue import RedisQueue
 from contract.runtime.exits import ExitCode
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
@@ -22,6 +25,7 @@ from contract.runtime.supervised import Supervised
 from contract.store.disk import Disk
 from contract.store.disk_errors import StoreFullError
 from contract.wire.errors import UnavailableError
+from tests.contract.queues import job
 
 SLEEP = "import time; time.sleep(60)"
 LACKS = """
@@ -50,9 +54,9 @@ def child_that_runs(program: str, folder: Path) -> Supervised:
 
 
 @contextmanager
-def started(folder: Path, worker: str) -> Iterator[Installation]:
+def started(folder: Path, worker: str, redis_url: str | None = "redis://127.0.0.1:1") -> Iterator[Installation]:
     """An installation with a queue elsewhere, a service that sleeps, and one worker that runs a program."""
-    installation = Installation(Settings(data_dir=folder, redis_url="redis://127.0.0.1:1"))
+    installation = Installation(Settings(data_dir=folder, redis_url=redis_url))
     installation.service = child_that_runs(SLEEP, folder)
     installation.workers = [child_that_runs(worker, folder)]
     with installation:
@@ -121,6 +125,27 @@ def test_a_second_launcher_of_a_data_directory_is_refused(tmp_path: Path) -> Non
     with pytest.raises(UnavailableError, match="Another `intrasplat up`"), installation:
         pass
     other.release()
+
+
+def test_a_launcher_starts_while_a_backup_runs_the_queue_and_has_one_when_the_backup_has_ended(tmp_path: Path) -> None:
+    with ExitStack() as ended:
+        with installed_queue(Settings(data_dir=tmp_path)) as queue:
+            record = queue.submit(job())
+            installation = ended.enter_context(started(tmp_path, SLEEP, None))
+        installation.watch()
+        after = RedisQueue(EmbeddedServer(tmp_path).url)
+        ended.callback(after.close)
+        assert [each.job_id for each in after.records()] == [record.job_id]
+
+
+def test_a_launcher_that_finds_a_queue_which_ends_just_then_starts_its_own(tmp_path: Path) -> None:
+    server = EmbeddedServer(tmp_path)
+    lock = FolderLock(tmp_path / "valkey" / "lock")  # what whoever ends its server holds until that is done
+    assert lock.take()
+    threading.Timer(0.2, lock.release).start()
+    server.start()
+    assert server.process_id is not None
+    server.stop()
 
 
 def test_a_launcher_that_cannot_start_everything_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import random
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -10,15 +13,19 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+import redis
+
 from client.cli import main
 from contract.access.audit import AUDIT_FILE
 from contract.access.chain import check_file
 from contract.access.keys import DEFAULT_SCOPES, KeyScope
+from contract.backup.manifest import read_manifest
 from contract.backup.restore import Restored, restore_backup
 from contract.backup.take import Taken, take_backup
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.installed import installed_queue
-from contract.queue.redis_queue import RedisQueue
+from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
@@ -212,3 +219,72 @@ def test_whatever_happens_while_backups_are_taken_each_holds_all_that_was_acknow
     _, records = restored_into(tmp_path / "newest", tmp_path / "backups", old / AUDIT_FILE)
     assert gone_at_last & records.keys() == set()
     assert [path for job_id in gone_at_last for path in (tmp_path / "newest").glob(f"*/{job_id}*")] == []
+
+
+def restore_and_be_killed(source: Path, folder: Path) -> None:
+    submit = RedisQueue.submit
+
+    class Deadly(RedisQueue):
+        entered = 0
+
+        def submit(self, *arguments: Any) -> JobRecord:
+            if self.entered == 2:
+                os._exit(9)
+            self.entered += 1
+            return submit(self, *arguments)
+
+    @contextmanager
+    def deadly(settings: Settings) -> Iterator[RedisQueue]:
+        server = EmbeddedServer(settings.data_dir)
+        server.start()
+        yield Deadly(server.url)
+
+    settings = Settings(data_dir=folder)
+    restore_backup(settings, deadly(settings), source)
+
+
+def test_a_restore_that_was_killed_goes_on_when_it_is_run_again(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    with installation(old) as (service, url):
+        ward = Ward(service)
+        done, queued = ward.done(), [ward.send() for _ in range(4)]
+        queue = RedisQueue(url)
+        taken = take_backup(Settings(data_dir=old), queue, tmp_path / "backups")
+        queue.close()
+    new.mkdir()
+    kill = multiprocessing.get_context("spawn").Process(target=restore_and_be_killed, args=(taken.path, new))
+    kill.start()
+    kill.join()
+    assert kill.exitcode == 9
+    restored, records = restored_into(new, taken.path)
+    assert restored.jobs == {JobState.DONE: 1, JobState.QUEUED: 4}
+    assert records.keys() == {done, *queued}
+    with installed_queue(Settings(data_dir=new)) as queue:
+        claimed = [queue.claim(f"worker-{number}", 0.0) for number in range(4)]
+    assert [record and record.job_id for record in claimed] == queued
+
+
+def test_jobs_whose_records_cannot_be_read_are_named_and_come_back_from_their_clips(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new, shelf = tmp_path / "old", tmp_path / "new", tmp_path / "backups"
+    with installation(old) as (service, url):
+        ward = Ward(service)
+        sound, damaged, left = ward.send(), ward.send(), ward.cancelled()
+        with redis.Redis.from_url(url) as client:
+            for job_id in (damaged, left):
+                client.hset(f"{PREFIX}job:{job_id}", "document", "{")
+        assert main(["backup", str(shelf), "--data-dir", str(old)]) == ExitCode.FAILED
+    told, names = capsys.readouterr(), ", ".join(sorted([damaged, left]))
+    assert "1 jobs (1 queued)" in told.err
+    assert re.search(f"2 jobs have records that cannot be read.*: {names}", told.err)
+    backup = Path(told.out.strip())
+    assert set(read_manifest(backup).unreadable) == {damaged, left}
+    assert main(["restore", str(backup), "--data-dir", str(new)]) == ExitCode.OK
+    assert names in capsys.readouterr().err
+    with installation(new) as (service, _):
+        found = Ward(service, ward.headers).views
+        deadline_s = time.monotonic() + 30.0
+        while found().keys() != {sound, damaged} and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+        assert found().keys() == {sound, damaged}

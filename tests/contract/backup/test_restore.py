@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import time
 from collections.abc import Callable
@@ -192,6 +193,75 @@ def test_a_queue_that_is_not_empty_is_refused_and_nothing_is_left(site: Site, qu
     with pytest.raises(UnavailableError, match=r"queue is not empty.*REDIS_URL"):
         restored(tmp_path / "new", queue, backup)
     assert list((tmp_path / "new").iterdir()) == []
+
+
+class Failing(MemoryQueue):
+    """A queue that goes away after so many more submissions."""
+
+    takes = 0
+
+    def submit(self, *arguments: Any) -> JobRecord:
+        if not self.takes:
+            raise UnavailableError("The queue does not answer.", "Start it.")
+        self.takes -= 1
+        return super().submit(*arguments)
+
+
+def elsewhere(folder: Path, queue: Queue, source: Path, *audits: Path) -> Restored:
+    """Restore with a queue that does not lie in the data directory."""
+    settings = Settings(data_dir=folder, redis_url="redis://queue")
+    return restore_backup(settings, contextlib.nullcontext(queue), source, audits)
+
+
+def test_a_restore_that_failed_while_jobs_were_entered_goes_on_when_it_is_run_again(site: Site, tmp_path: Path) -> None:
+    done, queued, new = site.done(), [site.queued() for _ in range(4)], tmp_path / "new"
+    backup, queue = site.backup(tmp_path / "backups"), Failing()
+    AuditLog(site.settings.data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.PURGED, job_id=queued[1]))
+    for queue.takes in (2, 3):  # those that the queue has are counted again
+        with pytest.raises(UnavailableError, match="does not answer"):
+            elsewhere(new, queue, backup)
+        assert [each.name for each in new.iterdir()] == [RESTORING]
+        with pytest.raises(UnavailableError, match="restore again"):
+            open_store(Settings(data_dir=new))
+    assert {record.job_id for record in queue.records()} == {done, *queued[:3]}
+    queue.takes = 9
+    told = elsewhere(new, queue, backup, site.settings.data_dir / AUDIT_FILE)
+    assert (told.jobs, told.purged) == ({JobState.DONE: 1, JobState.QUEUED: 3}, [queued[1]])
+    assert [claimed(queue, f"worker-{number}")[0].job_id for number in range(3)] == [queued[0], *queued[2:]]
+    assert {record.job_id for record in queue.records()} == {done, queued[0], *queued[2:]}
+    open_store(Settings(data_dir=new))
+
+
+def test_only_the_same_restore_goes_on_and_only_into_the_queue_of_its_own_jobs(site: Site, tmp_path: Path) -> None:
+    site.queued(), site.queued()
+    first, new, queue = site.backup(tmp_path / "backups"), tmp_path / "new", Failing()
+    second = site.backup(tmp_path / "backups")
+    queue.takes = 1
+    with pytest.raises(UnavailableError, match="does not answer"):
+        elsewhere(new, queue, first)
+    begun = json.loads((new / RESTORING).read_text())["backup"]
+    with pytest.raises(UnavailableError, match=rf"not empty.*Restore the backup of {re.escape(begun)} again"):
+        elsewhere(new, queue, second)
+    with pytest.raises(UnavailableError, match="not empty"):
+        restored(new, queue, first)  # that would be the queue of the data directory
+    queue.takes = 9
+    with pytest.raises(UnavailableError, match="not empty"):
+        elsewhere(tmp_path / "other", queue, first)
+    queue.submit(job())
+    elsewhere(new, MemoryQueue(), second)
+
+
+def test_two_restores_do_not_fill_one_folder_at_once(site: Site, tmp_path: Path) -> None:
+    new = tmp_path / "new"
+
+    class Second(MemoryQueue):
+        def records(self, *_: Any, **__: Any) -> list[JobRecord]:
+            with pytest.raises(UnavailableError, match="Another restore"):
+                elsewhere(new, MemoryQueue(), backup)
+            return []
+
+    backup = site.backup(tmp_path / "backups")
+    elsewhere(new, Second(), backup)
 
 
 def test_a_full_disk_is_named_and_nothing_is_left(site: Site, tmp_path: Path) -> None:
