@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shutil
 import socket
@@ -32,6 +33,7 @@ from tests.test_repository import project, requirement_name
 DOCKER = Path(__file__).resolve().parent.parent / "docker"
 REPOSITORY = DOCKER.parent
 DOCKERFILES = sorted(DOCKER.glob("*.Dockerfile"))
+TRACED = DOCKER / "compose.traces.yml"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 PINNED = re.compile(r"[a-z/-]+:\d+\.\d+\.\d+[a-z0-9.-]*(@sha256:[0-9a-f]{64})?$")
@@ -113,6 +115,29 @@ def test_a_proxy_is_named_from_outside_the_file() -> None:
     }
 
 
+def test_traces_leave_by_a_collector_so_that_the_worker_still_has_no_way_out() -> None:
+    traced = yaml.safe_load(TRACED.read_text())
+    collector = traced["services"].pop("collector")
+    assert traced["services"].keys() == {"service", "worker"}
+    config = yaml.safe_load((DOCKER / traced["configs"]["collector"]["file"]).read_text())
+    port = config["receivers"]["otlp"]["protocols"]["http"]["endpoint"].rpartition(":")[2]
+    endpoint = {"OTEL_EXPORTER_OTLP_ENDPOINT": f"http://collector:{port}"}
+    for changes in traced["services"].values():
+        assert changes == {"environment": endpoint}  # and so no other network than in compose.yml
+    assert set(collector["networks"]) == COMPOSE["networks"].keys() == {"inside", "outside"}
+    assert not {"ports", "volumes", "privileged", "cap_add", "devices", "pid", "ipc", "network_mode"} & collector.keys()
+    for key in ("read_only", "cap_drop", "security_opt", "restart", "logging"):
+        assert collector[key] == SERVICES["worker"][key]
+    assert all(collector[key] for key in ("mem_limit", "pids_limit", "stop_grace_period"))
+    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", collector["user"])
+    assert PINNED.match(collector["image"])
+    (mounted,) = collector["configs"]
+    assert collector["command"] == [f"--config={mounted['target']}"]
+    assert config["service"]["pipelines"].keys() == {"traces"}
+    assert config["exporters"]["otlphttp"]["endpoint"] == "${env:TRACES_TO}"
+    assert collector["environment"].keys() == {"TRACES_TO"}
+
+
 @each_service
 def test_logs_go_to_a_driver_that_docker_and_podman_have(name: str) -> None:
     assert SERVICES[name]["logging"]["driver"] == "json-file"
@@ -184,13 +209,16 @@ def test_the_command_line_is_in_every_image(path: Path) -> None:
 def test_docker_itself_finds_no_fault_with_the_files() -> None:
     checked = [
         ["docker", "compose", "--file", str(DOCKER / "compose.yml"), "config", "--quiet"],
+        ["docker", "compose", "--file", str(DOCKER / "compose.yml"), "--file", str(TRACED), "config", "--quiet"],
         *(["hadolint", "--failure-threshold", "error", str(path)] for path in DOCKERFILES),
     ]
     able = [command for command in checked if _is_there(command)]
     if not able:
         pytest.skip("neither docker compose nor hadolint is here")
     for command in able:
-        subprocess.run(command, check=True, timeout=60)
+        subprocess.run(
+            command, check=True, timeout=60, env={**os.environ, "TRACES_TO": "http://collector.example.org:4318"}
+        )
 
 
 def _is_there(command: list[str]) -> bool:
