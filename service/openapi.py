@@ -41,7 +41,8 @@ REFERENCE = "#/components/schemas/{model}"
 WEBHOOK_HEADERS = {
     "webhook-id": "the event's id, the same at every try: whoever knows it already has this webhook",
     "webhook-timestamp": "when this try was sent, UNIX s",
-    "webhook-signature": "v1, and HMAC-SHA256 of `id.timestamp.body` under the tenant's secret, in base64",
+    "webhook-signature": "v1, and HMAC-SHA256 of `id.timestamp.body` under the tenant's secret, in base64; several, "
+    "with spaces between them, while the secret is changed",
 }
 WEBHOOKS = {
     "jobEnded": {

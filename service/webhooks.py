@@ -13,7 +13,7 @@ import ssl
 import time
 import uuid
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 
@@ -155,7 +155,8 @@ class Webhooks:
             raise TryFailed(TryFailure.UNREACHABLE) from None
         if not addresses:
             raise TryFailed(TryFailure.ADDRESS_REFUSED)
-        request = _request(loan, tenant_secret(secret, loan.tenant))
+        secrets = [each for each in (secret, self._settings.webhook_old_secret) if each]
+        request = _request(loan, [tenant_secret(each, loan.tenant) for each in secrets])
         failed = TryFailed(TryFailure.UNREACHABLE)
         for address in addresses:
             try:
@@ -207,14 +208,15 @@ class _Request:
     headers: dict[str, str]
 
 
-def _request(loan: Loan, secret: str) -> _Request:
+def _request(loan: Loan, secrets: Sequence[str]) -> _Request:
+    """The webhook, with a signature by each secret."""
     body, now_s, event = JobEnded.of(loan.delivery).model_dump_json().encode(), int(time.time()), loan.delivery.event_id
     headers = {
         "Content-Type": "application/json",
         "User-Agent": f"intrasplat/{version()}",
         "webhook-id": event,
         "webhook-timestamp": str(now_s),
-        "webhook-signature": signature(secret, event, now_s, body),
+        "webhook-signature": " ".join(signature(each, event, now_s, body) for each in secrets),
     }
     return _Request(body, headers)
 

@@ -123,6 +123,8 @@ class Settings(BaseModel):
     # webhooks
     webhook_secret: str | None = Field(default=None, min_length=32, repr=False)
     """The secrets that tenants verify webhooks with are made from it."""
+    webhook_old_secret: str | None = Field(default=None, min_length=32, repr=False)
+    """The one before it: while it is set, webhooks are signed with both."""
     webhook_hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
     """Where webhooks may go: HOST or HOST:PORT for https, http://HOST:PORT without encryption; nowhere by default."""
     webhook_private: Literal["no", "yes"] = "no"

@@ -334,6 +334,15 @@ def test_each_tenant_has_a_secret_of_its_own_which_the_command_line_prints(
     assert "INTRASPLAT_WEBHOOK_SECRET" in capsys.readouterr().err
 
 
+def test_while_the_secret_is_changed_receivers_with_either_verify_webhooks(receiver: Receiver, tmp_path: Path) -> None:
+    with telling(receiver, tmp_path, webhook_secret="n" * 32, webhook_old_secret=SECRET) as service:
+        cancelled(service, f"{receiver.origin}/")
+        webhook = receiver.next()
+    assert webhook.is_genuine("n" * 32, LOCAL_TENANT)
+    assert webhook.is_genuine(SECRET, LOCAL_TENANT)
+    assert not webhook.is_genuine("x" * 32, LOCAL_TENANT)
+
+
 def test_the_api_describes_what_is_sent(service: ServiceUnderTest, receiver: Receiver) -> None:
     document = service.http.get("/openapi.json").json()
     described = document["webhooks"]["jobEnded"]["post"]
