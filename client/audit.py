@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from contract.access.audit import AUDIT_FILE
-from contract.access.chain import HEAD_PATTERN, START, CheckedFile, check_file, in_order
+from contract.access.chain import HEAD_PATTERN, START, CheckedFile, check_files, in_order, unnamed_lines
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import InputError
@@ -35,10 +35,16 @@ def _verify(options: argparse.Namespace) -> int:
     if options.head is not None and not re.fullmatch(HEAD_PATTERN, options.head):
         raise InputError("--head", f"{options.head[:80]!r} is no hash.", "Give the 64 digits that verify has printed.")
     paths: list[Path] = options.files or [settings_of(options).data_dir.expanduser() / AUDIT_FILE]
-    checked = [check_file(path, options.head) for path in paths]
+    checked = check_files(paths, options.head)
     files = in_order([file for file in checked if file.lines])
     for file in [*(each for each in checked if not each.lines), *files]:
         print(_counts(file))
+    for file in files:
+        if unnamed := unnamed_lines(file, files):
+            print(
+                f"{file.path}, its last {unnamed} lines: no later file names them. The power failed or the process was "
+                "killed before the file was moved away, or they were added since"
+            )
     faults = [*_faults(files), *_fault_of_head(files, options.head)]
     for fault in faults:
         print(fault)
@@ -75,7 +81,7 @@ def _faults(files: Sequence[CheckedFile]) -> Iterator[str]:
                 "or lines were removed, inserted or moved here"
             )
     for before, file in pairwise(files):
-        if file.begins != before.head:
+        if file.begins in (None, START) or not any(file.begins in each.found for each in files if each is not file):
             yield (
                 f"{file.path}, line 1: it does not follow the last line of {before.path}, which was changed, "
                 "or lines or files between them are missing"
@@ -83,6 +89,6 @@ def _faults(files: Sequence[CheckedFile]) -> Iterator[str]:
 
 
 def _fault_of_head(files: Sequence[CheckedFile], head: str | None) -> Iterator[str]:
-    if head is None or any(file.found_at is not None for file in files):
+    if head is None or any(head in file.found for file in files):
         return
     yield f"--head {head}: no line has this hash: the line that had it was changed, or removed with all that followed"

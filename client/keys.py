@@ -21,6 +21,7 @@ from contract.access.webhook_secrets import tenant_secret
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
+from contract.store.disk_errors import disk_errors
 from contract.store.owner import check_owner
 from contract.wire.errors import InputError
 from contract.wire.job import TENANT_PATTERN
@@ -123,7 +124,10 @@ def _own_keys(options: argparse.Namespace) -> KeyFile:
 def _recorded(options: argparse.Namespace, *acts: tuple[AuditAction, ApiKey, str]) -> Iterator[None]:
     """The time in which keys are changed: the audit says what begins, and what was done. An act that was begun and
     not done failed or was cut off."""
-    log = AuditLog(settings_of(options).data_dir)
+    data_dir = settings_of(options).data_dir.expanduser()
+    with disk_errors():
+        data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    log = AuditLog(data_dir)
 
     def note(state: str) -> None:
         for action, key, how in acts:

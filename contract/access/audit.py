@@ -21,12 +21,14 @@ from pydantic import BaseModel, ConfigDict
 from contract.access.chain import HEAD_PATTERN, START, head_of
 from contract.runtime.locks import held
 from contract.store.disk_errors import StoreFullError, disk_errors
+from contract.store.durable import flush
 
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"
 HEAD_FILE = "audit.head"
-"""The head of the chain, and the lock of whoever appends. It counts only where the audit was moved away, and is not
-flushed: if the power fails within seconds of that, the new file may name an earlier head, as if lines were gone."""
+"""The head of the chain, and the lock of whoever appends. It counts only where the audit was moved away. It is noted
+after the line, and flushed once a file: a kill in between, or a loss of power, leaves an earlier head of the file,
+which the next one then names if this one is moved away at once (chain.unnamed_lines)."""
 RESERVE_BYTES = 4 * 2**20
 """About 12,000 lines."""
 RESERVE_PIECE_BYTES = 64 * 2**10
@@ -143,6 +145,9 @@ class AuditLog:
                     os.ftruncate(audit, size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(audit)
+            if size == 0:  # the name of the new file, and the head that it goes on from
+                os.fsync(head)
+                flush(self._path.parent)
             with contextlib.suppress(OSError):
                 _put(head, hashlib.sha256(line).hexdigest())
         finally:

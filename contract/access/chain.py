@@ -16,7 +16,7 @@ import hashlib
 import os
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from contract.wire.errors import InputError
 START = "0" * 64
 HEAD_PATTERN = r"[0-9a-f]{64}"
 CHAINED = re.compile(rb'\{"chain":"([0-9a-f]{64})",')
+TIME = re.compile(rb'"time":"([^"]{1,40})"')
 TAIL_BYTES = 4096
 """The last line is looked for in so many bytes first; a line has about 350."""
 PIECE_BYTES = 1 << 20
@@ -88,6 +89,8 @@ class CheckedFile:
 
     path: Path
     lines: int = 0
+    begun: str = ""
+    """The time of its first line."""
     begins: str | None = None
     """The head that its first line names; None: that line has no chain."""
     head: str = START
@@ -95,15 +98,25 @@ class CheckedFile:
     broken_at: int | None = None
     """The first line, counted from 1, that does not name what stands before it."""
     unchained: list[int] = field(default_factory=list)
-    found_at: int | None = None
-    """After this line the head was the one that is looked for; 0: before the first."""
+    found: dict[str, int] = field(default_factory=dict)
+    """After which line the head was one that is looked for; 0: before the first."""
 
 
-def check_file(path: Path, wanted: str | None = None) -> CheckedFile:
-    """Follow the chain of one file. wanted: a head to look for. Raises as audit_lines()."""
+def check_files(paths: Sequence[Path], head: str | None = None) -> list[CheckedFile]:
+    """Follow the chain through all files of an audit, each looked through for the heads that the others begin with, and
+    for `head`. Raises as audit_lines()."""
+    named = [CHAINED.match(next(audit_lines(path), b"")) for path in paths]
+    wanted = frozenset({each[1].decode() for each in named if each} | ({head} if head else set()))
+    return [check_file(path, wanted) for path in paths]
+
+
+def check_file(path: Path, wanted: Collection[str] = ()) -> CheckedFile:
+    """Follow the chain of one file. wanted: heads to look for. Raises as audit_lines()."""
     checked, since = CheckedFile(path), hashlib.sha256()
     for number, line in enumerate(audit_lines(path), 1):
         chained = CHAINED.match(line)
+        if number == 1 and (time := TIME.search(line)):
+            checked.begun = time[1].decode("ascii", "replace")
         if chained is None:
             checked.unchained.append(number)
             since.update(line if number == 1 else b"\n" + line)
@@ -111,25 +124,33 @@ def check_file(path: Path, wanted: str | None = None) -> CheckedFile:
             named = chained[1].decode()
             if number == 1:
                 checked.begins = named
-                checked.found_at = 0 if named == wanted else None
+                if named in wanted:
+                    checked.found[named] = 0
             elif named != checked.head and checked.broken_at is None:
                 checked.broken_at = number
             since = hashlib.sha256(line)
         checked.lines, checked.head = number, since.hexdigest()
-        if checked.head == wanted:
-            checked.found_at = number
+        if checked.head in wanted:
+            checked.found[checked.head] = number
     return checked
 
 
 def in_order(files: Sequence[CheckedFile]) -> list[CheckedFile]:
     """The files, none of them empty, so that each begins where the one before it ends, as far as that can be."""
-    heads = {each.head for each in files}
-    firsts = [each for each in files if each.begins is None or each.begins not in heads]
-    firsts.sort(key=lambda each: each.begins not in (None, START))
-    following = {each.begins: each for each in files if each not in firsts}
+    waiting = [each for each in files if not any(other.found.get(each.begins or "") for other in files)]
+    waiting.sort(key=lambda each: (each.begins not in (None, START), each.begun), reverse=True)
     ordered: list[CheckedFile] = []
-    for first in firsts:
-        ordered.append(first)
-        while (after := following.pop(ordered[-1].head, None)) is not None:
-            ordered.append(after)
-    return ordered + list(following.values())
+    while waiting:
+        file = waiting.pop()
+        if file not in ordered:
+            ordered.append(file)
+            following = [each for each in files if file.found.get(each.begins or "")]
+            waiting += sorted(following, key=lambda each: each.begun, reverse=True)
+    return ordered
+
+
+def unnamed_lines(file: CheckedFile, files: Sequence[CheckedFile]) -> int:
+    """How many lines at a file's end no later one names, though it names those before them. A process that was killed,
+    or a loss of power, leaves so many: the file was moved away before its head was noted."""
+    named = [file.found[each.begins] for each in files if each is not file and each.begins in file.found]
+    return file.lines - max(named) if named and file is not files[-1] else 0

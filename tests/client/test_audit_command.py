@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 from pathlib import Path
 
 import pytest
 
 from client.cli import main
-from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
+from contract.access.audit import AUDIT_FILE, HEAD_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.chain import check_file
 from contract.runtime.exits import ExitCode
 
@@ -70,6 +72,57 @@ def test_lines_that_are_gone_at_the_end_show_against_a_head_that_was_kept(
     status, told = verified(capsys, path, "--head", head)
     assert status == ExitCode.FAILED
     assert any(line.startswith(f"--head {head}: no line has this hash") for line in told)
+
+
+def write_and_be_killed(folder: Path) -> None:
+    fsync = os.fsync
+
+    def fsync_and_die(descriptor: int) -> None:
+        fsync(descriptor)
+        os._exit(9)
+
+    os.fsync = fsync_and_die
+    write(folder, 1)
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_an_audit_whose_process_was_killed_before_it_noted_the_head_is_intact(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], is_moved: bool
+) -> None:
+    path, old = write(tmp_path, 2), tmp_path / "audit.1"
+    kill = multiprocessing.get_context("spawn").Process(target=write_and_be_killed, args=(tmp_path,))
+    kill.start()
+    kill.join()
+    assert kill.exitcode == 9
+    if is_moved:
+        path.rename(old)
+    write(tmp_path, 2)
+    status, told = verified(capsys, path, *[old] * is_moved)
+    assert (status, told[-2]) == (ExitCode.OK, "intact")
+    assert [line[: len(str(old)) + 18] for line in told if "names them" in line] == [
+        f"{old}, its last 1 lines"
+    ] * is_moved
+    if is_moved:  # a line that a later file names is still missed
+        old.write_text("".join(old.read_text().splitlines(keepends=True)[:1]))
+        assert verified(capsys, path, old)[0] == ExitCode.FAILED
+
+
+def test_after_a_loss_of_power_a_file_may_go_on_from_where_the_one_before_it_began(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / f"audit.{number}" for number in (3, 2, 1)]
+    for count, file in enumerate(files, 1):
+        write(tmp_path, 1)
+        on_disk = (tmp_path / HEAD_FILE).read_bytes()
+        write(tmp_path, count).rename(file)
+        (tmp_path / HEAD_FILE).write_bytes(on_disk)
+    newest = write(tmp_path, 1)
+    status, told = verified(capsys, newest, *reversed(files))
+    assert (status, told[-2:]) == (ExitCode.OK, ["intact", f"head {check_file(newest).head}"])
+    assert [f"{file}, its last {count} lines" for count, file in enumerate(files, 1)] == [
+        line.partition(":")[0] for line in told if "names them" in line
+    ]
+    assert verified(capsys, newest, files[2], files[0])[0] == ExitCode.FAILED
 
 
 def test_old_lines_are_told_and_not_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

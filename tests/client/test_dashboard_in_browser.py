@@ -342,6 +342,31 @@ def test_a_job_is_cancelled_and_a_failed_one_tried_again_by_keyboard(site: Site,
     assert record.state is JobState.CANCELLED
 
 
+def test_a_key_that_expires_while_it_is_used_and_one_that_has_are_told_so(
+    tmp_path: Path, driver: webdriver.Chrome
+) -> None:
+    with site_at(tmp_path / "data", hosts=("127.0.0.1",)) as site:
+        keys = KeyFile(tmp_path / "data")
+        key, text = keys.create("local", {KeyScope.VIEW}, "page")
+        scene = site.scene()
+        page = Page(driver, site.url)
+        page.open()
+        page.find("#key-text").send_keys(text, Keys.ENTER)
+        page.press(scene, "View")
+        page.until_state("live")
+        keys.rotate(key.key_id, key.successor()[0], time.time())
+        page.until_text("#key-message", "This key has expired. Ask for a new one.")
+        page.click("#forget-key")
+        page.until_text("#key-message", "A key is needed.")
+        page.find("#key-text").send_keys(text, Keys.ENTER)
+        page.until_text("#key-message", "This key has expired. Ask for a new one.")
+        _, successor = keys.create("local", {KeyScope.VIEW}, "page")
+        page.find("#key-text").send_keys(successor, Keys.ENTER)
+        page.until_state("live")
+        assert page.faults() == []
+        driver.get("about:blank")
+
+
 def test_a_key_is_asked_for_used_everywhere_and_forgotten(tmp_path: Path, driver: webdriver.Chrome) -> None:
     with site_at(tmp_path / "data", hosts=("127.0.0.1",)) as site:
         _, key = KeyFile(tmp_path / "data").create("local", {KeyScope.VIEW}, "page")

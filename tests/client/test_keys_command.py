@@ -28,6 +28,7 @@ def acts(folder: Path) -> list[tuple[str, str, str]]:
 def test_a_key_is_printed_once_and_alone_and_opens_what_it_was_made_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    tmp_path /= "not/yet/there"
     where = ["--data-dir", str(tmp_path)]
     create = ["keys", "create", "--tenant", "ward-3", "--scopes", "view,operate", "--label", "theatre 2"]
     assert main([*create, *where]) == ExitCode.OK

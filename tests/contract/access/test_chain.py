@@ -14,7 +14,7 @@ import pytest
 
 from contract.access import audit, chain
 from contract.access.audit import AUDIT_FILE, HEAD_FILE, AuditAction, AuditEntry, AuditLog, utc_now
-from contract.access.chain import START, CheckedFile, audit_lines, check_file, in_order
+from contract.access.chain import START, CheckedFile, audit_lines, check_file, check_files, in_order
 from contract.store.disk_errors import StoreFullError
 from contract.wire.errors import InputError
 from tests.contract.stores import files_no_larger_than
@@ -81,9 +81,9 @@ def test_a_line_that_a_crash_has_cut_off_breaks_nothing_and_hides_nothing(tmp_pa
     path.write_bytes(whole[: -len(last) - 1] + last[:kept])
     head = check_file(path).head
     write(tmp_path, 2)
-    checked = check_file(path, head)
+    checked = check_file(path, [head])
     assert is_intact(checked)
-    assert (checked.lines, checked.found_at) == (5, 3)
+    assert (checked.lines, checked.found) == (5, {head: 3})
     without_the_second = rewritten(path, lambda lines: [lines[0], *lines[2:]])
     assert not is_intact(without_the_second)
 
@@ -113,7 +113,7 @@ def test_the_next_file_goes_on_where_the_one_that_was_moved_away_ended(tmp_path:
     packed = tmp_path / "audit.3.gz"
     packed.write_bytes(gzip.compress((tmp_path / "audit.3").read_bytes()))
     paths = [tmp_path / AUDIT_FILE, tmp_path / "audit.1", tmp_path / "audit.2", packed]
-    files = in_order([check_file(path) for path in paths])
+    files = in_order(check_files(paths))
     assert [each.path for each in files] == paths[::-1]
     assert [each.begins for each in files] == [START, *(each.head for each in files[:-1])]
 
@@ -130,11 +130,11 @@ def test_the_head_is_taken_from_the_file_itself_while_there_is_one(tmp_path: Pat
 def test_a_head_that_was_kept_tells_what_was_added_and_that_lines_are_gone(tmp_path: Path) -> None:
     path = write(tmp_path, 3)
     head = check_file(path).head
-    assert check_file(path, head).found_at == 3
-    assert check_file(write(tmp_path, 2), head).found_at == 3
+    assert check_file(path, [head]).found == {head: 3}
+    assert check_file(write(tmp_path, 2), [head]).found == {head: 3}
     cut = rewritten(path, lambda lines: lines[:2])
     assert is_intact(cut)
-    assert check_file(path, head).found_at is None
+    assert check_file(path, [head]).found == {}
 
 
 def append_many(folder: Path) -> None:
