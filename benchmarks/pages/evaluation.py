@@ -14,7 +14,7 @@ from statistics import mode
 from benchmarks.pages.markdown import number, origin, table
 from benchmarks.pages.post import post_claim
 from benchmarks.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim, two_eyes
-from worker.evaluate.cells import DEFAULT_SERIES, GRID_BASES, GRID_POINTS, OURS, base_of
+from worker.evaluate.cells import GRID_BASES, GRID_POINTS, OURS, base_of, expected_beside
 from worker.evaluate.charts import clip_alone
 from worker.evaluate.published import ABLATION, RESULTS, Published
 from worker.evaluate.rows import Results, Row
@@ -293,7 +293,8 @@ def _parsimony(groups: Sequence[Group]) -> str:
         for key in keys:
             here = [found.get((*key, holdout)) for holdout in holdouts]
             rows.append([*key, *_size(next(each for each in here if each)), *map(_score, here)])
-        absent = [series for series in DEFAULT_SERIES if series not in {key[1] for key in keys}]
+        there = {key[1] for key in keys}
+        absent = [series for series in expected_beside(there) if series not in there]
         not_run += [f"{clip}: {', '.join(absent)}"] if absent else []
     header = ["clip", "series", "limit", *_SIZES, *(f"{holdout}, dB" for holdout in holdouts)]
     said = f"\nNot run. {'; '.join(not_run)}.\n" if not_run else ""

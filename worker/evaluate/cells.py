@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -23,8 +23,8 @@ OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in
 RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
 """The published method, as printed and as released, and what it compares itself with."""
 DEFAULT_SERIES = (*OURS, *RIVALS)
-TABLE_1 = (*RIVAL_SYSTEMS, "paper", "fast")
-"""The systems that the paper's table 1 compares, and our default."""
+TABLE_1 = ("fast", "paper", *reversed(tuple(RIVAL_SYSTEMS)))
+"""Our default and the systems that the paper's table 1 compares: those that are measured soonest come first."""
 SHORTHANDS = {"ours": OURS, "rivals": RIVALS, "table1": TABLE_1}
 DEFAULT_HOLDOUTS = ("every8", "blocks8")
 GRID_BASES = (3, 5, 9, 17, 33)
@@ -33,6 +33,14 @@ GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
 EYES = "eyes"
 BOTH_EYES: Eyes = "both"
 """The change in a series that is an option of the reconstruction and no value of its preset, and what it is unsaid."""
+
+
+def expected_beside(series: Collection[str]) -> list[str]:
+    """The series that a comparison of these is to have: the table's if a system of others is among them, and all
+    presets unless they are the table's alone."""
+    table = TABLE_1 if any(each in RIVAL_SYSTEMS for each in series) else ()
+    presets = () if table and set(series) <= set(TABLE_1) else DEFAULT_SERIES
+    return list(dict.fromkeys((*presets, *table)))
 
 
 @dataclass(frozen=True)

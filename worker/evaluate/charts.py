@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from worker.evaluate.cells import DEFAULT_SERIES, base_of, preset_of
+from worker.evaluate.cells import DEFAULT_SERIES, base_of, expected_beside, preset_of
 from worker.evaluate.published import LABEL, RESULTS
 from worker.evaluate.rows import Results, Row, key_of
 from worker.evaluate.style import BASES_LOOKS, FAINT, GREY, SETTINGS, Look, figure_of, look_of, save
@@ -273,7 +273,8 @@ def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, t
 def _missing(groups: Sequence[Group], more: Mapping[str, Sequence[str]]) -> str:
     """Which series have no figure here, and which failed; and more of that kind."""
     failed = [group.series for group in groups if group.errors and not group.rows]
-    missing = [series for series in DEFAULT_SERIES if series not in {group.series for group in groups}]
+    there = {group.series for group in groups}
+    missing = [series for series in expected_beside(there) if series not in there]
     named = {"failed": failed, "missing": missing, **more}
     return "; ".join(f"{word}: {', '.join(dict.fromkeys(names))}" for word, names in named.items() if names)
 

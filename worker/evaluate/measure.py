@@ -167,7 +167,7 @@ class Bench:
         if opened.phantom is None:
             return values, curve
         place = (cell.clip, cell.holdout)
-        return values | self._true(place, opened, RivalCandidate(rival, clip), report), curve
+        return values | self._true(place, opened, RivalCandidate(fitted, clip), report), curve
 
     def _true(self, place: tuple[str, str], opened: OpenClip, candidate: Candidate, report: Report) -> Values:
         """The scores of a phantom's candidate against the truth."""

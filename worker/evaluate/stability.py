@@ -16,7 +16,7 @@ import itertools
 import math
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import InputError, TrainingDiverged
 from contract.wire.notices import Severity
 from contract.wire.report import Report
-from worker.evaluate.cells import eyes_of, preset_of
+from worker.evaluate.cells import eyes_of, is_rival_system, preset_of
 from worker.evaluate.conditions import (
     CLEAN,
     CLEAN_STEREO,
@@ -38,16 +38,21 @@ from worker.evaluate.conditions import (
     clean_given,
     write_recording,
 )
+from worker.evaluate.rivals import RIVAL_SYSTEMS
+from worker.evaluate.rivals.run import Length, every_core, run_rival
 from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
+from worker.input.clip import split_frames
+from worker.machine.timing import Timings
 from worker.model.metrics import psnr_tissue
 from worker.phantom import PhantomSettings
-from worker.pipeline import reconstruct
+from worker.pipeline import open_with_depth, reconstruct
 from worker.poses.trajectory import trajectory_error
+from worker.raster.backend import choose_device
 from worker.render.camera import view_camera
 from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
-from worker.scene.scene import POSE_DOUBTS, Scene
-from worker.train.hooks import TrainingHooks
+from worker.scene.scene import POSE_DOUBTS
+from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import solid_depth_mm
 
@@ -111,7 +116,8 @@ def plan(
     if unknown:
         raise InputError("--conditions", f"there is no {unknown[0]!r}.", f"Use some of: {', '.join(CONDITIONS)}.")
     for name in series:
-        preset_of(name)
+        if not is_rival_system(name):
+            preset_of(name)
     cells: dict[StabilityCell, None] = {}
     for seed in seeds:
         for method in series:
@@ -253,6 +259,53 @@ def moments_of(given: Given, held_out: Sequence[int], frame_count: int) -> list[
     return found or [Moment(0.0, 0, given.source[0])]
 
 
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """A finished model of either kind: its report, the poses [S, 4, 4] it took, and its picture at a moment."""
+
+    report: Report
+    world_from_camera: NDArray[np.float64]
+    show: Callable[[Moment], RenderedFrame]
+
+
+def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks: TrainingHooks) -> _Made:
+    if is_rival_system(cell.series):
+        with every_core():
+            return _made_by_rival(request, cell, hooks)
+    report = reconstruct(dataclasses.replace(request, own_preset=preset_of(cell.series)), out, hooks)
+    scene = load_scene(out)
+    model = model_of(scene)
+
+    def show(moment: Moment) -> RenderedFrame:
+        camera = view_camera(scene, moment.t, scene.world_from_camera[moment.frame], scene.intrinsics)
+        image = model.render(camera, moment.t)
+        depth_mm = solid_depth_mm(image[3], image[4], scene.units_per_mm)
+        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+
+    return _Made(report, scene.world_from_camera, show)
+
+
+def _made_by_rival(request: ReconstructionRequest, cell: StabilityCell, hooks: TrainingHooks) -> _Made:
+    options, device = request.options, choose_device(request.device)
+    clip = open_with_depth(request, hooks, Timings(), device)
+    fitted = run_rival(
+        cell.series,
+        RIVAL_SYSTEMS[cell.series],
+        clip,
+        split_frames(clip, options.holdout),
+        Length(options.iterations, None),
+        seed=cell.seed,
+        device=device,
+        waited_s=0.0,
+        hooks=hooks,
+    )
+
+    def show(moment: Moment) -> RenderedFrame:
+        return fitted.renders(moment.t, clip.world_from_camera[moment.frame], clip.intrinsics)
+
+    return _Made(fitted.report, clip.world_from_camera, show)
+
+
 def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: TrainingHooks) -> Row:
     """What `reconstruct` makes of the clip, judged by the truth and as it judges itself."""
     with tempfile.TemporaryDirectory() as folder:
@@ -261,14 +314,12 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
             if isinstance(given.clip, Recording)
             else ReconstructionRequest(given.clip)
         )
-        preset = preset_of(cell.series)
         chosen = {"iterations": grid.iterations, "seed": cell.seed, "eyes": eyes_of(cell.series)}
         options = asked.options.model_copy(update=chosen)
-        request = dataclasses.replace(asked, own_preset=preset, options=options)
-        report = reconstruct(request, Path(folder, "scene"), hooks)
-        scene = load_scene(Path(folder, "scene"))
-    psnr_db, depth_error_mm = _judged(given, scene, moments_of(given, report.held_out, report.frame_count))
-    off = None if given.path is None else trajectory_error(scene.world_from_camera, given.path)
+        made = _made(dataclasses.replace(asked, options=options), cell, Path(folder, "scene"), hooks)
+    report = made.report
+    psnr_db, depth_error_mm = _judged(given, made, moments_of(given, report.held_out, report.frame_count))
+    off = None if given.path is None else trajectory_error(made.world_from_camera, given.path)
     return {
         "path_error_mm": _text(None if off is None else off.mm),
         "path_error_deg": _text(None if off is None else off.deg),
@@ -281,16 +332,14 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
     }
 
 
-def _judged(given: Given, scene: Scene, moments: Sequence[Moment]) -> tuple[float, float]:
+def _judged(given: Given, made: _Made, moments: Sequence[Moment]) -> tuple[float, float]:
     """Mean psnr in dB and mean |z - truth| in mm over the moments' scored pixels; NaN where there is none."""
-    model, scale = model_of(scene), scene.units_per_mm
     scores, errors_mm = [], []
     for moment in moments:
-        camera = view_camera(scene, moment.t, scene.world_from_camera[moment.frame], scene.intrinsics)
-        image = model.render(camera, moment.t)
-        depth_mm = solid_depth_mm(image[3], image[4], scale)
+        shown = made.show(moment)
+        depth_mm = shown.depth_mm
         truth, scored = given.depth_mm[moment.truth], given.scored[moment.truth]
-        scores.append(psnr_tissue(image[:3].transpose(1, 2, 0), given.rgb[moment.truth], scored))
+        scores.append(psnr_tissue(shown.rgb, given.rgb[moment.truth], scored))
         both = scored & (truth > 0) & (depth_mm > 0)
         errors_mm.append(np.abs(depth_mm[both] - truth[both]))
     return _mean(scores), _mean(np.concatenate(errors_mm))

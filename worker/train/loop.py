@@ -24,7 +24,7 @@ from worker.train.run import CurvePoint, Run, frames_at
 from worker.train.schedule import validation_frames
 from worker.train.scoring import HeldOutScore
 
-CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600)
+CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600, 1200, 1800)
 """Training times at which held-out frames are scored; the clock is paused meanwhile."""
 UNSCORED_S = 2.0
 """After the first step: a score takes a third of a second of whoever waits, and would tell little so soon."""

@@ -6,11 +6,14 @@ import pytest
 
 from contract.wire.errors import InputError
 from worker.evaluate.cells import (
+    DEFAULT_SERIES,
     GRID_BASES,
     GRID_POINTS,
+    TABLE_1,
     Cell,
     base_of,
     capacity_grid,
+    expected_beside,
     options_of,
     plan,
     preset_of,
@@ -123,3 +126,11 @@ def test_eyes_that_a_series_names_are_kept_and_both_need_no_name() -> None:
     assert [cell.series for cell in cells] == ["fast:eyes=left", "fast"]
     assert base_of("fast:bases=9,eyes=left") == base_of("fast:eyes=left") == "fast:eyes=left"
     assert capacity_grid("fast:eyes=left")[1] == "fast:bases=3,points_per_image=10000,eyes=left"
+
+
+def test_a_comparison_is_to_have_the_table_where_a_system_of_it_was_measured_and_else_all_presets() -> None:
+    assert expected_beside({"fast", "paper"}) == [*DEFAULT_SERIES]
+    assert expected_beside({"fast", "lerplane"}) == [*TABLE_1]
+    both = expected_beside({"quality", "lerplane"})
+    assert set(both) == {*DEFAULT_SERIES, *TABLE_1}
+    assert len(both) == len(set(both))

@@ -26,6 +26,9 @@ from worker.train.hooks import RenderedFrame
 GUIDES = 8
 """Training frames nearest in time whose depth guides the rays of a render."""
 
+CPU_RAYS = 128
+"""Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
+
 
 @dataclass(frozen=True)
 class EndoNerfSettings:
@@ -52,6 +55,11 @@ class EndoNerfSettings:
     refined_from: float = 0.04
     refined_share: float = 0.01
 
+    @classmethod
+    def on(cls, device: torch.device) -> EndoNerfSettings:
+        """As published on a GPU; with a smaller batch on a processor."""
+        return cls(rays=CPU_RAYS) if device.type == "cpu" else cls()
+
 
 class EndoNerf(Rival):
     """A training EndoNeRF."""
@@ -59,7 +67,7 @@ class EndoNerf(Rival):
     not_measured = "motion: it maps each moment to the canonical one, not back; confidence: it has none"
 
     def __init__(self, seen: Seen, seed: int, settings: EndoNerfSettings | None = None) -> None:
-        self.seed, self.settings = seed, settings or EndoNerfSettings()
+        self.seed, self.settings = seed, settings or EndoNerfSettings.on(seen.rgb.device)
         self._seen, self._box = seen, Box.of(seen)
         hidden = (~seen.tissue).sum(0).to(seen.rgb)
         self._importance = 1 + hidden / hidden.norm().clamp(min=1e-9)
@@ -114,7 +122,7 @@ class EndoNerf(Rival):
         view = torch.nn.functional.normalize(direction, dim=-1)[:, None].expand_as(points_mm)
         density, rgb = self.field(self._box.place(points_mm).flatten(0, 1), t, view.flatten(0, 1))
         length = torch.cat([s[:, 1:] - s[:, :-1], torch.full_like(s[:, :1], SOLID)], 1)
-        weight = weights_along(density.reshape(s.shape), length)
+        weight = weights_along(density.reshape(s.shape), length / self.settings.spread)
         return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
 
     def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
@@ -181,7 +189,7 @@ class _Field(nn.Module):
             place = place + self.displacement(self.displace(torch.cat([_encoded(place, octaves), time], 1)))
         known = self.trunk(_encoded(place, octaves))
         branch = self.branch(torch.cat([self.feature(known), _encoded(view, self.settings.view_octaves)], 1))
-        return torch.relu(self.density(known))[:, 0], torch.sigmoid(self.colour(torch.relu_(branch)))
+        return torch.nn.functional.softplus(self.density(known))[:, 0], torch.sigmoid(self.colour(torch.relu_(branch)))
 
 
 def _encoded(value: Tensor, octaves: int) -> Tensor:

@@ -30,6 +30,9 @@ MAX_LOG_DENSITY = 15.0
 WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
 
+CPU_RAYS = 512
+"""Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
+
 
 @dataclass(frozen=True)
 class Evenness:
@@ -72,6 +75,11 @@ class LerPlaneSettings:
     evenness: Evenness = Evenness(variation=1e-3, unrest=1e-3, jerk=0.05)
     proposal_evenness: Evenness = Evenness(variation=1e-4, unrest=1e-4, jerk=1e-4)
 
+    @classmethod
+    def on(cls, device: torch.device) -> LerPlaneSettings:
+        """As published on a GPU; with a smaller batch on a processor."""
+        return cls(rays=CPU_RAYS) if device.type == "cpu" else cls()
+
 
 class LerPlane(Rival):
     """A training LerPlane."""
@@ -79,7 +87,7 @@ class LerPlane(Rival):
     not_measured = "motion: it has a field for each moment and no points that move; confidence: it has none"
 
     def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:
-        self.seed, self.settings = seed, settings or LerPlaneSettings()
+        self.seed, self.settings = seed, settings or LerPlaneSettings.on(seen.rgb.device)
         self._seen, self._box = seen, Box.of(seen)
         self._importance = importance(seen, self.settings.least, self.settings.most)
         with torch.random.fork_rng(devices=[]):

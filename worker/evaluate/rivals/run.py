@@ -21,6 +21,7 @@ from contract.wire.errors import Cancelled, TrainingDiverged
 from contract.wire.report import Report
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.truth import Pose, ShownView
+from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, Eye, FrameSplit
 from worker.machine.cores import cores
 from worker.machine.hooks import Progress
@@ -29,9 +30,15 @@ from worker.raster.backend import Device
 from worker.report.judge import judged
 from worker.report.quality import Training, first_report
 from worker.train.hooks import RenderedFrame, TrainingHooks
-from worker.train.loop import CURVE_SECONDS, REPORT_EVERY_S
+from worker.train.loop import REPORT_EVERY_S
 from worker.train.run import CurvePoint
-from worker.train.scoring import FrameRenderer, score_held_out
+from worker.train.scoring import MAX_SCORED_FRAMES, FrameRenderer, score_held_out
+
+SCORED_SECONDS = (1, 3, 10, 30, 60, 120, 300, 600, 1200)
+"""Training times at which held-out frames are scored, the clock paused; fewer than of our presets, for a picture of a
+radiance field takes a processor many seconds."""
+SCORED_ON_THE_WAY = 4
+"""Held-out frames of such a score; the end is scored on as many as everybody's."""
 
 Make = Callable[[Seen, int], Rival]
 """A rival before its first step, from what it may see and a seed."""
@@ -52,11 +59,30 @@ class Length:
         return elapsed_s / self.budget_s
 
 
+class Renders:
+    """A rival's pictures, each rendered once as long as it trains no further: the end of its curve, its report and the
+    truth ask for the same ones. Several threads may call it."""
+
+    def __init__(self, rival: Rival) -> None:
+        self._rival, self._known = rival, dict[tuple[float, bytes, Intrinsics], RenderedFrame]()
+
+    def __call__(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
+        key = (t, world_from_camera.tobytes(), intrinsics)
+        if key not in self._known:
+            self._known[key] = self._rival.render(t, world_from_camera, intrinsics)
+        return self._known[key]
+
+    def forget(self) -> None:
+        """The rival has been trained further."""
+        self._known.clear()
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A trained rival, its scored report and its curve."""
+    """A trained rival, its pictures, its scored report and its curve."""
 
     rival: Rival
+    renders: Renders
     report: Report
     curve: tuple[CurvePoint, ...]
 
@@ -68,13 +94,13 @@ def train_rival(
 
     Args:
         clock: t_train_s so far; paused while score is called.
-        score: of the held-out frames in dB, given the iterations made; called at CURVE_SECONDS and at the end.
+        score: of the held-out frames in dB, given the iterations made; called at SCORED_SECONDS and at the end.
 
     Raises:
         Cancelled: hooks.should_stop said so.
         TrainingDiverged: a loss is not finite.
     """
-    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s]
+    marks = [mark for mark in SCORED_SECONDS if mark > clock.elapsed_s]
     made, reported, last_db = 0, -math.inf, math.nan
     while (progress := length.progress(made, clock.elapsed_s)) < 1:
         if hooks.should_stop():
@@ -120,19 +146,22 @@ def run_rival(
     clock = Stopwatch()
     curve: list[CurvePoint] = []
     rival = make(Seen.of(clip, split.train, device.memory), seed)
+    renders = Renders(rival)
     start_s = clock.elapsed_s
 
     def render_as(eye: Eye | None) -> FrameRenderer:
         by: Eye = clip if eye is None else eye
 
         def view(index: int) -> RenderedFrame:
-            return rival.render(float(clip.t[index]), by.world_from_camera[index], by.intrinsics)
+            return renders(float(clip.t[index]), by.world_from_camera[index], by.intrinsics)
 
         return view
 
     def score(made: int) -> float:
         t_train_s = clock.elapsed_s
-        found = score_held_out(clip, split.held_out, render_as, hooks)
+        renders.forget()
+        most = MAX_SCORED_FRAMES if length.progress(made, t_train_s) >= 1 else SCORED_ON_THE_WAY
+        found = score_held_out(clip, split.held_out, render_as, hooks, most)
         if not math.isnan(found.left_db):
             right_db = None if math.isnan(found.right_db) else found.right_db
             curve.append(CurvePoint(t_train_s, made, found.left_db, right_db, waited_s + t_train_s))
@@ -143,7 +172,7 @@ def run_rival(
     seconds = {"start_s": start_s, "optimise_s": t_train_s - start_s, "t_train_s": t_train_s}
     seconds["t_post_s"] = waited_s + t_train_s
     first = first_report(clip, split, _training(name, rival, made, seed, device, seconds))
-    return Fitted(rival, judged(first, clip, split.train, rival.render, hooks), tuple(curve))
+    return Fitted(rival, renders, judged(first, clip, split.train, renders, hooks), tuple(curve))
 
 
 @contextmanager
@@ -160,11 +189,11 @@ def every_core() -> Iterator[None]:
 class RivalCandidate:
     """A trained rival before the truth (worker/evaluate/truth.py)."""
 
-    def __init__(self, rival: Rival, clip: DepthClip) -> None:
-        self._rival, self._clip = rival, clip
+    def __init__(self, fitted: Fitted, clip: DepthClip) -> None:
+        self._rival, self._renders, self._clip = fitted.rival, fitted.renders, clip
 
     def view(self, frame: int, pose: Pose) -> ShownView:
-        shown = self._rival.render(float(self._clip.t[frame]), pose, self._clip.intrinsics)
+        shown = self._renders(float(self._clip.t[frame]), pose, self._clip.intrinsics)
         unknown = np.full(shown.depth_mm.shape, np.nan, np.float32)  # no rival says how far to trust it
         return ShownView(shown.rgb, shown.depth_mm, unknown)
 

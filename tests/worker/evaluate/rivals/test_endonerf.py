@@ -34,6 +34,14 @@ def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers()
     check_what_counts(small)
 
 
+def test_it_learns_from_the_start_whatever_the_seed() -> None:
+    seen = Seen.of(small_clip(2), [1])
+    for seed in range(6):
+        rival = EndoNerf(seen, seed, TINY)
+        rival.loss(1, 0.0).backward()  # type: ignore[no-untyped-call]
+        assert all(bool((each.grad != 0).any()) for each in rival.field.density.parameters() if each.grad is not None)
+
+
 def test_rays_are_drawn_where_there_is_tissue_and_more_often_where_it_hides() -> None:
     clip = small_clip(9)
     rival = small(Seen.of(clip, range(9)), 0)

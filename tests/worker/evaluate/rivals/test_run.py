@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.rival import Rival, Seen
-from worker.evaluate.rivals.run import Length, train_rival
+from worker.evaluate.rivals.run import Length, Renders, train_rival
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from worker.evaluate.sources import source_of
 from worker.machine.timing import Stopwatch
@@ -108,12 +109,35 @@ def test_a_clip_without_depth_is_refused() -> None:
 
 def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
     cells = plan(["clip"], ["table1"], ["every8"], [0])
-    assert [cell.series for cell in cells] == [*RIVAL_SYSTEMS, "paper", "fast"]
-    assert cells[0].budget_s == RIVAL_BUDGET_S
+    assert [cell.series for cell in cells] == ["fast", "paper", *reversed(tuple(RIVAL_SYSTEMS))]
+    assert cells[-1].budget_s == RIVAL_BUDGET_S
     assert not set(RIVAL_SYSTEMS) & set(PRESETS)
     for series in ("endonerf:bases=3", "endonerf:eyes=left"):
         with pytest.raises(InputError, match="as it was published"):
             plan(["clip"], [series], ["every8"], [0])
-    for refused in (lambda: preset_of("endonerf"), lambda: stability.plan(["smoke"], [3], ["endonerf"], [0])):
-        with pytest.raises(InputError, match="by `intrasplat evaluate` alone"):
-            refused()
+    with pytest.raises(InputError, match="by `intrasplat evaluate` alone"):
+        preset_of("endonerf")
+
+
+def test_a_picture_is_rendered_once_until_the_rival_trains_further() -> None:
+    clip = small_clip(2)
+    rival = tiny(Seen.of(clip, [1]), 0)
+    renders = Renders(rival)
+    first = renders(0.5, clip.world_from_camera[1], clip.intrinsics)
+    assert renders(0.5, clip.world_from_camera[1], clip.intrinsics) is first
+    assert renders(0.6, clip.world_from_camera[1], clip.intrinsics) is not first
+    renders.forget()
+    assert renders(0.5, clip.world_from_camera[1], clip.intrinsics) is not first
+
+
+def test_a_rival_has_cells_in_the_atlas(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(stability, "RIVAL_SYSTEMS", {"endonerf": tiny})
+    atlas = stability.StabilityBench(tmp_path, stability.Grid(64, 48, frames=9, iterations=2))
+    cells = stability.plan(["depth_noise"], [5], ["endonerf"], [0])
+    rows = [atlas.measure(cell, TrainingHooks()) for cell in cells]
+    assert [row["severity"] for row in rows] == ["0", "5"]
+    for row in rows:
+        assert row["error"] == "", row["error"]
+        assert all(row[name] for name in ("psnr_db", "depth_error_mm", "reported_db"))
+        assert row["outcome"] in ("held", "told", "silent")
+    assert atlas.missing(cells) == []
