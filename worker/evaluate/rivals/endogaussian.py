@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from contract.wire.errors import TrainingDiverged
 from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.planes import Planes
-from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.rivals.rival import Rival, Seen, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
 from worker.model.loss import LossSettings, training_loss
@@ -102,6 +102,10 @@ class EndoGaussian(Rival):
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
 
+    def step(self, iteration: int, progress: float) -> float:
+        with torch_threads(1):  # more of them spin while the rasteriser's own threads work, which takes most of a step
+            return super().step(iteration, progress)
+
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
         seen, frame = self._seen, self._measured[0]
@@ -121,7 +125,8 @@ class EndoGaussian(Rival):
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
         camera = camera_in_units(intrinsics, world_from_camera, self._scale)
-        shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
+        with torch_threads(1):
+            shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
         rgb, depth, alpha = (each.float().cpu().numpy() for each in (shown.rgb, shown.depth, shown.alpha))
         return RenderedFrame(rgb, solid_depth_mm(depth, alpha, self._scale), alpha)
 

@@ -6,7 +6,8 @@ Symbols: F training frames, H W pixels. Lengths in mm of the clip's world.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -115,3 +116,14 @@ class Rival(ABC):
     def generator(self, iteration: int) -> torch.Generator:
         """The random numbers of an iteration; 0 stands for the start. On the CPU, so that a device changes none."""
         return torch.Generator().manual_seed(1_000_003 * self.seed + iteration)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch computes on so many threads within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

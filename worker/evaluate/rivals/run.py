@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from contract.wire.errors import Cancelled, TrainingDiverged
 from contract.wire.report import Report
-from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.rivals.rival import Rival, Seen, torch_threads
 from worker.evaluate.truth import Pose, ShownView
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, Eye, FrameSplit
@@ -175,15 +174,9 @@ def run_rival(
     return Fitted(rival, renders, judged(first, clip, split.train, renders, hooks), tuple(curve))
 
 
-@contextmanager
-def every_core() -> Iterator[None]:
+def every_core() -> AbstractContextManager[None]:
     """Torch computes on every core within the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(cores())
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    return torch_threads(cores())
 
 
 class RivalCandidate:
