@@ -27,7 +27,7 @@ from contract.wire.errors import InputError
 from contract.wire.job import TENANT_PATTERN
 
 UNITS_S = {"d": DAY_S, "h": 3600.0}
-TIME_REMEDY = "Give a time to come: 90d, 12h, or a date such as 2030-01-31 (UTC)."
+TIME_REMEDY = "Give a time to come: 90d, 12h, or a date or time such as 2030-01-31 or 2030-01-31T18:00 (UTC)."
 
 
 def add_keys(commands: Commands) -> None:

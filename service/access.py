@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from contract.access.keys import ApiKey, KeyFile, KeyScope
-from contract.runtime.settings import LOOPBACK_NAMES, Settings
+from contract.access.keys import ApiKey, KeyFile, KeyScope, needs_keys
+from contract.runtime.settings import Settings
 from contract.wire.errors import ErrorCode
 from contract.wire.job import LOCAL_TENANT, JobRecord
 from service.limits import Limiter
@@ -88,7 +88,7 @@ class Access:
         self._keys = KeyFile(settings.data_dir)
         self._wrong_keys = Limiter(WRONG_KEYS_PER_S, WRONG_KEYS_AT_ONCE)
         self._strangers = 0
-        self.keys_required = settings.host not in LOOPBACK_NAMES or bool(settings.hosts)
+        self.keys_required = needs_keys(settings)
 
     def caller(self, headers: Mapping[str, str], address: str) -> Caller | None:
         """Whose request has these headers (names in lower case); None if it has no key and needs one.

@@ -163,7 +163,8 @@ def _problem_of_validation(error: RequestValidationError) -> Problem:
     if first["type"] == "json_invalid":
         return Problem(400, "The body is not JSON.", field="body", remedy=API_REMEDY)
     given = "" if first["type"] == "missing" else f" (given: {str(first.get('input'))[:80]!r})"
-    return Problem(422, f"{first['msg']}{given}.", field=str(first["loc"][-1]), remedy=API_REMEDY)
+    place = [str(each) for each in first["loc"] if each != "[key]"]  # pydantic's sign for the key itself
+    return Problem(422, f"{first['msg']}{given}.", field=".".join(place[1:] or place), remedy=API_REMEDY)
 
 
 def _problem_of_http_exception(error: HTTPException) -> Problem:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
+from contract.queue.redis_client import QUEUE_REMEDY
 from contract.wire.errors import UnavailableError
 
 THREADS = 8
@@ -37,8 +38,7 @@ class Questions:
                 return asked.result(patience_s)
             except TimeoutError:
                 self._unanswered = asked
-        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
-        raise UnavailableError("The queue does not answer.", remedy, may_return=True)
+        raise UnavailableError("The queue does not answer.", QUEUE_REMEDY, may_return=True)
 
     def close(self) -> None:
         """Ask nothing more."""

@@ -93,9 +93,9 @@ def format_findings(findings: list[Finding]) -> str:
     lines = []
     for finding in findings:
         mark = "missing" if finding.blocks else ("look" if finding.remedy else "ok")
-        lines.append(f"{mark:<8}{finding.topic:<32}{finding.found}")
+        lines.append(f"{mark:<8}{finding.topic:<41}{finding.found}")
         if finding.remedy:
-            lines.append(f"{'':<8}{'':<32}-> {finding.remedy}")
+            lines.append(f"{'':<8}{'':<41}-> {finding.remedy}")
     return "\n".join(lines)
 
 

@@ -264,14 +264,20 @@ def expiring_keys(keys: Iterable[ApiKey], now_s: float) -> list[ApiKey]:
     return [key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S)]
 
 
+def needs_keys(settings: Settings) -> bool:
+    """Whether every caller needs a key: others than this machine's user can reach the service."""
+    return settings.host not in LOOPBACK_NAMES or bool(settings.hosts)
+
+
 def check_keys(settings: Settings) -> None:
-    """Return if the service has keys, or needs none because only this machine can reach it.
+    """Return if the service has keys, or needs none because only this machine's user may reach it.
 
     Raises:
-        UnavailableError: other machines can reach it and there are no keys.
+        UnavailableError: nobody could get in without a key, and there are none.
     """
-    if settings.host not in LOOPBACK_NAMES and not KeyFile(settings.data_dir).list():
-        problem = f"Other machines can reach the service at {settings.host}, and there are no keys."
+    if needs_keys(settings) and not KeyFile(settings.data_dir).list():
+        at = settings.host if settings.host not in LOOPBACK_NAMES else ", ".join(sorted(settings.hosts))
+        problem = f"Others can reach the service at {at}, and there are no keys."
         remedy = f"Make one first: `intrasplat keys create --tenant NAME --data-dir {settings.data_dir}`."
         raise UnavailableError(problem, remedy)
 

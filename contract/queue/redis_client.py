@@ -15,6 +15,7 @@ from contract.wire.errors import InputError, UnavailableError
 
 PATIENCE_S = 12.0
 """How long to try, in all, until the server counts as away."""
+QUEUE_REMEDY = "See whether its server runs, reachable at REDIS_URL; without REDIS_URL, `intrasplat up` starts it."
 RETRIES = 2
 MAX_CONNECT_TIMEOUT_S = 2.0
 
@@ -87,8 +88,7 @@ def reachable() -> Iterator[None]:
         raise UnavailableError("The queue refuses this user or password.", "Correct REDIS_URL.") from error
     except (redis.ConnectionError, redis.TimeoutError) as error:
         problem = f"The queue does not answer ({type(error).__name__})."
-        remedy = "Start it with `intrasplat up`, or correct REDIS_URL."
-        raise UnavailableError(problem, remedy, may_return=True) from error
+        raise UnavailableError(problem, QUEUE_REMEDY, may_return=True) from error
     except redis.exceptions.OutOfMemoryError as error:
         raise UnavailableError("The queue's memory is full.", "Raise its maxmemory or delete old jobs.") from error
     except redis.ResponseError as error:

@@ -105,7 +105,8 @@ def test_labels_that_cannot_be_are_refused_as_a_change(service: ServiceUnderTest
     job_id = sent(service)
     for change, field in (
         ({"label": "x" * 81}, "label"),
-        ({"metadata": {"a b": "c"}}, "[key]"),
+        ({"metadata": {"a b": "c"}}, "metadata.a b"),
+        ({"metadata": {"ris": 815}}, "metadata.ris"),
         ({"lable": "x"}, "lable"),
     ):
         assert_problem(service.http.request("PATCH", f"/jobs/{job_id}", json=change), 422, field)
