@@ -122,13 +122,15 @@ def restore_backup(
         try:
             _empty(data_dir, {RESTORING} if queue_url else {RESTORING, *EMBEDDED_QUEUE})
             with open_queue as queue:
-                _check_queue(queue, _begun(marker), entering, backup)
+                begun = _begun(marker)
+                _check_queue(queue, begun, entering, backup)
                 _copy_files(backup, manifest, data_dir, since.purged)
                 restored = Restored(backup, manifest.created_at, unreadable=manifest.unreadable)
                 restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
                 records = list(read_jobs(backup))
-                marker.write_text(entering.model_dump_json())
-                flush(marker)
+                if begun != entering:  # else the queue has records, and the marker must not be empty for a moment
+                    marker.write_text(entering.model_dump_json())
+                    flush(marker)
                 _fill_queue(queue, Store(data_dir, settings.store_url), records, since.purged, restored)
             outcome = f"backup of {manifest.created_at}"
             AuditLog(data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.RESTORED, outcome=outcome))

@@ -217,12 +217,15 @@ def test_a_restore_that_failed_while_jobs_were_entered_goes_on_when_it_is_run_ag
     done, queued, new = site.done(), [site.queued() for _ in range(4)], tmp_path / "new"
     backup, queue = site.backup(tmp_path / "backups"), Failing()
     AuditLog(site.settings.data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.PURGED, job_id=queued[1]))
+    written_ns = set()
     for queue.takes in (2, 3):  # those that the queue has are counted again
         with pytest.raises(UnavailableError, match="does not answer"):
             elsewhere(new, queue, backup)
         assert [each.name for each in new.iterdir()] == [RESTORING]
+        written_ns.add((new / RESTORING).stat().st_mtime_ns)
         with pytest.raises(UnavailableError, match="restore again"):
             open_store(Settings(data_dir=new))
+    assert len(written_ns) == 1  # a kill while it is written anew would leave records that no restore goes on from
     assert {record.job_id for record in queue.records()} == {done, *queued[:3]}
     queue.takes = 9
     told = elsewhere(new, queue, backup, site.settings.data_dir / AUDIT_FILE)
