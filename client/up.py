@@ -23,7 +23,7 @@ from pathlib import Path
 
 from client.up_room import RoomWatch
 from contract.access.keys import check_keys
-from contract.queue.embedded import EmbeddedServer
+from contract.queue.embedded import EmbeddedServer, ServerEnd
 from contract.runtime.locks import FolderLock
 from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
@@ -39,6 +39,10 @@ WATCH_PERIOD_S = 0.2
 READY_PERIOD_S = 1.0
 QUEUE_PERIOD_S = 1.0
 """Between two starts of the queue's server."""
+QUEUE_ENDS = {
+    ServerEnd.DIED: "had died",
+    ServerEnd.WITH_ITS_STARTER: "ended with the command that had started it, such as a backup,",
+}
 HEALTHY_AFTER_S = 60.0
 """A child that has lived this long works: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
@@ -124,18 +128,19 @@ class Installation:
                 say(f"the {child.name} {ended.cause}; starting it again in {ended.pause_s:g} s")
 
     def _watch_queue(self) -> None:
-        """Start the queue's server again if it has died. While the disk is full it may die again and again."""
+        """Start the queue's server again if it has ended. While the disk is full it may die again and again."""
         if self._queue is None or time.monotonic() < self._queue_at_s:
             return
         try:
-            if not self._queue.ensure_running():
+            end = self._queue.ensure_running()
+            if end is None:
                 return
         except StoreFullError:
             self.room.look(now=True)
         else:
             self.room.look(now=True)
             if not self.room.is_full:
-                say("the queue's server had died and was started again; nothing it had accepted is lost")
+                say(f"the queue's server {QUEUE_ENDS[end]} and was started again; nothing it had accepted is lost")
         self._queue_at_s = time.monotonic() + QUEUE_PERIOD_S
 
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:

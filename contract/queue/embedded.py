@@ -14,6 +14,7 @@ import socket
 import tempfile
 import time
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
 
 import redis
@@ -85,6 +86,14 @@ def short_socket_path(folder: Path, name: str) -> Path:
     return short / name
 
 
+class ServerEnd(Enum):
+    """Why a server had to be started again."""
+
+    DIED = auto()
+    WITH_ITS_STARTER = auto()
+    """Another process had started it, such as a backup, and has ended."""
+
+
 class EmbeddedServer:
     """The one server of a data directory. Whoever starts it second shares the one that runs."""
 
@@ -95,7 +104,7 @@ class EmbeddedServer:
         self._socket = short_socket_path(self._folder, "queue.sock")
         self._log = self._folder / "server.log"
         self._server: Supervised | None = None
-        self._owner = self._adopted = False
+        self._owner = self._adopted = self._shared = False
         self._lock = FolderLock(self._folder / "lock")
 
     @property
@@ -130,22 +139,23 @@ class EmbeddedServer:
             self._server.watch()
         self._wait_until_it_answers()
 
-    def ensure_running(self) -> bool:
-        """Start the server again if it has died, or whoever had started it has ended it; True if so. Keeps room for its
-        log. Raises as start()."""
+    def ensure_running(self) -> ServerEnd | None:
+        """Start the server again if it has died, or ended with whoever had started it; which, or None if it runs. Keeps
+        room for its log. Raises as start()."""
         if self._server is not None:
             if self._server.watch() is None:
                 fill_reserve(self._folder)
-                return False
+                return None
             self._wait_until_it_answers()
-            return True
+            return ServerEnd.DIED
         if self._adopted and self._listens():
             fill_reserve(self._folder)
-            return False
+            return None
         if not self._lock.take():  # another process has started it, and still runs
-            return False
+            return None
+        end = ServerEnd.WITH_ITS_STARTER if self._shared else ServerEnd.DIED
         self.start()
-        return not self._adopted
+        return None if self._adopted else end
 
     def stop(self) -> None:
         """End the server that this object has started or adopted; a shared one goes on."""
@@ -170,6 +180,7 @@ class EmbeddedServer:
                 problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
                 raise UnavailableError(problem, f"See {self._log}.")
             time.sleep(0.02)
+        self._shared = not self._owner
         if self._server is not None:
             self._server.mark_healthy()
         if self._owner:

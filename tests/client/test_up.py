@@ -15,7 +15,7 @@ import pytest
 
 from client import up
 from client.up import Installation, check_port, worker_names
-from contract.queue.embedded import EmbeddedServer
+from contract.queue.embedded import EmbeddedServer, ServerEnd
 from contract.queue.installed import installed_queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.exits import ExitCode
@@ -42,11 +42,11 @@ class FailingQueue(EmbeddedServer):
         super().__init__(data_dir)
         self.starts = starts
 
-    def ensure_running(self) -> bool:
+    def ensure_running(self) -> ServerEnd | None:
         error = self.starts.pop(0)
         if error is not None:
             raise error
-        return True
+        return ServerEnd.DIED
 
 
 def child_that_runs(program: str, folder: Path) -> Supervised:
@@ -127,7 +127,9 @@ def test_a_second_launcher_of_a_data_directory_is_refused(tmp_path: Path) -> Non
     other.release()
 
 
-def test_a_launcher_starts_while_a_backup_runs_the_queue_and_has_one_when_the_backup_has_ended(tmp_path: Path) -> None:
+def test_a_launcher_starts_while_a_backup_runs_the_queue_and_has_one_when_the_backup_has_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with ExitStack() as ended:
         with installed_queue(Settings(data_dir=tmp_path)) as queue:
             record = queue.submit(job())
@@ -136,6 +138,9 @@ def test_a_launcher_starts_while_a_backup_runs_the_queue_and_has_one_when_the_ba
         after = RedisQueue(EmbeddedServer(tmp_path).url)
         ended.callback(after.close)
         assert [each.job_id for each in after.records()] == [record.job_id]
+    told = [line for line in capsys.readouterr().err.splitlines() if "the queue's server" in line]
+    assert len(told) == 1
+    assert "ended with the command that had started it, such as a backup" in told[0]
 
 
 def test_a_launcher_that_finds_a_queue_which_ends_just_then_starts_its_own(tmp_path: Path) -> None:
