@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import gc
 import hashlib
 import json
 import shutil
+import weakref
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -486,6 +488,17 @@ def test_nothing_of_the_recording_is_kept_where_that_is_off(clip: Path, tmp_path
     assert json.loads((tmp_path / MANIFEST).read_bytes())["beside"] == {}
     with pytest.raises(InputError, match="keep_recorded"):
         request(clip, keep_recorded="perhaps")
+
+
+def test_a_clip_goes_with_its_job_and_does_not_wait_for_the_garbage_collector(clip: Path, tmp_path: Path) -> None:
+    clips: list[weakref.ref[DepthClip]] = []
+    hooks = TrainingHooks(on_clip=lambda whole: clips.append(weakref.ref(whole)))
+    gc.disable()
+    try:
+        run(clip, tmp_path, hooks, iterations=2)
+        assert [each() for each in clips] == [None]
+    finally:
+        gc.enable()
 
 
 def test_a_run_that_ends_between_its_recorded_frames_and_its_scene_can_be_made_again(

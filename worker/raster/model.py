@@ -83,11 +83,11 @@ class Model(Protocol):
         values: Floats | None = None,
         pause: Callable[[], None] | None = None,
     ) -> Floats:
-        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
+        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites, with pause a copy.
 
         With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
-        called between the parts of a large render, if the device makes it in parts. It may render another size, and
-        end the render by an exception.
+        called between the parts of a large render, if the device makes it in parts. It may render, and end the render
+        by an exception.
         """
         ...
 

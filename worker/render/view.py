@@ -155,11 +155,7 @@ class SceneRenderer:
         camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
         values = self.values(t)
         with self._lock:
-            shown = self._model.render(camera, t, values, pause)
-            image = np.empty(shown.shape, np.float32)
-            for rows in _parts(shown.shape[1:]):
-                image[:, rows] = shown[:, rows]
-                pause()
+            image = self._model.render(camera, t, values, pause)
         return image[:5], None if values is None else image[5]
 
     def seen_from(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:

@@ -92,26 +92,11 @@ class TrainingFrames:
         self._digest: str | None = None
 
     def _frame(self, index: int) -> TrainingFrame:
-        counts = int(self.eye.tissue[index].sum()), int(self._measured(index).sum())
+        counts = int(self.eye.tissue[index].sum()), int(_measured(self.eye, index).sum())
         self.eye.let_go(index)
-        return TrainingFrame(self.cameras[index], float(self.t[index]), partial(self._target, index), *counts)
-
-    def _measured(self, index: int) -> NDArray[np.bool_]:
-        return np.asarray(self.eye.tissue[index] & (self.eye.depth_mm[index] > 0))
-
-    def _target(self, index: int) -> Target:
-        height, width = self.eye.tissue.shape[1:]
-        rgb = np.zeros((3, height, padded(width)), np.uint8)
-        weight, inverse_depth = np.zeros_like(rgb[0]), np.zeros(rgb.shape[1:], np.float32)
-        for plane, channel in zip(rgb, cv2.split(self.eye.rgb[index]), strict=True):
-            plane[:, :width] = channel
-        np.multiply(self.eye.tissue[index].view(np.uint8), np.uint8(255), out=weight[:, :width])
-        inside = inverse_depth[:, :width]  # a division everywhere, then a mask: faster than one where it is asked for
-        np.divide(np.float32(1 / self.scale), np.maximum(self.eye.depth_mm[index], MIN_DEPTH_MM), out=inside)
-        inside *= self._measured(index)
-        if self._lets_go:
-            self.eye.let_go(index)
-        return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())
+        # no method of its own: in a cycle with its frames, the eye's files on disk would outlive the job
+        make_target = partial(_target, self.eye, index, self.scale, self._lets_go)
+        return TrainingFrame(self.cameras[index], float(self.t[index]), make_target, *counts)
 
     def frame(self, index: int) -> TrainingFrame:
         """Frame `index` as a training step needs it, the same object every time."""
@@ -144,3 +129,22 @@ class TrainingFrames:
                 eye.let_go(index)
             self._digest = found.hexdigest()
         return self._digest
+
+
+def _measured(eye: Eye, index: int) -> NDArray[np.bool_]:
+    return np.asarray(eye.tissue[index] & (eye.depth_mm[index] > 0))
+
+
+def _target(eye: Eye, index: int, scale: float, lets_go: bool) -> Target:
+    height, width = eye.tissue.shape[1:]
+    rgb = np.zeros((3, height, padded(width)), np.uint8)
+    weight, inverse_depth = np.zeros_like(rgb[0]), np.zeros(rgb.shape[1:], np.float32)
+    for plane, channel in zip(rgb, cv2.split(eye.rgb[index]), strict=True):
+        plane[:, :width] = channel
+    np.multiply(eye.tissue[index].view(np.uint8), np.uint8(255), out=weight[:, :width])
+    inside = inverse_depth[:, :width]  # a division everywhere, then a mask: faster than one where it is asked for
+    np.divide(np.float32(1 / scale), np.maximum(eye.depth_mm[index], MIN_DEPTH_MM), out=inside)
+    inside *= _measured(eye, index)
+    if lets_go:
+        eye.let_go(index)
+    return Target(rgb.ravel(), weight.ravel(), inverse_depth.ravel())

@@ -233,6 +233,20 @@ def test_sizes_come_and_go_without_changing_a_picture(scene: Scene) -> None:
     np.testing.assert_array_equal(render_frame(scene, 0.2).rgb, first)
 
 
+def test_a_view_of_the_same_size_in_a_pause_changes_nothing(scene: Scene) -> None:
+    renderer, camera = renderer_of(scene), scene.intrinsics.resized(1100, 1000)
+    poses = [orbit_pose(yaw_deg, 0.0) for yaw_deg in (0.0, 10.0)]
+    alone = [renderer.layers(0.5, pose, camera)[0] for pose in poses]
+    in_pauses: list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]] = []
+    shown, _ = renderer.layers(
+        0.5, poses[0], camera, pause=lambda: in_pauses.append(renderer.layers(0.5, poses[1], camera)[0])
+    )
+    np.testing.assert_array_equal(shown, alone[0])
+    assert len(in_pauses) > 3
+    for each in in_pauses:
+        np.testing.assert_array_equal(each, alone[1])
+
+
 def test_a_scene_that_is_dropped_takes_its_renderer_along() -> None:
     scene = random_scene()
     render_frame(scene, 0.0)

@@ -95,13 +95,17 @@ class CpuModel:
         self._seen = np.zeros(columns, np.bool_)
 
     def _rasterizer(self, width: int, height: int) -> Rasterizer:
-        """The buffers of an image size; the few sizes used last are kept."""
-        if (width, height) not in self._rasterizers:
-            self._rasterizers[width, height] = Rasterizer(width, height)
-        self._rasterizers.move_to_end((width, height))
+        """The buffers of an image size."""
+        return self._kept(self._rasterizers.get((width, height)) or Rasterizer(width, height))
+
+    def _kept(self, rasterizer: Rasterizer) -> Rasterizer:
+        """Keep these buffers, and of other sizes the few used last."""
+        size = rasterizer.width, rasterizer.height
+        self._rasterizers[size] = rasterizer
+        self._rasterizers.move_to_end(size)
         while len(self._rasterizers) > SIZES_KEPT:
             self._rasterizers.popitem(last=False)
-        return self._rasterizers[width, height]
+        return rasterizer
 
     @property
     def gradient_norm(self) -> Tensor:
@@ -113,25 +117,25 @@ class CpuModel:
         """[N] whether any of the last step's frames could see each Gaussian."""
         return torch.from_numpy(self._seen[: self.count].copy())
 
-    def project(
-        self, camera: NDArray[np.float64], t: float, sh_degree: int, pause: Callable[[], None] | None = None
-    ) -> None:
+    def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """The Gaussians at time t on this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
-        self._project_state(camera, sh_degree, pause)
+        self._project_state(camera, sh_degree, self._rasterizer(*image_size(camera)))
 
     def _project_state(
-        self, camera: NDArray[np.float64], sh_degree: int, pause: Callable[[], None] | None = None
+        self,
+        camera: NDArray[np.float64],
+        sh_degree: int,
+        rasterizer: Rasterizer,
+        pause: Callable[[], None] | None = None,
     ) -> None:
         """The Gaussians of the state on this camera's image."""
-        self.rasterizer = self._rasterizer(*image_size(camera))
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        rasterizer = self.rasterizer
         rasterizer.project(camera, self.state, self.opacity_logit, self.colour, pause)
-        self.rasterizer = rasterizer  # a pause may have used another
+        self.rasterizer = rasterizer
 
     def render(
         self,
@@ -140,9 +144,19 @@ class CpuModel:
         values: Floats | None = None,
         pause: Callable[[], None] | None = None,
     ) -> Floats:
-        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
-        self.project(camera, t, self.sh_degree, pause)
-        return self.rasterizer.render(values, pause)
+        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites, or
+        with pause a copy."""
+        if pause is None:
+            self.project(camera, t, self.sh_degree)
+            return self.rasterizer.render(values)
+        size = image_size(camera)
+        rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)  # a pause that renders takes other buffers
+        try:
+            self.motion.deform(self.canonical, t, self.state)
+            self._project_state(camera, self.sh_degree, rasterizer, pause)
+            return _copied(rasterizer.render(values, pause), pause)
+        finally:
+            self.rasterizer = self._kept(rasterizer)
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""
@@ -196,7 +210,7 @@ class CpuModel:
         self.motion.deform(self.canonical, t, self.state, trains=True)
         for k, frame in enumerate(frames):
             adds, adds_state = place + k > 0, k > 0
-            self._project_state(frame.camera, sh_degree)
+            self._project_state(frame.camera, sh_degree, self._rasterizer(*image_size(frame.camera)))
             self.rasterizer.loss_backward(
                 frame.target, frame.loss_settings(loss), gradients, adds=adds, adds_state=adds_state
             )
@@ -293,3 +307,12 @@ def _flat(array: Floats) -> Floats:
     if not array.flags.c_contiguous:
         raise ValueError(f"an array of shape {array.shape} and strides {array.strides} has no flat view")
     return array.reshape(-1)
+
+
+def _copied(planes: Floats, pause: Callable[[], None]) -> Floats:
+    """A copy of [P, H, W]; pause is called after each plane."""
+    copy = np.empty(planes.shape, np.float32)
+    for to, plane in zip(copy, planes, strict=True):
+        to[:] = plane
+        pause()
+    return copy
