@@ -73,8 +73,8 @@ def _rotate(options: argparse.Namespace) -> int:
     keys, expires_at_s = _own_keys(options), _expires_at_s(options)
     ends_at_s = _until("--overlap", options.overlap)
     old = keys.get(options.key_id).ending(ends_at_s)
-    new, text = old.successor(expires_at_s)
-    how = f" (followed by {new.key_id}, ends {utc_text(old.refused_from_s or ends_at_s)})"
+    new, text = keys.successor(options.key_id, expires_at_s)
+    how = f" (followed by {new.key_id}, ends {utc_text(old.expires_at_s or ends_at_s)})"
     with _recorded(options, (AuditAction.KEY_CREATED, new, ""), (AuditAction.KEY_ROTATED, old, how)):
         old = keys.rotate(old.key_id, new, ends_at_s)
         _show(new, text)
@@ -173,8 +173,8 @@ def _expires_at_s(options: argparse.Namespace) -> float | None:
 def _line(key: ApiKey) -> str:
     created = utc_text(key.created_at_s)[: len("2026-01-31")]
     expires = "never expires"
-    if key.refused_from_s is not None:
+    if key.expires_at_s is not None:
         word = "expired" if key.has_expired(time.time()) else "expires"
-        expires = f"{word} {utc_text(key.refused_from_s)}"
+        expires = f"{word} {utc_text(key.expires_at_s)}"
     scopes = ",".join(sorted(key.scopes))
     return f"{key.key_id}  {key.tenant}  {scopes}  {created}  {expires}  {key.label or ''}".rstrip()

@@ -111,7 +111,7 @@ class Access:
         if key is None:
             self._wrong_keys.admit(address)
             raise Refusal(401, "This key is not known.", KEY_REMEDY, address=address)
-        caller = Caller(key.tenant, key.scopes, key.key_id, address, key.refused_from_s)
+        caller = Caller(key.tenant, key.scopes, key.key_id, address, key.expires_at_s)
         if key.has_expired(time.time()):
             detail, code = "This key has expired.", ErrorCode.KEY_EXPIRED
             raise Refusal(401, detail, EXPIRED_REMEDY, address=address, caller=caller, code=code)

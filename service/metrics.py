@@ -14,7 +14,7 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from contract.access.keys import KeyFile, expiring_keys
+from contract.access.keys import KeyFile
 from contract.queue.interface import Queue
 from contract.runtime import traces
 from contract.runtime.version import version
@@ -138,7 +138,7 @@ class _KeyCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """How many expire within 14 days; nothing while the file cannot be read."""
         with contextlib.suppress(UnavailableError):
-            number = len(expiring_keys(self._keys.list(), time.time()))
+            number = len(self._keys.expiring(time.time()))
             yield GaugeMetricFamily("intrasplat_keys_expiring", "Keys that expire within 14 days.", number)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from contract.access.keys import KeyFile, expiring_keys
+from contract.access.keys import KeyFile
 from contract.queue.embedded import find_server
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import GIB, Settings
@@ -101,10 +101,10 @@ def format_findings(findings: list[Finding]) -> str:
 
 def _keys(settings: Settings) -> list[Finding]:
     try:
-        keys = KeyFile(settings.data_dir).list()
+        file = KeyFile(settings.data_dir)
+        keys, soon = file.list(), file.expiring(time.time())
     except UnavailableError as error:
         return [Finding("keys", error.problem, error.remedy, blocks=True)]
-    soon = expiring_keys(keys, time.time())
     found = f"{len(keys)}, {len(soon)} of which expire within 14 days"
     names = ", ".join(key.key_id for key in soon)
     return [Finding("keys", found, f"intrasplat keys rotate: {names}" if soon else None)] if keys else []

@@ -3,6 +3,9 @@
 A key reads isp_<id>_<secret>. The id names it in lists, logs and the audit. The secret is 256 random bits, and the file
 holds only its SHA-256 (no salt and no slow hash, because nobody can guess 256 bits). The file is replaced whole. Every
 service reads it again when it has changed, and so refuses a revoked key at once. A key may expire.
+
+Earlier versions refuse a file with a field that they do not know, and so let nobody in. What a later one must keep
+beyond the fields of ApiKey goes into a file beside it: which keys were rotated is in keys.rotated.json.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import hashlib
 import hmac
 import secrets
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Literal
@@ -27,6 +30,7 @@ from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TENANT_PATTERN
 
 KEYS_FILE = "keys.json"
+ROTATED_FILE = "keys.rotated.json"
 KEY_PREFIX = "isp"
 SECRET_BYTES = 32
 MAX_LABEL_CHARACTERS = 60
@@ -69,32 +73,15 @@ class ApiKey(BaseModel):
     created_at_s: float
     label: str | None = Field(default=None, max_length=MAX_LABEL_CHARACTERS)
     expires_at_s: float | None = Field(default=None, gt=0, lt=1e11, allow_inf_nan=False)
-    """Until then it was made to last, UNIX time; None: for ever."""
-    ends_at_s: float | None = Field(default=None, gt=0, lt=1e11, allow_inf_nan=False)
-    """Until then it lasts at most, because it has a successor; None: it has none."""
-
-    @property
-    def refused_from_s(self) -> float | None:
-        """The UNIX time from which on it is refused; None: never."""
-        return min((at_s for at_s in (self.expires_at_s, self.ends_at_s) if at_s is not None), default=None)
+    """From then on it is refused, UNIX time; None: never."""
 
     def has_expired(self, now_s: float) -> bool:
         """Whether it is refused at that UNIX time."""
-        return self.refused_from_s is not None and self.refused_from_s <= now_s
+        return self.expires_at_s is not None and self.expires_at_s <= now_s
 
     def ending(self, at_s: float) -> ApiKey:
-        """The same key, which ends at that UNIX time at the latest."""
-        return self.model_copy(update={"ends_at_s": min(at_s, self.ends_at_s or at_s)})
-
-    def successor(self, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
-        """A new key with this one's tenant, scopes and label, and its text.
-
-        Args:
-            expires_at_s: of the new key; None: it lasts as long as this one was made to last.
-        """
-        if self.expires_at_s is not None:
-            expires_at_s = expires_at_s or time.time() + self.expires_at_s - self.created_at_s
-        return new_key(self.tenant, self.scopes, self.label, expires_at_s)
+        """The same key, which expires at that UNIX time at the latest."""
+        return self.model_copy(update={"expires_at_s": min(at_s, self.expires_at_s or at_s)})
 
 
 def new_key(
@@ -135,11 +122,30 @@ class _Stored(BaseModel):
     keys: tuple[ApiKey, ...] = ()
 
 
+class _Rotated(BaseModel):
+    """A key that was rotated. successor: the id of the newest. made_until_s: it was made to last until then, UNIX time;
+    None: for ever."""
+
+    model_config = ConfigDict(frozen=True)
+
+    successor: str
+    made_until_s: float | None
+
+
+class _RotatedKeys(BaseModel):
+    """The file beside, by the ids of keys. Without it, a rotated key counts as one that was made to end so early."""
+
+    model_config = ConfigDict(frozen=True)
+
+    keys: dict[str, _Rotated] = {}
+
+
 class KeyFile:
     """The keys of one data directory. If the file cannot be read, no key is accepted."""
 
     def __init__(self, data_dir: Path) -> None:
         self._path = data_dir.expanduser() / KEYS_FILE
+        self._rotated_path = data_dir.expanduser() / ROTATED_FILE
         self._seen: tuple[int, int, int] | None = None
         self._by_id: dict[str, ApiKey] = {}
 
@@ -164,6 +170,22 @@ class KeyFile:
         with self._changing() as keys:
             self._write((*keys, key))
 
+    def successor(self, key_id: str, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
+        """A new key with that one's tenant, scopes and label, which no file holds yet, and its text.
+
+        Args:
+            expires_at_s: of the new key; None: it lasts as long as that one was made to last.
+
+        Raises:
+            InputError: no key has that id.
+            UnavailableError: a file is damaged.
+        """
+        key = self.get(key_id)
+        until_s = self._made_until_s(key)
+        if until_s is not None:
+            expires_at_s = expires_at_s or time.time() + until_s - key.created_at_s
+        return new_key(key.tenant, key.scopes, key.label, expires_at_s)
+
     def rotate(self, key_id: str, successor: ApiKey, ends_at_s: float) -> ApiKey:
         """Accept the successor of a key, and let that key end at that UNIX time, unless it does so before: both or
         neither. Returns the key that ends.
@@ -173,7 +195,12 @@ class KeyFile:
             UnavailableError: as add().
         """
         with self._changing() as keys:
-            ending = self.get(key_id).ending(ends_at_s)
+            key = self.get(key_id)
+            ending = key.ending(ends_at_s)
+            rotated = _Rotated(successor=successor.key_id, made_until_s=self._made_until_s(key))
+            by_id = {each: kept for each, kept in self._rotated().items() if each in self._by_id} | {key_id: rotated}
+            # First, because a note of a successor that is not there says nothing.
+            replace_file(self._rotated_path, _RotatedKeys(keys=by_id).model_dump_json(indent=1).encode())
             self._write((*(ending if key.key_id == key_id else key for key in keys), successor))
         return ending
 
@@ -210,6 +237,20 @@ class KeyFile:
             self._write(tuple(key for key in keys if key != revoked))
         return revoked
 
+    def expiring(self, now_s: float) -> list[ApiKey]:
+        """The keys without a successor that expire within WARN_BEFORE_S after that UNIX time, and have not yet.
+
+        Raises:
+            UnavailableError: the file is damaged.
+        """
+        keys, rotated = self.list(), {}
+        with contextlib.suppress(UnavailableError):  # rather too many are told
+            rotated = self._rotated()
+        there = {key.key_id for key in keys}
+        followed = {key_id for key_id, each in rotated.items() if each.successor in there}
+        lasting = (key for key in keys if key.key_id not in followed and not key.has_expired(now_s))
+        return [key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S)]
+
     def find(self, text: str) -> ApiKey | None:
         """The key that this text belongs to, be it expired; None if there is none. Costs one stat and one hash.
 
@@ -241,6 +282,20 @@ class KeyFile:
                 raise self._damaged(error) from error
             self._seen, self._by_id = seen, {key.key_id: key for key in stored.keys}
 
+    def _rotated(self) -> dict[str, _Rotated]:
+        try:
+            return _RotatedKeys.model_validate_json(self._rotated_path.read_bytes()).keys
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValidationError) as error:
+            problem = f"{self._rotated_path} cannot be read ({type(error).__name__})."
+            remedy = "Restore or remove it; without it, give the successors of rotated keys --expires yourself."
+            raise UnavailableError(problem, remedy) from error
+
+    def _made_until_s(self, key: ApiKey) -> float | None:
+        rotated = self._rotated().get(key.key_id)
+        return key.expires_at_s if rotated is None else rotated.made_until_s
+
     def _damaged(self, error: Exception) -> UnavailableError:
         self._seen, self._by_id = None, {}
         problem = f"{self._path.name} cannot be read ({type(error).__name__}); no key is accepted."
@@ -256,12 +311,6 @@ class KeyFile:
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:
         replace_file(self._path, _Stored(keys=keys).model_dump_json(indent=1, exclude_none=True).encode())
-
-
-def expiring_keys(keys: Iterable[ApiKey], now_s: float) -> list[ApiKey]:
-    """Those without a successor that expire within WARN_BEFORE_S after that UNIX time, and have not yet."""
-    lasting = (key for key in keys if key.ends_at_s is None and not key.has_expired(now_s))
-    return [key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S)]
 
 
 def needs_keys(settings: Settings) -> bool:

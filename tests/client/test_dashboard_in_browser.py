@@ -354,7 +354,7 @@ def test_a_key_that_expires_while_it_is_used_and_one_that_has_are_told_so(
         page.find("#key-text").send_keys(text, Keys.ENTER)
         page.press(scene, "View")
         page.until_state("live")
-        keys.rotate(key.key_id, key.successor()[0], time.time())
+        keys.rotate(key.key_id, keys.successor(key.key_id)[0], time.time())
         page.until_text("#key-message", "This key has expired. Ask for a new one.")
         page.click("#forget-key")
         page.until_text("#key-message", "A key is needed.")

@@ -93,9 +93,11 @@ def change_and_be_killed(folder: Path, arguments: list[str], after_it: bool) -> 
     rename = Path.rename
 
     def rename_and_die(source: Path, target: Path) -> Path:
-        if after_it:
+        if after_it or target.name != KEYS_FILE:
             rename(source, target)
-        os._exit(9)
+        if target.name == KEYS_FILE:
+            os._exit(9)
+        return target
 
     Path.rename = rename_and_die  # type: ignore[assignment, method-assign]
     change(folder, arguments)
@@ -119,7 +121,7 @@ def test_of_a_change_that_was_killed_the_audit_says_that_it_was_begun_and_it_is_
     if not after_it:
         assert keys == (before,)
     else:
-        changed = {(each.key_id, each.ends_at_s is not None) for each in keys} ^ {(before.key_id, False)}
+        changed = {(each.key_id, each.expires_at_s is not None) for each in keys} ^ {(before.key_id, False)}
         assert {key_id for key_id, _ in changed} == {key_id for _, key_id, _ in told}
     assert main(["keys", "create", "--tenant", "ward-5", "--data-dir", str(tmp_path)]) == ExitCode.OK
 
@@ -168,8 +170,8 @@ def test_a_key_is_made_to_expire_and_rotated_and_the_list_and_the_audit_tell(
     ending, new = KeyFile(tmp_path).find(old_text), KeyFile(tmp_path).find(text)
     assert ending is not None
     assert new is not None
-    ends, expires = (key.refused_from_s or 0.0 for key in (ending, new))
-    assert ends + 80 * DAY_S < expires < (old.refused_from_s or 0.0)
+    ends, expires = (key.expires_at_s or 0.0 for key in (ending, new))
+    assert ends + 80 * DAY_S < expires < (old.expires_at_s or 0.0)
     main(["keys", "list", *where])
     assert all("  expires 20" in line for line in capsys.readouterr().out.splitlines())
     how = f" (followed by {new.key_id}, ends {utc_text(ends)})"

@@ -221,9 +221,9 @@ def test_a_key_that_has_expired_is_refused_and_only_its_holder_hears_why(open_se
     keys = KeyFile(open_service.store.data_dir)
     (key,) = keys.list()
     assert holder.request("GET", "/key").json()["expires_at"] is None
-    keys.rotate(key.key_id, key.successor()[0], 4e9)
+    keys.rotate(key.key_id, keys.successor(key.key_id)[0], 4e9)
     assert holder.request("GET", "/key").json()["expires_at"] == "2096-10-02T07:06:40+00:00"
-    keys.rotate(key.key_id, key.successor()[0], time.time())
+    keys.rotate(key.key_id, keys.successor(key.key_id)[0], time.time())
     problem = assert_problem(holder.request("GET", "/jobs"), 401, "Authorization")
     assert problem["code"] == ErrorCode.KEY_EXPIRED
     guessed = open_service.http.get("/jobs", headers={"X-API-Key": f"isp_{key.key_id}_{'0' * 64}"})

@@ -305,7 +305,7 @@ def test_a_wrong_key_or_one_that_may_not_see_is_refused_before_the_handshake(gua
 
 
 def rotate_at_once(keys: KeyFile, key_id: str) -> None:
-    keys.rotate(key_id, keys.get(key_id).successor()[0], time.time())
+    keys.rotate(key_id, keys.successor(key_id)[0], time.time())
 
 
 @pytest.mark.parametrize("end", [KeyFile.revoke, rotate_at_once])

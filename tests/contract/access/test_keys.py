@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import pytest
 from contract.access.keys import (
     DAY_S,
     KEYS_FILE,
+    ROTATED_FILE,
     WARN_BEFORE_S,
     KeyFile,
     KeyScope,
     check_keys,
-    expiring_keys,
 )
 from contract.runtime.settings import Settings
 from contract.wire.errors import InputError, UnavailableError
@@ -128,20 +129,20 @@ def test_a_key_expires_at_its_time_and_old_files_are_read_and_new_ones_stay_read
     assert keys.find(text) == ending
     assert [key.has_expired(2e9 - 1) for key in (lasting, ending)] == [False, False]
     assert [key.has_expired(2e9) for key in (lasting, ending)] == [False, True]
-    assert expiring_keys(keys.list(), 2e9 - WARN_BEFORE_S) == [ending]
-    assert expiring_keys(keys.list(), 2e9 - WARN_BEFORE_S - 1) == expiring_keys(keys.list(), 2e9) == []
+    assert keys.expiring(2e9 - WARN_BEFORE_S) == [ending]
+    assert keys.expiring(2e9 - WARN_BEFORE_S - 1) == keys.expiring(2e9) == []
 
 
 def test_a_successor_is_like_the_key_before_and_lasts_as_long_which_ends_after_the_overlap(tmp_path: Path) -> None:
     keys = KeyFile(tmp_path)
     old, old_text = keys.create("ward-3", {KeyScope.VIEW}, "theatre 2", time.time() + 1000.0)
-    new, text = old.successor()
+    new, text = keys.successor(old.key_id)
     ending = keys.rotate(old.key_id, new, time.time() + 10.0)
     assert keys.find(old_text) == ending
-    assert (ending.refused_from_s or 0.0) < (old.refused_from_s or 0.0) <= (new.refused_from_s or 0.0)
+    assert (ending.expires_at_s or 0.0) < (old.expires_at_s or 0.0) <= (new.expires_at_s or 0.0)
     assert (new.tenant, new.scopes, new.label) == (old.tenant, old.scopes, old.label)
     assert keys.find(text) == new
-    assert keys.rotate(old.key_id, old.successor()[0], 3e9) == ending
+    assert keys.rotate(old.key_id, keys.successor(old.key_id)[0], 3e9) == ending
     with pytest.raises(InputError, match="no key"):
         keys.rotate("000000000000", new, 3e9)
 
@@ -153,15 +154,50 @@ def test_whoever_rotates_a_key_twice_gets_two_keys_that_last_as_long_as_it_was_m
     keys = KeyFile(tmp_path)
     key, _ = keys.create("ward-3", expires_at_s=lasts_s and time.time() + lasts_s)
     for _ in range(2):
-        new, _ = keys.get(key.key_id).successor()
+        new, _ = keys.successor(key.key_id)
         keys.rotate(key.key_id, new, time.time() + DAY_S)
-        lasting_s = new.refused_from_s and new.refused_from_s - new.created_at_s
+        lasting_s = new.expires_at_s and new.expires_at_s - new.created_at_s
         assert lasting_s == (lasts_s and pytest.approx(lasts_s, abs=60.0))
 
 
 def test_a_key_that_has_a_successor_is_not_among_those_to_be_rotated(tmp_path: Path) -> None:
     keys, soon_s = KeyFile(tmp_path), time.time() + DAY_S
     old, _ = keys.create("ward-3", expires_at_s=soon_s)
-    assert expiring_keys(keys.list(), time.time()) == [old]
-    keys.rotate(old.key_id, old.successor(soon_s + WARN_BEFORE_S)[0], soon_s)
-    assert expiring_keys(keys.list(), time.time()) == []
+    assert keys.expiring(time.time()) == [old]
+    keys.rotate(old.key_id, keys.successor(old.key_id, soon_s + WARN_BEFORE_S)[0], soon_s)
+    assert keys.expiring(time.time()) == []
+
+
+def test_the_file_of_keys_has_no_field_that_an_earlier_version_refuses(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    lasting, _ = keys.create("a", label="theatre 2")
+    for key in (lasting, keys.create("b", expires_at_s=2e9)[0]):
+        keys.rotate(key.key_id, keys.successor(key.key_id)[0], 1e9)
+    stored = json.loads((tmp_path / KEYS_FILE).read_text())
+    assert stored.keys() == {"version", "keys"}
+    earlier = {"key_id", "tenant", "scopes", "secret_sha256", "created_at_s", "label", "expires_at_s"}
+    assert set().union(*stored["keys"]) == earlier
+    assert [key.get("expires_at_s") for key in stored["keys"][:2]] == [1e9, 1e9]  # what an earlier version goes by
+
+
+def test_a_note_of_rotated_keys_that_is_lost_or_damaged_lets_no_key_last_longer(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    key, text = keys.create("ward-3")
+    keys.rotate(key.key_id, keys.successor(key.key_id)[0], time.time() + DAY_S)
+    assert keys.expiring(time.time()) == []
+    (tmp_path / ROTATED_FILE).write_text("{")
+    assert keys.expiring(time.time()) == [keys.find(text)]
+    with pytest.raises(UnavailableError, match=f"{ROTATED_FILE} cannot be read.*--expires"):
+        keys.successor(key.key_id)
+    (tmp_path / ROTATED_FILE).unlink()
+    assert (keys.successor(key.key_id)[0].expires_at_s or 0.0) < time.time() + 2 * DAY_S
+
+
+def test_a_key_whose_successor_was_revoked_is_to_be_rotated_again_and_the_next_lasts_as_it_did(tmp_path: Path) -> None:
+    keys = KeyFile(tmp_path)
+    key, _ = keys.create("ward-3")
+    lost, _ = keys.successor(key.key_id)
+    ending = keys.rotate(key.key_id, lost, time.time() + DAY_S)
+    keys.revoke(lost.key_id)
+    assert keys.expiring(time.time()) == [ending]
+    assert keys.successor(key.key_id)[0].expires_at_s is None
