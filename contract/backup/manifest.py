@@ -4,7 +4,7 @@
     ├── .lock                       held while a backup is written
     ├── .unfinished-<time>/         a backup that was cut off, or is being written; the next one removes it
     └── 2026-11-24T132055.120Z/
-        ├── spool/ scenes/ unscored/ purging/ keys.json keys.rotated.json audit.jsonl audit.head    as in the data directory
+        ├── spool/ scenes/ unscored/ purging/ keys.json keys.rotated.json audit.jsonl audit.head: as in a data directory
         ├── jobs.jsonl              a JobRecord a line: ended jobs, then live ones in the order in which they are to run
         └── backup.json             the manifest: size, SHA-256 and time of change of each other file
 
