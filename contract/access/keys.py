@@ -237,7 +237,7 @@ class KeyFile:
             self._write(tuple(key for key in keys if key != revoked))
         return revoked
 
-    def expiring(self, now_s: float) -> list[ApiKey]:
+    def expiring(self, now_s: float) -> tuple[ApiKey, ...]:
         """The keys without a successor that expire within WARN_BEFORE_S after that UNIX time, and have not yet.
 
         Raises:
@@ -249,7 +249,7 @@ class KeyFile:
         there = {key.key_id for key in keys}
         followed = {key_id for key_id, each in rotated.items() if each.successor in there}
         lasting = (key for key in keys if key.key_id not in followed and not key.has_expired(now_s))
-        return [key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S)]
+        return tuple(key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S))
 
     def find(self, text: str) -> ApiKey | None:
         """The key that this text belongs to, be it expired; None if there is none. Costs one stat and one hash.

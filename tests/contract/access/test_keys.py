@@ -129,8 +129,8 @@ def test_a_key_expires_at_its_time_and_old_files_are_read_and_new_ones_stay_read
     assert keys.find(text) == ending
     assert [key.has_expired(2e9 - 1) for key in (lasting, ending)] == [False, False]
     assert [key.has_expired(2e9) for key in (lasting, ending)] == [False, True]
-    assert keys.expiring(2e9 - WARN_BEFORE_S) == [ending]
-    assert keys.expiring(2e9 - WARN_BEFORE_S - 1) == keys.expiring(2e9) == []
+    assert keys.expiring(2e9 - WARN_BEFORE_S) == (ending,)
+    assert keys.expiring(2e9 - WARN_BEFORE_S - 1) == keys.expiring(2e9) == ()
 
 
 def test_a_successor_is_like_the_key_before_and_lasts_as_long_which_ends_after_the_overlap(tmp_path: Path) -> None:
@@ -163,9 +163,9 @@ def test_whoever_rotates_a_key_twice_gets_two_keys_that_last_as_long_as_it_was_m
 def test_a_key_that_has_a_successor_is_not_among_those_to_be_rotated(tmp_path: Path) -> None:
     keys, soon_s = KeyFile(tmp_path), time.time() + DAY_S
     old, _ = keys.create("ward-3", expires_at_s=soon_s)
-    assert keys.expiring(time.time()) == [old]
+    assert keys.expiring(time.time()) == (old,)
     keys.rotate(old.key_id, keys.successor(old.key_id, soon_s + WARN_BEFORE_S)[0], soon_s)
-    assert keys.expiring(time.time()) == []
+    assert keys.expiring(time.time()) == ()
 
 
 def test_the_file_of_keys_has_no_field_that_an_earlier_version_refuses(tmp_path: Path) -> None:
@@ -184,9 +184,9 @@ def test_a_note_of_rotated_keys_that_is_lost_or_damaged_lets_no_key_last_longer(
     keys = KeyFile(tmp_path)
     key, text = keys.create("ward-3")
     keys.rotate(key.key_id, keys.successor(key.key_id)[0], time.time() + DAY_S)
-    assert keys.expiring(time.time()) == []
+    assert keys.expiring(time.time()) == ()
     (tmp_path / ROTATED_FILE).write_text("{")
-    assert keys.expiring(time.time()) == [keys.find(text)]
+    assert keys.expiring(time.time()) == (keys.find(text),)
     with pytest.raises(UnavailableError, match=f"{ROTATED_FILE} cannot be read.*--expires"):
         keys.successor(key.key_id)
     (tmp_path / ROTATED_FILE).unlink()
@@ -199,5 +199,5 @@ def test_a_key_whose_successor_was_revoked_is_to_be_rotated_again_and_the_next_l
     lost, _ = keys.successor(key.key_id)
     ending = keys.rotate(key.key_id, lost, time.time() + DAY_S)
     keys.revoke(lost.key_id)
-    assert keys.expiring(time.time()) == [ending]
+    assert keys.expiring(time.time()) == (ending,)
     assert keys.successor(key.key_id)[0].expires_at_s is None
