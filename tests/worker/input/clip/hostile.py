@@ -236,6 +236,14 @@ CORPUS: dict[str, Hostile] = {
         "nested 100000 levels",
         part="calibration",
     ),
+    "deep behind keys": Hostile("calibration.json", fixed(b'{"a}":' * 20_000), "not valid JSON", part="calibration"),
+    "deep behind comments": Hostile(
+        "calibration.xml",
+        fixed(_CUT_XML + b"<a><!--</-->" * 9_000 + b"</a><!--<-->" * 9_000 + b"</opencv_storage>"),
+        "left_k has 1 numbers",
+        "decoding",
+        "calibration",
+    ),
     "not a number": Hostile("calibration.json", fixed(calibration(fx_px="NaN")), "finite number", part="calibration"),
     "beyond all numbers": Hostile(
         "calibration.json", fixed(calibration(baseline_mm="1e999")), "finite number", part="calibration"
