@@ -26,6 +26,9 @@ LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
 SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
+MAX_SHOWN = 80
+"""Characters of a caller's own text that an answer repeats, such as a key that is no field."""
+
 TITLES = {
     400: "The request cannot be understood",
     401: "A key is needed",
@@ -67,7 +70,7 @@ class Problem(Exception):
         super().__init__(detail)
         self.status = status
         self.detail = detail
-        self.field = field
+        self.field = None if field is None else field[:MAX_SHOWN]
         self.remedy = remedy
         self.headers = dict(headers or {})
         self.extensions = dict(extensions or {})
@@ -162,7 +165,7 @@ def _problem_of_validation(error: RequestValidationError) -> Problem:
     first = error.errors()[0]
     if first["type"] == "json_invalid":
         return Problem(400, "The body is not JSON.", field="body", remedy=API_REMEDY)
-    given = "" if first["type"] == "missing" else f" (given: {str(first.get('input'))[:80]!r})"
+    given = "" if first["type"] == "missing" else f" (given: {str(first.get('input'))[:MAX_SHOWN]!r})"
     place = [str(each) for each in first["loc"] if each != "[key]"]  # pydantic's sign for the key itself
     return Problem(422, f"{first['msg']}{given}.", field=".".join(place[1:] or place), remedy=API_REMEDY)
 

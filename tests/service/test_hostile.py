@@ -55,7 +55,7 @@ def test_what_only_decoding_shows_fails_its_job_and_the_worker_takes_the_next(tm
     assert list((tmp_path / "data" / "scenes").iterdir()) == []
 
 
-DEEP, BUDGET = "[" * 99_999, "options.budget_s"
+DEEP, BUDGET, ENDLESS = "[" * 99_999, "options.budget_s", "k" * 5_000
 REQUESTS: dict[str, tuple[str, str, dict[str, Any], int, str | None]] = {
     "deep options": ("POST", "/reconstruct", sent(options=f'{{"preset": {DEEP}'), 413, "options"),
     "options nested as deep as they are long": ("POST", "/reconstruct", sent(options="[" * 9_000), 422, "options"),
@@ -67,6 +67,15 @@ REQUESTS: dict[str, tuple[str, str, dict[str, Any], int, str | None]] = {
         400,
         "body",
     ),
+    "a body whose key is endless": ("POST", "/reconstruct", {"json": {ENDLESS: 1}}, 422, "k" * 80),
+    "options whose key is endless": (
+        "POST",
+        "/reconstruct",
+        sent(options=f'{{"{ENDLESS}": 1}}'),
+        422,
+        ("options." + "k" * 80)[:80],
+    ),
+    "labels whose key is endless": ("PATCH", "/jobs/x", {"json": {ENDLESS: 1}}, 422, "k" * 80),
     "a budget that is no number": ("POST", "/reconstruct", sent(options='{"budget_s": NaN}'), 422, BUDGET),
     "a budget beyond all numbers": (
         "POST",
