@@ -116,7 +116,7 @@ evaluate: setup ## every preset on every clip, and the charts; takes hours, and 
 	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
 	@$(BIN)/python -m benchmarks.pages
 
-table1: setup ## the systems of the paper's table 1, a minute each first, then half an hour; takes days, and resumes (TABLE_CLIPS=...)
+table1: setup ## the systems of the paper's table 1, a minute each first, then rivals half an hour, presets as they are; takes days, and resumes (TABLE_CLIPS=...)
 	@$(EVALUATE) $(TABLE_CLIPS) --series table1 --budget-s 60 --out docs/results
 	@$(EVALUATE) $(TABLE_CLIPS) --series table1 --out docs/results
 	@$(BIN)/python -m benchmarks.pages

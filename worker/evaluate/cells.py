@@ -200,7 +200,7 @@ def _read(series: str) -> tuple[str, Preset]:
     """A series' canonical name, with its changes in alphabetical order, and its preset. Raises as preset_of."""
     name = preset_name_of(series)
     if is_rival_system(series):
-        problem = f"{series!r} is no preset: it is trained by `intrasplat evaluate` alone."
+        problem = f"{series!r} is no preset: `intrasplat evaluate` and `stability` alone train it."
         raise InputError("--series", problem, f"Use one of: {', '.join(PRESETS)}.")
     preset = preset_named(name)
     values: dict[str, Any] = {}
