@@ -1,7 +1,7 @@
-"""How deep a text file seems to nest, told without a parser: parsers of JSON, YAML and XML call themselves for every level.
+"""How deep a text file seems to nest, told without a parser: those of JSON, YAML and XML call themselves for every level.
 
-What hides its levels from this passes it, and the parsers have to bear that: json raises RecursionError, and OpenCV reads
-in the process that decodes clips, whose death fails one job.
+What hides its levels passes, and the parsers have to bear it: json raises RecursionError, and OpenCV reads in the
+process that decodes clips, whose death fails one job.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ MAX_COUNTED = 100
 def nesting(text: str) -> int:
     """The levels of JSON, YAML and XML in a text by its signs: brackets, open tags, keys and dashes in one line.
 
-    No bound: signs in strings and in comments count as others, so they may open levels that are none and close some that
-    are. Levels that YAML tells by indentation are not counted: a file of a megabyte cannot have many.
+    No bound: signs in strings and in comments count as others do, so they may open levels that are none, and close some
+    that are. Levels that YAML tells by indentation are not counted: a file of a megabyte cannot have many.
     """
     data = text.encode("ascii", "replace")
     deepest = max(_of_pairs(data.translate(_SQUARE, _OTHERS)), _of_tags(data))
