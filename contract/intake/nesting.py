@@ -1,4 +1,4 @@
-"""How deep a text file seems to nest, told without a parser: those of JSON, YAML and XML call themselves for every level.
+"""How deep a text seems to nest, told without a parser: those of JSON, YAML and XML call themselves for every level.
 
 What hides its levels passes, and the parsers have to bear it: json raises RecursionError, and OpenCV reads in the
 process that decodes clips, whose death fails one job.
