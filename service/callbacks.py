@@ -10,6 +10,8 @@ from __future__ import annotations
 import asyncio
 import re
 import socket
+from concurrent.futures import Executor
+from functools import partial
 from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
 
 import httpx
@@ -54,13 +56,16 @@ def is_allowed(url: str, settings: Settings) -> bool:
     return _origin(url) in {_origin(each) for each in named}
 
 
-async def permitted_addresses(host: str, settings: Settings) -> list[str]:
+async def permitted_addresses(host: str, settings: Settings, threads: Executor | None = None) -> list[str]:
     """The addresses of a host that may be connected to, in the resolver's order.
+
+    threads: where the resolver is asked; a look-up that is cancelled keeps its thread until the resolver answers.
 
     Raises:
         OSError, UnicodeError: the name means nothing.
     """
-    found = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    ask = partial(socket.getaddrinfo, host, None, type=socket.SOCK_STREAM)
+    found = await asyncio.get_running_loop().run_in_executor(threads, ask)
     addresses = dict.fromkeys(str(each[4][0]) for each in found)
     return [address for address in addresses if _is_permitted(address, settings.webhook_private == "yes")]
 

@@ -14,10 +14,12 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 
 import httpx
+from anyio import CapacityLimiter, to_thread
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.webhook_secrets import signature, tenant_secret
@@ -33,6 +35,8 @@ from service.callbacks import is_allowed, permitted_addresses
 LOOK_PERIOD_S = 0.5
 MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
 """Tries under way at a time, in all and of one tenant: a receiver that does not answer holds one for TRY_S."""
+MAX_CALLS = 8
+"""Calls of the queue at a time: requests wait for threads of their own while the queue is away."""
 TRY_S = 10.0
 """How long one try may take, from looking up the name to the head of the answer."""
 CONNECT_S = 4.0
@@ -62,6 +66,8 @@ class Webhooks:
         self._is_away = False
         self._under_way: Counter[str] = Counter()
         """By tenant."""
+        self._threads = CapacityLimiter(MAX_CALLS)
+        self._look_ups = ThreadPoolExecutor(MAX_AT_ONCE, thread_name_prefix="look-ups")
 
     async def run(self) -> None:
         """Deliver whatever is due, until cancelled."""
@@ -79,7 +85,7 @@ class Webhooks:
                 loan = None
                 if self._under_way.total() < MAX_AT_ONCE:
                     full = [tenant for tenant, count in self._under_way.items() if count >= MAX_OF_TENANT]
-                    loan = await run_in_threadpool(self._lent, full)
+                    loan = await to_thread.run_sync(self._lent, full, limiter=self._threads)
                 if loan is None:
                     await asyncio.sleep(LOOK_PERIOD_S)
                 else:
@@ -135,7 +141,7 @@ class Webhooks:
         _log(delivery)
         wait_s = wait_after(len(delivery.tries)) if delivery.status is DeliveryStatus.OWED else None
         try:
-            await run_in_threadpool(self._queue.note_try, loan, delivery, wait_s)
+            await to_thread.run_sync(self._queue.note_try, loan, delivery, wait_s, limiter=self._threads)
         except UnavailableError as error:  # the loan runs out, and the webhook is sent once more
             logger.warning("what became of a webhook is not noted: %s", error.problem, extra=_about(delivery))
 
@@ -150,7 +156,7 @@ class Webhooks:
             raise TryFailed(TryFailure.HOST_REFUSED)
         url = httpx.URL(loan.url)
         try:
-            addresses = await permitted_addresses(_host_of(url), self._settings)
+            addresses = await permitted_addresses(_host_of(url), self._settings, self._look_ups)
         except (OSError, UnicodeError):
             raise TryFailed(TryFailure.UNREACHABLE) from None
         if not addresses:

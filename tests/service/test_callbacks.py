@@ -6,6 +6,7 @@ import asyncio
 import socket
 import ssl
 import subprocess
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ import pytest
 
 from contract.runtime.settings import Settings
 from contract.wire.errors import InputError
+from service import webhooks
 from service.callbacks import permitted_addresses
 from service.webhooks import MAX_TRIES
 from tests.receiver import Receiver
 from tests.service.telling import SECRET, accepted, cancelled, failure_of, log_of, sent, telling
-from tests.service.under_test import assert_problem, running_service
+from tests.service.under_test import assert_problem, bearer, running_service
 
 
 def test_without_the_setting_a_callback_is_refused_with_what_the_operator_can_do(tmp_path: Path) -> None:
@@ -127,6 +129,33 @@ def test_the_address_that_was_judged_is_the_one_that_is_connected_to(
         assert receiver.next().headers["host"] == f"his.example:{receiver.port}"
         log_of(service, job_id, lambda delivery: delivery["status"] == "delivered")
         assert len(names.asked) == 1
+
+
+def test_names_whose_look_ups_hang_hold_up_no_other_receiver(
+    receiver: Receiver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, go_on, asked = socket.getaddrinfo, threading.Event(), threading.Semaphore(0)
+
+    def hanging(host: Any, *more: Any, **named: Any) -> Any:
+        if host == "hangs.example":
+            asked.release()
+            go_on.wait()
+        return real("127.0.0.1" if host == "hangs.example" else host, *more, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", hanging)
+    monkeypatch.setattr(webhooks, "TRY_S", 5.0)
+    hangs, tenants = "http://hangs.example", 8
+    with telling(receiver, tmp_path, webhook_hosts=(hangs, receiver.origin)) as service:
+        try:
+            for number in range(tenants * webhooks.MAX_OF_TENANT):
+                job_id = accepted(service, f"{hangs}/", **bearer(service, f"ward-{number % tenants}"))
+                service.queue.cancel(job_id)
+            for _ in range(tenants * webhooks.MAX_OF_TENANT):
+                assert asked.acquire(timeout=60.0)
+            cancelled(service, f"{receiver.origin}/")
+            receiver.next()
+        finally:
+            go_on.set()
 
 
 def test_no_proxy_of_the_environment_is_used(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -223,6 +224,34 @@ def test_while_a_try_is_under_way_no_next_one_is_told(tmp_path: Path) -> None:
         failed = log_of(service, job_id, lambda delivery: bool(delivery["tries"]))
         assert failed["status"] == "owed"
         assert failed["next_try_at_s"] > failed["tries"][0]["at_s"]
+
+
+def test_while_the_queue_takes_no_notes_requests_have_threads_of_their_own(
+    receiver: Receiver, service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, noting, at_once = threading.Event(), [], []
+
+    def slow(*arguments: object) -> bool:
+        noting.append(arguments)
+        at_once.append(len(noting))
+        go_on.wait()
+        noting.remove(arguments)
+        return False
+
+    monkeypatch.setattr(service.queue, "note_try", slow)
+    tenants = 2 * webhooks.MAX_CALLS // webhooks.MAX_OF_TENANT
+    for number in range(2 * webhooks.MAX_CALLS):
+        job_id = accepted(service, f"{receiver.origin}/", **bearer(service, f"ward-{number % tenants}"))
+        service.queue.cancel(job_id)
+    try:
+        for _ in range(webhooks.MAX_CALLS):
+            receiver.next()
+        assert service.http.get("/jobs").status_code == 200
+    finally:
+        go_on.set()
+    for _ in range(webhooks.MAX_CALLS):
+        receiver.next()
+    assert max(at_once) == webhooks.MAX_CALLS
 
 
 def ended_after_the_last_day(queue: MemoryQueue, url: str) -> str:
