@@ -93,7 +93,7 @@ class Webhooks:
                     tries.create_task(self._deliver(http, loan))
 
     def _lent(self, full: Collection[str]) -> Loan | None:
-        """A delivery that is due; None also while the queue is away, and for one that cannot be read."""
+        """A delivery that is due; None also while the queue is away, and after a fault."""
         try:
             loan = self._queue.lend_delivery(uuid.uuid4().hex, full)
         except UnavailableError as error:
@@ -101,8 +101,8 @@ class Webhooks:
                 logger.warning("webhooks wait for the queue: %s", error.problem)
             self._is_away = True
             return None
-        except Exception:  # its loan runs out, and the others are lent meanwhile
-            logger.exception("a webhook that is owed cannot be read")
+        except Exception:  # if one was lent, its loan runs out
+            logger.exception("the queue lends no webhook by a fault of ours")
             return None
         self._is_away = False
         return loan

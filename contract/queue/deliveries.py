@@ -39,6 +39,8 @@ class Deliveries(Protocol):
     def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
         """The delivery that has been due for longest, which is lent to nobody else for LOAN_S; None if none is due.
 
+        What cannot be read is given up, and logged once.
+
         token: of this call; the same token gets the same delivery again. passed: tenants whose deliveries have to wait.
         """
         ...
@@ -51,8 +53,16 @@ class Deliveries(Protocol):
         ...
 
     def deliveries(self, job_id: str) -> list[Delivery]:
-        """What a job's ends owe and owed, the first end first; nothing if the job has no callback.
+        """What a job's ends owe and owed, the first end first, without what cannot be read; nothing without a callback.
 
         While one is lent, it has no next_try_at_s.
         """
         ...
+
+
+def delivery_of(document: str) -> Delivery | None:
+    """The delivery in a document of the queue; None if it cannot be read, as one of a later version."""
+    try:
+        return Delivery.model_validate_json(document)
+    except ValueError:
+        return None

@@ -59,7 +59,7 @@ from typing import Any
 
 import redis
 
-from contract.queue.deliveries import LOAN_S, Loan
+from contract.queue.deliveries import LOAN_S, Loan, delivery_of
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -242,11 +242,13 @@ class RedisQueue:
         return bool(self._scripts.run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
 
     def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
-        answer = self._scripts.run("lend", token, round(LOAN_S * 1000), *passed)
-        if not answer:
-            return None
-        document, url, tenant, mark, trace = answer
-        return Loan(Delivery.model_validate_json(document), url, tenant, mark, trace or None)
+        while answer := self._scripts.run("lend", token, round(LOAN_S * 1000), *passed):
+            event, document, url, tenant, mark, trace = answer
+            if delivery := delivery_of(document):
+                return Loan(delivery, url, tenant, mark, trace or None)
+            if self._scripts.run("note", event, mark, "", DeliveryStatus.FAILED.value, "", tenant):
+                logger.error("A webhook cannot be read and is given up.", extra={"job_id": event.partition(".")[0]})
+        return None
 
     def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
         wait_ms = "" if wait_s is None else round(wait_s * 1000)
@@ -256,10 +258,10 @@ class RedisQueue:
 
     def deliveries(self, job_id: str) -> list[Delivery]:
         with reachable():
-            found = [Delivery.model_validate_json(each) for each in self._client.hvals(_deliveries_key(job_id))]
-            tenant = self._client.hget(_job_key(job_id), "tenant")
+            found = [each for each in map(delivery_of, self._client.hvals(_deliveries_key(job_id))) if each]
             if not found:
                 return []
+            tenant = self._client.hget(_job_key(job_id), "tenant")
             with self._client.pipeline(transaction=True) as batch:
                 batch.zmscore(f"{PREFIX}tenant:{tenant}:owed", [each.event_id for each in found])
                 batch.mget([f"{PREFIX}trying:{each.event_id}" for each in found])

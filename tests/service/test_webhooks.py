@@ -284,13 +284,13 @@ def test_a_fault_in_one_try_ends_neither_the_loop_nor_the_tries_under_way(
     assert fault.__dict__["job_id"] == faulty
 
 
-def test_a_delivery_that_cannot_be_read_is_logged_and_the_others_go_out(
+def test_a_fault_in_lending_is_logged_and_webhooks_go_out(
     receiver: Receiver,
     service: ServiceUnderTest,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    lend, left = service.queue.lend_delivery, [ValueError("of a later version")]
+    lend, left = service.queue.lend_delivery, [ValueError("a fault")]
 
     def damaged(*arguments: Any) -> Loan | None:
         if left:
@@ -301,7 +301,7 @@ def test_a_delivery_that_cannot_be_read_is_logged_and_the_others_go_out(
     with caplog.at_level(logging.ERROR, "intrasplat.service"):
         job_id = cancelled(service, f"{receiver.origin}/")
         assert receiver.next().document["data"]["job_id"] == job_id
-    assert [each.getMessage() for each in caplog.records] == ["a webhook that is owed cannot be read"]
+    assert [each.getMessage() for each in caplog.records] == ["the queue lends no webhook by a fault of ours"]
 
 
 def test_the_same_idempotency_key_with_another_callback_is_refused(

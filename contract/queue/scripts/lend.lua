@@ -1,8 +1,8 @@
 #!lua flags=allow-oom
 -- LEND: lend a service the delivery that has been due for longest. Its score is then when the loan runs out.
 -- ARGV   2 token of the call, 3 how long the loan lasts in ms, 4 and more: tenants whose deliveries are not lent
--- Keys   owed-by, tenant:<tenant>:owed, lent:<token>, trying:<event>, deliveries:<id>, job:<id>
--- Answer {delivery as JSON, callback, tenant, score, trace or ''}; {}: none is due.
+-- Keys   owed, owed-by, tenant:<tenant>:owed, lent:<token>, trying:<event>, deliveries:<id>, job:<id>
+-- Answer {event, delivery as JSON, callback, tenant, score, trace or ''}; {}: none is due.
 
 local lent, passed = P .. 'lent:' .. ARGV[2], {}
 for i = 4, #ARGV do passed[ARGV[i]] = true end
@@ -13,7 +13,7 @@ local function answer(event)
   local job = redis.pcall('HMGET', document(id), 'callback', 'tenant', 'trace')
   if not (delivery and job[1] and job[2]) then return nil end
   local score = redis.call('ZSCORE', owed_of(job[2]), event)
-  return score and {delivery, job[1], job[2], score, job[3] or ''}
+  return score and {event, delivery, job[1], job[2], score, job[3] or ''}
 end
 
 local function first_due()
@@ -23,6 +23,13 @@ local function first_due()
     if head[1] and (not at or tonumber(head[2]) < at) then tenant, event, at = each, head[1], tonumber(head[2]) end
   end
   if at and at <= tonumber(now()) then return tenant, event end
+end
+
+-- Earlier workers write what is owed into one set of all tenants.
+for _, event in ipairs(redis.call('ZRANGE', P .. 'owed', 0, 99)) do
+  local tenant = redis.pcall('HMGET', document(job_of(event)), 'tenant')[1]
+  if tenant then set_due(tenant, event, redis.call('ZSCORE', P .. 'owed', event)) end
+  redis.call('ZREM', P .. 'owed', event)
 end
 
 local mine = redis.call('GET', lent)

@@ -102,6 +102,40 @@ def test_a_job_that_is_set_aside_because_its_record_is_damaged_owes_a_webhook(
     assert served.forget(job_id)
 
 
+def test_deliveries_that_cannot_be_read_are_given_up_at_once_and_logged_once_each(
+    served: RedisQueue, client: redis.Redis, caplog: pytest.LogCaptureFixture
+) -> None:
+    damaged = [served.submit(job(callback_url=CALLBACK)).job_id for _ in range(3)]
+    whole = served.submit(job(callback_url=CALLBACK)).job_id
+    for job_id in (*damaged, whole):
+        served.cancel(job_id)
+    for job_id in damaged:
+        client.hset(f"{PREFIX}deliveries:{job_id}", f"{job_id}.0.cancelled", '{"of": "a later version"}')
+    loan = lent(served)
+    assert loan is not None
+    assert loan.delivery.job_id == whole
+    assert [each.__dict__["job_id"] for each in caplog.records] == damaged
+    assert lent(served) is None
+    assert served.figures().webhooks == {DeliveryStatus.OWED: 1, DeliveryStatus.FAILED: 3}
+    assert served.deliveries(damaged[0]) == []
+    assert len(caplog.records) == len(damaged)
+
+
+def test_what_earlier_workers_owe_in_one_set_of_all_tenants_is_lent(served: RedisQueue, client: redis.Redis) -> None:
+    owed = [served.submit(job(callback_url=CALLBACK, tenant=each)).job_id for each in ("a", "b")]
+    for job_id, tenant in zip(owed, "ab", strict=True):
+        served.cancel(job_id)
+        client.rename(f"{PREFIX}tenant:{tenant}:owed", f"{PREFIX}own")
+        client.zunionstore(f"{PREFIX}owed", [f"{PREFIX}owed", f"{PREFIX}own"])
+        client.hdel(f"{PREFIX}owed-by", tenant)
+    client.zadd(f"{PREFIX}owed", {"gone.1.done": 1.0})
+    assert served.figures().webhooks == {DeliveryStatus.OWED: 0}
+    loans = [loan for loan in (lent(served), lent(served)) if loan]
+    assert [(loan.delivery.job_id, loan.tenant) for loan in loans] == list(zip(owed, "ab", strict=True))
+    assert all(tried(served, loan, None, None) for loan in loans)
+    assert not client.exists(f"{PREFIX}owed", f"{PREFIX}owed-by")
+
+
 def test_a_failed_delivery_is_lent_again_when_it_is_due_and_a_delivered_one_never(queue: Queue) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
