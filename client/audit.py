@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from contract.access.audit import AUDIT_FILE
-from contract.access.chain import HEAD_PATTERN, START, CheckedFile, check_files, in_order, unnamed_lines
+from contract.access.chain import HEAD_PATTERN, START, CheckedFile, check_files, has_branches, in_order, unnamed_lines
 from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
 from contract.runtime.exits import ExitCode
 from contract.wire.errors import InputError
@@ -40,10 +40,10 @@ def _verify(options: argparse.Namespace) -> int:
     for file in [*(each for each in checked if not each.lines), *files]:
         print(_counts(file))
     for file in files:
-        if unnamed := unnamed_lines(file, files):
+        if unnamed_lines(file, files) == 1:
             print(
-                f"{file.path}, its last {unnamed} lines: no later file names them. The power failed or the process was "
-                "killed before the file was moved away, or they were added since"
+                f"{file.path}, its last line: no later file names it. The process was killed before the file was moved "
+                "away, or the line was added since"
             )
     faults = [*_faults(files), *_fault_of_head(files, options.head)]
     for fault in faults:
@@ -61,7 +61,7 @@ def _counts(file: CheckedFile) -> str:
     if file.unchained:
         numbers = ", ".join(_ranges(file.unchained))
         text += f"; without a chain, of version 0.2 or cut off by a crash: {numbers}"
-    return text
+    return f"{text}; its last line is cut off" if file.is_cut_off else text
 
 
 def _ranges(numbers: Sequence[int]) -> Iterator[str]:
@@ -80,6 +80,13 @@ def _faults(files: Sequence[CheckedFile]) -> Iterator[str]:
                 f"{file.path}, line {line}: it does not follow line {line - 1}, which was changed, "
                 "or lines were removed, inserted or moved here"
             )
+        if (unnamed := unnamed_lines(file, files)) > 1:
+            yield (
+                f"{file.path}, its last {unnamed} lines: no later file names them; they were added since, or the power "
+                "failed just before the file was moved away"
+            )
+        if has_branches(file, files):
+            yield f"{file.path}: several files go on from it, of which one at most was written by the service"
     for before, file in pairwise(files):
         if file.begins in (None, START) or not any(file.begins in each.found for each in files if each is not file):
             yield (

@@ -27,8 +27,8 @@ AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"
 HEAD_FILE = "audit.head"
 """The head of the chain, and the lock of whoever appends. It counts only where the audit was moved away. It is noted
-after the line, and flushed once a file: a kill in between, or a loss of power, leaves an earlier head of the file,
-which the next one then names if this one is moved away at once (chain.unnamed_lines)."""
+after the line, and flushed once a file: a kill in between leaves the head before that line, and a loss of power may
+leave an earlier one, which the next file then names if this one is moved away at once (chain.unnamed_lines)."""
 RESERVE_BYTES = 4 * 2**20
 """About 12,000 lines."""
 RESERVE_PIECE_BYTES = 64 * 2**10

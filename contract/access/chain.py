@@ -97,6 +97,8 @@ class CheckedFile:
     """What the next line would name."""
     broken_at: int | None = None
     """The first line, counted from 1, that does not name what stands before it."""
+    is_cut_off: bool = False
+    """Its last line is not whole."""
     unchained: list[int] = field(default_factory=list)
     found: dict[str, int] = field(default_factory=dict)
     """After which line the head was one that is looked for; 0: before the first."""
@@ -129,7 +131,7 @@ def check_file(path: Path, wanted: Collection[str] = ()) -> CheckedFile:
             elif named != checked.head and checked.broken_at is None:
                 checked.broken_at = number
             since = hashlib.sha256(line)
-        checked.lines, checked.head = number, since.hexdigest()
+        checked.lines, checked.head, checked.is_cut_off = number, since.hexdigest(), not line.endswith(b"}")
         if checked.head in wanted:
             checked.found[checked.head] = number
     return checked
@@ -150,7 +152,20 @@ def in_order(files: Sequence[CheckedFile]) -> list[CheckedFile]:
 
 
 def unnamed_lines(file: CheckedFile, files: Sequence[CheckedFile]) -> int:
-    """How many lines at a file's end no later one names, though it names those before them. A process that was killed,
-    or a loss of power, leaves so many: the file was moved away before its head was noted."""
+    """How many lines at the end of a file no later one names, though it names what stands before them. A process that
+    was killed before it noted the head leaves one, if the file was moved away at once. files: in order."""
     named = [file.found[each.begins] for each in files if each is not file and each.begins in file.found]
     return file.lines - max(named) if named and file is not files[-1] else 0
+
+
+def has_branches(file: CheckedFile, files: Sequence[CheckedFile]) -> bool:
+    """Whether several files go on from this one. One that holds a single line and ends there does not count, if another
+    begins where it does: a kill may leave it, as in unnamed_lines()."""
+    followers = [each for each in files if each is not file and file.found.get(each.begins or "")]
+    places = {each.begins for each in followers}
+    going_on = [each for each in followers if each.lines > 1 or _is_followed(each, files)]
+    return len(places) > 1 or len(going_on) > 1
+
+
+def _is_followed(file: CheckedFile, files: Sequence[CheckedFile]) -> bool:
+    return any(file.found.get(each.begins or "") for each in files if each is not file)

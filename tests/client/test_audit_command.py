@@ -99,30 +99,56 @@ def test_an_audit_whose_process_was_killed_before_it_noted_the_head_is_intact(
     write(tmp_path, 2)
     status, told = verified(capsys, path, *[old] * is_moved)
     assert (status, told[-2]) == (ExitCode.OK, "intact")
-    assert [line[: len(str(old)) + 18] for line in told if "names them" in line] == [
-        f"{old}, its last 1 lines"
-    ] * is_moved
+    assert [line.partition(":")[0] for line in told if "names it" in line] == [f"{old}, its last line"] * is_moved
     if is_moved:  # a line that a later file names is still missed
         old.write_text("".join(old.read_text().splitlines(keepends=True)[:1]))
         assert verified(capsys, path, old)[0] == ExitCode.FAILED
 
 
-def test_after_a_loss_of_power_a_file_may_go_on_from_where_the_one_before_it_began(
+def rotated(folder: Path, name: str, count: int, noted: bytes | None = None) -> Path:
+    """A file of so many lines that was moved away, and went on from that head if one is given."""
+    if noted is not None:
+        (folder / HEAD_FILE).write_bytes(noted)
+    return write(folder, count).rename(folder / name)
+
+
+def test_lines_that_no_later_file_names_are_a_fault_unless_a_kill_leaves_as_many(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files = [tmp_path / f"audit.{number}" for number in (3, 2, 1)]
-    for count, file in enumerate(files, 1):
-        write(tmp_path, 1)
-        on_disk = (tmp_path / HEAD_FILE).read_bytes()
-        write(tmp_path, count).rename(file)
-        (tmp_path / HEAD_FILE).write_bytes(on_disk)
-    newest = write(tmp_path, 1)
-    status, told = verified(capsys, newest, *reversed(files))
-    assert (status, told[-2:]) == (ExitCode.OK, ["intact", f"head {check_file(newest).head}"])
-    assert [f"{file}, its last {count} lines" for count, file in enumerate(files, 1)] == [
-        line.partition(":")[0] for line in told if "names them" in line
-    ]
-    assert verified(capsys, newest, files[2], files[0])[0] == ExitCode.FAILED
+    write(tmp_path, 2)
+    noted = (tmp_path / HEAD_FILE).read_bytes()
+    old = rotated(tmp_path, "audit.1", 2)
+    newest = rotated(tmp_path, "audit.0", 1, noted)
+    status, told = verified(capsys, newest, old)
+    assert (status, told[-2]) == (ExitCode.FAILED, "CHANGED")
+    assert told[2].startswith(f"{old}, its last 2 lines: no later file names them")
+    old.write_text("".join(old.read_text().splitlines(keepends=True)[:3]))
+    assert verified(capsys, newest, old)[0] == ExitCode.OK
+
+
+@pytest.mark.parametrize(("main_lines", "side_lines"), [(2, 2), (1, 3), (3, 1)])
+@pytest.mark.parametrize("from_end", [False, True])
+def test_a_side_branch_is_a_fault_unless_it_is_the_one_line_that_a_kill_leaves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], main_lines: int, side_lines: int, from_end: bool
+) -> None:
+    write(tmp_path, 1)
+    early = (tmp_path / HEAD_FILE).read_bytes()
+    first = rotated(tmp_path, "first", 2)
+    end = (tmp_path / HEAD_FILE).read_bytes()
+    main_file = rotated(tmp_path, "main", main_lines)
+    side = rotated(tmp_path, "side", side_lines, end if from_end else early)
+    status, told = verified(capsys, side, main_file, first)
+    may_be_a_kill = from_end and main_lines == 1
+    assert (status == ExitCode.OK) == may_be_a_kill
+    assert any("names it" in line for line in told) == may_be_a_kill
+
+
+def test_a_last_line_that_is_cut_off_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path, 3)
+    path.write_bytes(path.read_bytes()[:-30])
+    status, told = verified(capsys, path)
+    assert status == ExitCode.OK
+    assert told[0].endswith("its last line is cut off")
 
 
 def test_old_lines_are_told_and_not_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
