@@ -178,8 +178,9 @@ def test_a_scene_imported_on_one_machine_is_shown_and_exported_on_others(site: S
 
     site.machine("second", "worker", "consume")
     eventually(lambda: http.get("/readyz").json().get("workers") == ["second"])
-    view = http.get("/render", params={"scene": job_id, "t": 0.5, "layer": "depth", "format": "npy"})
-    assert view.status_code == 200, view.text
+    asked = {"scene": job_id, "t": 0.5, "layer": "depth", "format": "npy"}
+    eventually(lambda: http.get("/render", params=asked).status_code == 200)
+    view = http.get("/render", params=asked)
     np.testing.assert_array_equal(np.load(io.BytesIO(view.content)), render_frame(scene, 0.5).depth_mm)
     exported = http.get(f"/scenes/{job_id}/export", params={"format": "scene"})
     assert files_of(exported.content)["scene.safetensors"] == files_of(archive)["scene.safetensors"]

@@ -23,6 +23,7 @@ from contract.queue.interface import Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
+from tests.receiver import Receiver
 from tests.test_many_machines import end_process, eventually, free_port, opened
 
 NEW = Path(__file__).resolve().parents[1]
@@ -52,9 +53,11 @@ class Site:
         server = EmbeddedServer(folder / "data")
         server.start()
         ended.callback(server.stop)
+        self.receiver = ended.enter_context(Receiver())
         self.settings = Settings(
-            data_dir=folder / "data", redis_url=server.url, device="cpu", min_free_bytes=0, port=free_port()
-        )
+            data_dir=folder / "data", redis_url=server.url, device="cpu", min_free_bytes=0, port=free_port(),
+            webhook_hosts=(self.receiver.origin,), webhook_private="yes", webhook_secret="s" * 32,
+        )  # fmt: skip
         self.queue: Queue = RedisQueue(server.url)
         ended.callback(self.queue.close)
         self.http = ended.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{self.settings.port}", timeout=60.0))
@@ -90,8 +93,9 @@ class Site:
         return found
 
     def send(self, clip: Path) -> str:
+        data = {"options": f'{{"iterations": {ITERATIONS}}}', "callback_url": f"{self.receiver.origin}/"}
         with opened(clip) as files:
-            sent = self.http.post("/reconstruct", files=files, data={"options": f'{{"iterations": {ITERATIONS}}}'})
+            sent = self.http.post("/reconstruct", files=files, data=data)
         assert sent.status_code == 202, sent.text
         return str(sent.json()["id"])
 
@@ -147,3 +151,4 @@ def test_worker_and_then_service_are_replaced_under_a_job_and_back_again(site: S
     eventually(lambda: site.job(later)["state"] in ("done", "failed"))
     site.assert_is_shown(later)
     site.assert_is_shown(first)
+    eventually(lambda: {each.document["data"]["job_id"] for each in site.receiver.all} == {first, waiting, later})

@@ -1,4 +1,5 @@
 """The page in a real browser, on a real service whose worker paints: what somebody at an operating table would see."""
+# long: one real service and page, and every part of the page is looked at on them
 
 from __future__ import annotations
 

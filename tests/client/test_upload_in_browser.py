@@ -174,6 +174,7 @@ def test_an_interrupted_clip_may_be_given_up(site: Site, page: Page, large_clip:
     page.click("#upload-again button")
     page.until(lambda: page.find("#upload [type=submit]").is_displayed())
     page.until(lambda: not list((site.store.data_dir / "incoming").iterdir()))
+    site.announce()  # the last time may be long ago
     page.open()
     page.until_text("#connection", "ready")
     assert page.text("#upload-message") == ""

@@ -115,7 +115,7 @@ def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
     for series in ("endonerf:bases=3", "endonerf:eyes=left"):
         with pytest.raises(InputError, match="as it was published"):
             plan(["clip"], [series], ["every8"], [0])
-    with pytest.raises(InputError, match="by `intrasplat evaluate` alone"):
+    with pytest.raises(InputError, match="no preset"):
         preset_of("endonerf")
 
 
