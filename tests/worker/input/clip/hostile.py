@@ -232,8 +232,8 @@ CORPUS: dict[str, Hostile] = {
     "deep": Hostile("calibration.json", fixed(b'{"a":' + b"[" * 99_999), "nested 100000 levels", part="calibration"),
     "deep YAML": Hostile(
         "calibration.yaml",
-        fixed(b"%YAML:1.0\n---\nM1: " + b"{a: " * 59_999),
-        "nested 60000 levels",
+        fixed(b"%YAML:1.0\n---\nM1: " + b"{a: " * 49_999),
+        "nested 49999 levels",
         part="calibration",
     ),
     "deep behind keys": Hostile("calibration.json", fixed(b'{"a}":' * 20_000), "not valid JSON", part="calibration"),
