@@ -28,7 +28,7 @@ KEPT_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
 """UUIDs and trace ids are kept. Words are not: the id goes into the log, and words may name somebody."""
 
 QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Asked every few seconds by machines; in the log only when they fail."""
+"""Asked every few seconds by machines; in the log only when they begin to fail, fail otherwise, or work again."""
 
 MAX_OPEN = 512
 """Requests, streams of events and WebSockets at a time. Each of them may hold a connection for long."""
@@ -36,6 +36,7 @@ MAX_OPEN = 512
 NO_ROUTE = "-"
 OTHER_METHOD = "_OTHER"
 """In spans, of a method that a caller has made up; so OpenTelemetry calls it."""
+OK = 200
 GONE = 499
 """In the log alone: the caller left before it was answered."""
 SWITCHED = 101
@@ -56,6 +57,8 @@ class RequestLog:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._open = 0
+        self._last_status: dict[str, int] = {}
+        """Of each quiet route; OK for everything below 400."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -71,7 +74,7 @@ class RequestLog:
                     await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
                 finally:
                     self._open -= 1
-                    _log(scope, answered.status or GONE, time.perf_counter() - began_s)
+                    self._log(scope, answered.status or GONE, time.perf_counter() - began_s)
                     _describe(span, scope, request_id, answered.status or GONE)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
@@ -86,6 +89,22 @@ class RequestLog:
             if answered.status is not None:
                 raise  # too late for another answer: the server cuts the connection
             await _refuse(fault(), scope, receive, send)
+
+    def _log(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", NO_ROUTE)
+        fields = {
+            "method": scope.get("method", "WEBSOCKET"),
+            "route": route,
+            "status": status,
+            "duration_ms": round(seconds * 1000.0, 1),
+        }
+        level = logging.DEBUG if route in QUIET_ROUTES and not self._has_changed(route, status) else logging.INFO
+        logger.log(level, "answered", extra=fields)
+
+    def _has_changed(self, route: str, status: int) -> bool:
+        now = status if status >= 400 else OK
+        before, self._last_status[route] = self._last_status.get(route, OK), now
+        return now != before
 
 
 def _marking(scope: Scope, send: Send, request_id: str, answered: _Answered) -> Send:
@@ -142,15 +161,3 @@ def _describe(span: traces.Span, scope: Scope, request_id: str, status: int) -> 
 
 def _method_of(scope: Scope) -> str:
     return scope["method"] if scope["method"] in METHODS else OTHER_METHOD
-
-
-def _log(scope: Scope, status: int, seconds: float) -> None:
-    route = getattr(scope.get("route"), "path", NO_ROUTE)
-    level = logging.DEBUG if route in QUIET_ROUTES and status < 400 else logging.INFO
-    fields = {
-        "method": scope.get("method", "WEBSOCKET"),
-        "route": route,
-        "status": status,
-        "duration_ms": round(seconds * 1000.0, 1),
-    }
-    logger.log(level, "answered", extra=fields)

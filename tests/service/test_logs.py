@@ -94,6 +94,22 @@ def test_each_answer_is_a_line_with_the_id_that_the_caller_was_given(
     }
 
 
+def test_probes_are_logged_when_they_begin_to_fail_and_when_they_work_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configure(Settings(data_dir=tmp_path, log_format="json"), "service")
+    for service in running_service(tmp_path):
+        (worker,) = service.queue.workers()
+        for status in (200, 503, 200):
+            if status == 503:
+                service.queue.withdraw(worker.name)
+            else:
+                service.queue.announce(worker)
+            assert {service.http.get("/readyz").status_code for _ in range(3)} == {status}
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [line["status"] for line in lines if line["message"] == "answered"] == [503, 200]
+
+
 def test_a_fault_is_logged_with_where_it_was_and_without_its_text(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
