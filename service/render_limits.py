@@ -45,7 +45,7 @@ class RenderLimits:
     def cost(self, request: RenderRequest) -> float:
         """What a render costs, as far as its scene is known."""
         gaussians, size = self._scenes.get(request.scene_id, (TYPICAL_GAUSSIANS, TYPICAL_SIZE))
-        return render_cost(request.most_drawn(size), gaussians)
+        return sum(render_cost(each, gaussians) for each in request.most_drawn(size))
 
     @contextmanager
     def admitted(self, caller: Caller, request: RenderRequest) -> Iterator[None]:

@@ -8,6 +8,7 @@ id of the request that it gives up, and gets no answer.
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from typing import Literal, TypeAlias
 
@@ -126,12 +127,24 @@ class RenderRequest(BaseModel):
     max_pixels: int = Field(default=4096 * 2160, gt=0)
     """The most that may be drawn for it."""
 
-    def most_drawn(self, clip_size: tuple[int, int]) -> int:
-        """Pixels that are drawn for it, at most: a wide lens shows more of the recording's pixels than the clip has."""
-        (width, height), (clip_width, clip_height) = self.camera.size(*clip_size), clip_size
-        is_own_lens = self.camera.fx is None and self.camera.fy is None
-        finest = clip_width * clip_height if is_own_lens else MAX_JUDGED_PIXELS
-        return min(max(width * height, min(finest, MAX_JUDGED_PIXELS)), self.max_pixels)
+    @property
+    def is_from_endoscope(self) -> bool:
+        """Whether it looks from the pose of the endoscope's left eye."""
+        return self.pose is None and self.eye == "left"
+
+    def most_drawn(self, clip_size: tuple[int, int]) -> list[int]:
+        """Pixels of each picture that is drawn for it, at most: a wide lens shows more of the recording's pixels than
+        the clip has; confidence takes a view as fine as the recording, and the endoscope's own to compare with."""
+        size, clip_pixels, lens = self.camera.size(*clip_size), math.prod(clip_size), self.camera
+        asked, is_own_lens = math.prod(size), lens.fx is None and lens.fy is None
+        finest = clip_pixels if is_own_lens else MAX_JUDGED_PIXELS
+        drawn = [max(asked, min(finest, MAX_JUDGED_PIXELS))]
+        is_clips_lens = size == clip_size and is_own_lens and lens.cx is None and lens.cy is None
+        if self.layer is Layer.CONFIDENCE and not (self.is_from_endoscope and is_clips_lens):
+            drawn.append(clip_pixels)
+            if asked > finest or not is_own_lens:
+                drawn.append(min(asked, finest))
+        return [min(each, self.max_pixels) for each in drawn]
 
 
 class ExportRequest(BaseModel):

@@ -52,7 +52,7 @@ from worker.render.encode import FOR_EYES, encode_layer
 from worker.render.measure import WINDOW_PX
 from worker.render.measured import measured
 from worker.render.recorded import live_frame, stored_frame
-from worker.render.view import LARGE_PIXELS, ROUNDING, Frame, judged_camera, no_pause, render_frame, renderer_of
+from worker.render.view import LARGE_PIXELS, ROUNDING, Frame, drawn_pixels, no_pause, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
@@ -149,12 +149,15 @@ class Views:
             return len(request.points) * render_cost(WINDOW_PX**2, gaussians)
         if isinstance(request, ExportRequest):
             return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
-        width, height = request.camera.size(*size)
         if scene is not None:
             asked = _seen_through(scene.intrinsics, request.camera)
-            judged = judged_camera(asked, scene.intrinsics, request.max_pixels)
-            return render_cost(max(width * height, judged.width * judged.height), gaussians)
-        return render_cost(request.most_drawn(size), gaussians)
+            is_own, is_judged = request.is_from_endoscope, request.layer is Layer.CONFIDENCE
+            drawn = drawn_pixels(
+                asked, scene.intrinsics, request.max_pixels, confidence=is_judged, from_endoscope=is_own
+            )
+        else:
+            drawn = request.most_drawn(size)
+        return sum(render_cost(each, gaussians) for each in drawn)
 
     def forget_purged(self) -> None:
         """Drop scenes whose folders are gone, and jobs that have ended. Call it now and then."""

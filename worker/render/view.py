@@ -222,7 +222,8 @@ def render_frame(
     pause: called between the parts of the work (worker/raster/model.py).
     """
     shown, outside = held_in_clip(scene, t)
-    pose = endoscope_pose(scene, shown) if world_from_camera is None else np.asarray(world_from_camera, np.float64)
+    own_pose = endoscope_pose(scene, shown)
+    pose = own_pose if world_from_camera is None else np.asarray(world_from_camera, np.float64)
     asked = intrinsics or scene.intrinsics
     judged = asked if is_coarse else judged_camera(asked, scene.intrinsics, max_pixels)
     drawn = max(asked, judged, key=_pixels)
@@ -254,9 +255,11 @@ def render_frame(
         )  # fmt: skip
         layer: Callable[[], NDArray[np.float32]] = partial(_enlarged_confidence, again, depth_mm > 0)
     else:
-        own_view = partial(_endoscope_rgb, scene, shown, device, highlights, pause)
+        most = _pixels(asked) if is_coarse else max_pixels
+        endoscope = (_compared_camera(drawn, scene.intrinsics, most), own_pose)
+        own_view = partial(_endoscope_rgb, scene, shown, endoscope, device, highlights, pause)
         view = (image[:3], depth_mm, trust)
-        layer = partial(_confidence, scene, endoscope_pose(scene, shown), camera, view, own_view)
+        layer = partial(_confidence, endoscope, camera, view, own_view)
     frame = Frame(rgb, depth_mm, unseen, _share(unseen), warnings, layer)
     return frame if _pixels(drawn) == _pixels(asked) else frame.reduced(asked.width, asked.height)
 
@@ -271,11 +274,44 @@ def judged_camera(asked: Intrinsics, own: Intrinsics, max_pixels: int = MAX_JUDG
     if abs(_pixels(fine) / _pixels(asked) - 1) <= AS_FINE:
         return asked
     most = max(min(MAX_JUDGED_PIXELS, max_pixels), _pixels(asked))
-    if _pixels(fine) <= most:
-        return fine
-    share = math.sqrt(most / _pixels(fine))
-    width = min(max(1, int(fine.width * share)), MAX_JUDGED_SIDE, most)
-    return fine.resized(width, min(max(1, int(fine.height * share)), MAX_JUDGED_SIDE, most // width))
+    return asked if _pixels(fine) > most == _pixels(asked) else _at_most(fine, most)
+
+
+def drawn_pixels(
+    asked: Intrinsics, own: Intrinsics, max_pixels: int, *, confidence: bool, from_endoscope: bool
+) -> list[int]:
+    """Pixels of each picture that render_frame draws, of a scene whose lens is `own`.
+
+    confidence: it is asked for, too.
+    from_endoscope: the view is from the endoscope's own pose.
+    """
+    judged = judged_camera(asked, own, max_pixels)
+    drawn = [max(asked, judged, key=_pixels)]
+    if confidence:
+        if _pixels(judged) < _pixels(asked):
+            drawn.append(judged)
+        compared = _compared_camera(drawn[-1], own, max_pixels)
+        if not from_endoscope or compared != drawn[-1]:
+            drawn.append(compared)
+    return [_pixels(each) for each in drawn]
+
+
+def _compared_camera(judged: Intrinsics, own: Intrinsics, max_pixels: int) -> Intrinsics:
+    """The endoscope's lens, in pixels as fine as those of a view that is compared with it, and no more than allowed."""
+    across, down = min(judged.fx / own.fx, 1.0), min(judged.fy / own.fy, 1.0)
+    as_fine = own
+    if across * down < 1 - AS_FINE:
+        as_fine = own.resized(max(1, round(own.width * across)), max(1, round(own.height * down)))
+    return _at_most(as_fine, max(max_pixels, _pixels(judged)))
+
+
+def _at_most(camera: Intrinsics, most: int) -> Intrinsics:
+    """The same view in at most so many pixels."""
+    if _pixels(camera) <= most:
+        return camera
+    share = math.sqrt(most / _pixels(camera))
+    width = min(max(1, int(camera.width * share)), MAX_JUDGED_SIDE, most)
+    return camera.resized(width, min(max(1, int(camera.height * share)), MAX_JUDGED_SIDE, most // width))
 
 
 def _pixels(camera: Intrinsics) -> int:
@@ -306,17 +342,21 @@ def _parts(size: tuple[int, ...]) -> Iterator[slice]:
 
 
 def _endoscope_rgb(
-    scene: Scene, t: float, device: Device, highlights: bool, pause: Callable[[], None]
+    scene: Scene,
+    t: float,
+    endoscope: tuple[Intrinsics, NDArray[np.float64]],
+    device: Device,
+    highlights: bool,
+    pause: Callable[[], None],
 ) -> NDArray[np.float32]:
-    """[3, H, W] of the endoscope's own view at t."""
-    own = endoscope_pose(scene, t), scene.intrinsics
-    image, _ = renderer_of(scene, device).layers(t, *own, highlights=highlights, pause=pause)
+    """[3, h, w] of the endoscope's own view at t."""
+    lens, pose = endoscope
+    image, _ = renderer_of(scene, device).layers(t, pose, lens, highlights=highlights, pause=pause)
     return image[:3]
 
 
 def _confidence(
-    scene: Scene,
-    own_pose: NDArray[np.float64],
+    endoscope: tuple[Intrinsics, NDArray[np.float64]],
     camera: tuple[Intrinsics, NDArray[np.float64]],
     view: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     own_view: Callable[[], NDArray[np.float32]],
@@ -324,8 +364,8 @@ def _confidence(
     """The confidence layer [H, W] of a view, given as colours [3, H, W], depth in mm and trust; 0 where trust is."""
     rgb, depth_mm, trust = view
     known_rgb = rgb
-    if not np.array_equal(camera[1], own_pose) or camera[0] != scene.intrinsics:
-        known_rgb = seen_from_endoscope(own_view(), depth_mm, camera, (scene.intrinsics, own_pose))
+    if not np.array_equal(camera[1], endoscope[1]) or camera[0] != endoscope[0]:
+        known_rgb = seen_from_endoscope(own_view(), depth_mm, camera, endoscope)
     likely = confidence(evidence(trust, rgb, known_rgb))
     return np.where(trust > 0, likely, 0).astype(np.float32)
 

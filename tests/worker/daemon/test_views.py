@@ -23,6 +23,7 @@ from contract.wire.notices import NoticeCode
 from contract.wire.pose import parse_pose
 from contract.wire.rendering import (
     TYPICAL_GAUSSIANS,
+    TYPICAL_SIZE,
     Highlights,
     ImageFormat,
     IntrinsicsOverride,
@@ -412,9 +413,27 @@ def test_a_lens_that_sees_more_than_any_does_is_answered_in_pixels_that_are_not_
 
 
 @pytest.mark.parametrize("layer", [Layer.RGB, Layer.CONFIDENCE])
-@pytest.mark.parametrize("lens", [{}, {"fx": 0.1, "fy": 0.1}, {"fx": 1e-5}])
-def test_no_more_is_drawn_for_a_small_picture_than_the_limit_and_that_is_what_it_costs(
-    lens: dict[str, float], layer: Layer, store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("pose", [None, "orbit:10,0,1"])
+@pytest.mark.parametrize(
+    ("lens", "max_pixels"),
+    [
+        ({"width": 16, "height": 12}, 2_000),
+        ({"width": 16, "height": 12}, 4_000),
+        ({"width": 64, "height": 48}, 4_000),
+        ({"width": 128}, 13_000),
+        ({"width": 60, "height": 40, "fx": 200.0}, 2_500),
+        ({"width": 16, "height": 12, "fx": 0.1, "fy": 0.1}, 4_000),
+        ({"width": 16, "height": 12, "fx": 1e-5}, 4_000),
+    ],
+)
+def test_no_picture_is_drawn_of_more_pixels_than_the_limit_and_a_view_costs_all_that_are_drawn_for_it(
+    lens: dict[str, Any],
+    max_pixels: int,
+    pose: str | None,
+    layer: Layer,
+    store: Store,
+    scene_id: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drawn, project = list[int](), Rasterizer.project
 
@@ -424,24 +443,25 @@ def test_no_more_is_drawn_for_a_small_picture_than_the_limit_and_that_is_what_it
 
     monkeypatch.setattr(Rasterizer, "project", noted)
     views = Views(store)
-    asked = {"camera": IntrinsicsOverride(width=16, height=12, **lens), "max_pixels": 4_000, "layer": layer}
-    small = request_of(scene_id, t=0.5).model_copy(update=asked)
-    before = views.cost(small) / TYPICAL_GAUSSIANS
-    views.answer(small)
-    views.answer(small.model_copy(update={"t": 0.25}))
-    cost = views.cost(small.model_copy(update={"t": 0.75}))
-    own = CLIP.width * CLIP.height  # confidence compares with the endoscope's own view
-    assert max(each for each in drawn if each != own or not lens) <= 4_000
-    assert cost == render_cost(max(each for each in drawn if each != own or not lens), len(scene().gaussians))
-    assert cost / len(scene().gaussians) <= before
+    asked = {"camera": IntrinsicsOverride(**lens), "max_pixels": max_pixels, "layer": layer}
+    view = request_of(scene_id, t=0.5).model_copy(update={**asked, "pose": pose and parse_pose(pose)})
+    assert views.cost(view) == sum(render_cost(each, TYPICAL_GAUSSIANS) for each in view.most_drawn(TYPICAL_SIZE))
+    views.answer(view.model_copy(update={"t": 0.25}))
+    cost, gaussians = views.cost(view), len(scene().gaussians)
+    drawn.clear()
+    views.answer(view)
+    assert max(drawn) <= max_pixels
+    assert cost == sum(render_cost(each, gaussians) for each in drawn)
+    at_most = sum(render_cost(each, 1) for each in view.most_drawn((CLIP.width, CLIP.height)))
+    assert cost / gaussians <= at_most
 
 
 def test_a_small_picture_through_a_wide_lens_counts_what_is_drawn_for_it_towards_the_limits(scene_id: str) -> None:
     small = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=16, height=12)})
     wide = small.model_copy(update={"camera": IntrinsicsOverride(width=16, height=12, fx=0.01)})
-    assert small.most_drawn((640, 512)) == 640 * 512
-    assert wide.most_drawn((640, 512)) == 1 << 21
-    assert wide.model_copy(update={"max_pixels": 50_000}).most_drawn((640, 512)) == 50_000
+    assert small.most_drawn((640, 512)) == [640 * 512]
+    assert wide.most_drawn((640, 512)) == [1 << 21]
+    assert wide.model_copy(update={"max_pixels": 50_000}).most_drawn((640, 512)) == [50_000]
 
 
 @pytest.mark.parametrize("name", ["encode_layer", "unseen_pixels"])

@@ -143,6 +143,7 @@ def test_a_smaller_picture_is_as_bright_as_the_recording_and_its_depth_is_a_mean
         ((640, 512), (1920, 1536), (640, 512)),
         ((3840, 2160), (160, 90), (1930, 1086)),
         ((3840, 2160), (2880, 1620), (2880, 1620)),
+        ((3840, 2160), (2461, 1384), (2461, 1384)),
     ],
 )
 def test_a_view_is_judged_in_the_recordings_pixels_as_far_as_they_are_not_too_many(
