@@ -10,8 +10,9 @@ from __future__ import annotations
 import asyncio
 import re
 import socket
-from concurrent.futures import Executor
-from functools import partial
+import threading
+from concurrent.futures import Future
+from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
 
 import httpx
@@ -28,6 +29,39 @@ METADATA = frozenset(map(ip_address, ("fd00:ec2::254", "fd20:ce::254", "fd00:c1:
 """Where clouds tell their machines secrets; others lie among the link-local addresses."""
 URL_REMEDY = "Give a URL such as https://his.example.org/intrasplat, without a user, a password or a fragment."
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_WEBHOOK_HOSTS."
+
+
+class LookUps:
+    """Asks the resolver, at most so often at a time, in threads that the end of the process does not wait for."""
+
+    def __init__(self, most: int) -> None:
+        self._places = asyncio.Semaphore(most)
+
+    async def addresses(self, host: str) -> list[str]:
+        """The addresses of a host; if this is cancelled, its place stays taken until the resolver answers.
+
+        Raises:
+            OSError, UnicodeError: the name means nothing.
+        """
+        await self._places.acquire()
+        loop, answer = asyncio.get_running_loop(), Future[list[str]]()
+        answer.set_running_or_notify_cancel()
+
+        def ask() -> None:
+            try:
+                found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+                answer.set_result(list(dict.fromkeys(str(each[4][0]) for each in found)))
+            except Exception as error:
+                answer.set_exception(error)
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._places.release)
+
+        try:
+            threading.Thread(target=ask, name="look-up", daemon=True).start()
+        except RuntimeError:  # the system has no more threads
+            self._places.release()
+            raise
+        return await asyncio.wrap_future(answer)
 
 
 def check_callback(url: str | None, settings: Settings) -> None:
@@ -56,17 +90,13 @@ def is_allowed(url: str, settings: Settings) -> bool:
     return _origin(url) in {_origin(each) for each in named}
 
 
-async def permitted_addresses(host: str, settings: Settings, threads: Executor | None = None) -> list[str]:
+async def permitted_addresses(host: str, settings: Settings, look_ups: LookUps) -> list[str]:
     """The addresses of a host that may be connected to, in the resolver's order.
-
-    threads: where the resolver is asked; a look-up that is cancelled keeps its thread until the resolver answers.
 
     Raises:
         OSError, UnicodeError: the name means nothing.
     """
-    ask = partial(socket.getaddrinfo, host, None, type=socket.SOCK_STREAM)
-    found = await asyncio.get_running_loop().run_in_executor(threads, ask)
-    addresses = dict.fromkeys(str(each[4][0]) for each in found)
+    addresses = await look_ups.addresses(host)
     return [address for address in addresses if _is_permitted(address, settings.webhook_private == "yes")]
 
 

@@ -14,7 +14,6 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 
@@ -30,7 +29,7 @@ from contract.runtime.settings import Settings
 from contract.runtime.version import version
 from contract.wire.errors import UnavailableError
 from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnded, TryFailure
-from service.callbacks import is_allowed, permitted_addresses
+from service.callbacks import LookUps, is_allowed, permitted_addresses
 
 LOOK_PERIOD_S = 0.5
 MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
@@ -67,7 +66,7 @@ class Webhooks:
         self._under_way: Counter[str] = Counter()
         """By tenant."""
         self._threads = CapacityLimiter(MAX_CALLS)
-        self._look_ups = ThreadPoolExecutor(MAX_AT_ONCE, thread_name_prefix="look-ups")
+        self._look_ups = LookUps(MAX_AT_ONCE)
 
     async def run(self) -> None:
         """Deliver whatever is due, until cancelled."""

@@ -6,6 +6,7 @@ import asyncio
 import socket
 import ssl
 import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ import pytest
 from contract.runtime.settings import Settings
 from contract.wire.errors import InputError
 from service import webhooks
-from service.callbacks import permitted_addresses
+from service.callbacks import LookUps, permitted_addresses
 from service.webhooks import MAX_TRIES
 from tests.receiver import Receiver
 from tests.service.telling import SECRET, accepted, cancelled, failure_of, log_of, sent, telling
 from tests.service.under_test import assert_problem, bearer, running_service
+
+ENDS_WITHIN_S = 120.0
 
 
 def test_without_the_setting_a_callback_is_refused_with_what_the_operator_can_do(tmp_path: Path) -> None:
@@ -90,7 +93,7 @@ def test_private_addresses_are_only_for_those_who_allow_them_and_metadata_for_no
     careful, trusting = Settings(), Settings(webhook_private="yes")
 
     def permitted(settings: Settings) -> set[str]:
-        return {each for each in every if asyncio.run(permitted_addresses(each, settings))}
+        return {each for each in every if asyncio.run(permitted_addresses(each, settings, LookUps(1)))}
 
     every = (*PRIVATE, *NEVER, *PUBLIC)
     assert permitted(careful) == {*PUBLIC}
@@ -156,6 +159,60 @@ def test_names_whose_look_ups_hang_hold_up_no_other_receiver(
             receiver.next()
         finally:
             go_on.set()
+
+
+HANGING_LOOK_UP = """
+import socket, sys, threading
+from pathlib import Path
+from tests.receiver import Receiver
+from tests.service.telling import cancelled, telling
+
+real, asked = socket.getaddrinfo, threading.Event()
+
+def hanging(host, *more, **named):
+    if host == "hangs.example":
+        asked.set()
+        threading.Event().wait()
+    return real(host, *more, **named)
+
+socket.getaddrinfo = hanging
+with Receiver() as receiver, telling(receiver, Path(sys.argv[1]), webhook_hosts=("http://hangs.example",)) as service:
+    cancelled(service, "http://hangs.example/")
+    assert asked.wait(60.0)
+print("the service has ended", flush=True)
+"""
+
+
+def test_a_service_ends_while_a_resolver_hangs(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HANGING_LOOK_UP, str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=ENDS_WITHIN_S)
+    assert (ended.returncode, ended.stdout) == (0, "the service has ended\n"), ended.stderr
+
+
+def test_look_ups_are_bounded_and_a_cancelled_one_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    go_on = threading.Event()
+
+    def hanging(host: str, *_: Any, **__: Any) -> Any:
+        asked.append(host)
+        go_on.wait()
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.0.1", 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", hanging)
+
+    async def look_up() -> None:
+        look_ups = LookUps(2)
+        tasks = [asyncio.create_task(look_ups.addresses(f"{number}.example")) for number in range(3)]
+        while len(asked) < 2:
+            await asyncio.sleep(0.01)
+        tasks[0].cancel()
+        await asyncio.wait(tasks[:1])
+        assert len(asked) == 2
+        go_on.set()
+        assert await asyncio.gather(*tasks[1:]) == [["127.0.0.1"]] * 2
+        assert sorted(asked) == ["0.example", "1.example", "2.example"]
+
+    asyncio.run(look_up())
 
 
 def test_no_proxy_of_the_environment_is_used(
