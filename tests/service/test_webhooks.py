@@ -56,7 +56,11 @@ def test_a_done_job_is_told_and_the_documented_sample_verifies_it(
     assert is_genuine(webhook)
     assert not is_genuine(webhook, "another-tenant")
     assert not is_genuine(Webhook(webhook.path, webhook.headers, webhook.body + b" "))
-    assert not is_genuine(Webhook(webhook.path, {**webhook.headers, "webhook-timestamp": "1"}, webhook.body))
+    for name in ("webhook-id", "webhook-timestamp", "webhook-signature"):
+        assert not is_genuine(Webhook(webhook.path, {**webhook.headers, name: "1"}, webhook.body))
+        assert not is_genuine(Webhook(webhook.path, {**webhook.headers, name: "v1,é 9"}, webhook.body))
+        others = {each: value for each, value in webhook.headers.items() if each != name}
+        assert not is_genuine(Webhook(webhook.path, others, webhook.body))
     document = webhook.document
     assert document.pop("timestamp").startswith("20")
     assert document == {
