@@ -15,7 +15,8 @@ from contract.access.keys import KeyScope
 from contract.queue.interface import event_order
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState, JobView
 from contract.wire.labels import LabelChange
-from contract.wire.webhooks import Delivery
+from contract.wire.webhooks import MAX_TRIES_BEFORE_AGAIN, Delivery
+from service.callbacks import check_callback
 from service.deps import AnyCaller, Deps, Services, owned_job
 from service.events import NOTHING_SEEN
 from service.listing import PAGED, JobQuery, find_page, tell_next
@@ -67,6 +68,32 @@ def list_deliveries(job_id: str, services: Services, caller: AnyCaller) -> list[
     """The webhooks about this job's ends, and every try to deliver them; none of a job without a callback_url."""
     caller.require(KeyScope.VIEW)
     return services.queue.deliveries(owned_job(services, caller, job_id).job_id)
+
+
+@router.post("/{job_id}/deliveries", status_code=202, operation_id="send_again")
+def send_again(job_id: str, services: Services, caller: AnyCaller) -> list[Delivery]:
+    """Send the webhook about the job's last end now, whether it is owed, was given up or was delivered.
+
+    It keeps its id, and its schedule begins anew. A try that is under way counts as this one. The answer is that of
+    GET /jobs/{job_id}/deliveries.
+    """
+    caller.require(KeyScope.RECONSTRUCT)
+    record = owned_job(services, caller, job_id)
+    if record.callback_url is None:
+        remedy = "Name callback_url when you send a clip; POST /reconstruct with clip_of sends this one again."
+        raise Problem(409, "The job has no callback_url.", field="job_id", remedy=remedy)
+    if record.state not in TERMINAL_STATES:
+        detail = f"The job is {record.state}, and its webhook is sent when it has ended."
+        raise Problem(409, detail, field="job_id", remedy=f"See GET /jobs/{job_id}/events.")
+    check_callback(record.callback_url, services.settings)
+    last = Delivery.of(record).event_id
+    tries = sum(len(each.tries) for each in services.queue.deliveries(job_id) if each.event_id == last)
+    if tries >= MAX_TRIES_BEFORE_AGAIN:
+        detail = f"The webhook was tried {tries} times; one of {MAX_TRIES_BEFORE_AGAIN} or more is not sent again."
+        raise Problem(409, detail, field="job_id", remedy=f"Ask for what it tells: GET /jobs/{job_id}.")
+    services.audit.record(AuditAction.SENT_AGAIN, caller, job_id)
+    services.queue.send_again(record)
+    return services.queue.deliveries(job_id)
 
 
 @router.patch("/{job_id}", operation_id="label_job")

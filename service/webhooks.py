@@ -30,6 +30,7 @@ from contract.runtime.version import version
 from contract.wire.errors import UnavailableError
 from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnded, TryFailure
 from service.callbacks import LookUps, is_allowed, permitted_addresses
+from service.retry_after import asked_wait_s
 
 LOOK_PERIOD_S = 0.5
 MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
@@ -42,18 +43,20 @@ CONNECT_S = 4.0
 """The same for the connection to one address: a host may have another one that answers."""
 MAX_TRIES = 11
 FIRST_WAIT_S, WAIT_GROWS, MAX_WAIT_S, JITTER = 5.0, 4.0, 6 * 3600.0, 0.2
-"""5 s after the first try, 20 s after the second, ... 6 h after the last but one: 26 h in all."""
+"""5 s after the first try, 20 s after the second, ... 6 h after the last but one: 26 h in all, unless receivers ask for
+longer waits."""
 
 logger = logging.getLogger("intrasplat.service")
 
 
 class TryFailed(Exception):
-    """A try failed; status_code: of the receiver's answer, if there was one."""
+    """A try failed. status_code, retry_after_s: of the receiver's answer, if there was one, and if it asked to wait."""
 
-    def __init__(self, failure: TryFailure, status_code: int | None = None) -> None:
+    def __init__(self, failure: TryFailure, status_code: int | None = None, retry_after_s: float | None = None) -> None:
         super().__init__(failure)
         self.failure = failure
         self.status_code = status_code
+        self.retry_after_s = retry_after_s
 
 
 class Webhooks:
@@ -117,7 +120,8 @@ class Webhooks:
 
     async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
         """The delivery after one more try."""
-        began_s, status_code, failure, job_id = time.time(), None, None, loan.delivery.job_id
+        began_s, job_id = time.time(), loan.delivery.job_id
+        status_code = failure = retry_after_s = None
         span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=traces.Kind.CLIENT, job_id=job_id)
         try:
             span.set(method="POST", host=_host_of(httpx.URL(loan.url)))
@@ -126,7 +130,7 @@ class Webhooks:
         except TimeoutError:
             failure = TryFailure.TIMEOUT
         except TryFailed as error:
-            failure, status_code = error.failure, error.status_code
+            failure, status_code, retry_after_s = error.failure, error.status_code, error.retry_after_s
         except Exception:
             logger.exception("a webhook was not sent by a fault of ours", extra={"job_id": job_id})
             failure = TryFailure.FAULT
@@ -134,11 +138,13 @@ class Webhooks:
             if status_code is not None:
                 span.set(status=status_code)
             span.end(failed=failure or ("cancelled" if status_code is None else None))
-        return _after(loan.delivery, DeliveryTry(at_s=began_s, status_code=status_code, failure=failure))
+        tried = DeliveryTry(at_s=began_s, status_code=status_code, failure=failure, retry_after_s=retry_after_s)
+        return _after(loan.delivery, tried)
 
     async def _note(self, loan: Loan, delivery: Delivery) -> None:
         _log(delivery)
-        wait_s = wait_after(len(delivery.tries)) if delivery.status is DeliveryStatus.OWED else None
+        asked_s = delivery.tries[-1].retry_after_s or 0.0
+        wait_s = wait_after(_counted(delivery), asked_s) if delivery.status is DeliveryStatus.OWED else None
         try:
             await to_thread.run_sync(self._queue.note_try, loan, delivery, wait_s, limiter=self._threads)
         except UnavailableError as error:  # the loan runs out, and the webhook is sent once more
@@ -175,21 +181,29 @@ class Webhooks:
         raise failed
 
 
-def wait_after(tries: int) -> float:
-    """Seconds from so many failed tries to the next, about: many that failed together do not come back together."""
+def wait_after(tries: int, asked_s: float = 0.0) -> float:
+    """Seconds from so many failed tries to the next, about: many that failed together do not come back together.
+
+    asked_s: how long the receiver asked to be left alone, which is the least.
+    """
     wait_s = min(FIRST_WAIT_S * WAIT_GROWS ** (tries - 1), MAX_WAIT_S)
-    return wait_s * random.uniform(1 - JITTER, 1 + JITTER)
+    return max(wait_s * random.uniform(1 - JITTER, 1 + JITTER), asked_s * random.uniform(1, 1 + JITTER))
+
+
+def _counted(delivery: Delivery) -> int:
+    """How many of its tries count."""
+    return len(delivery.tries) - delivery.forgiven_tries
 
 
 def _after(delivery: Delivery, tried: DeliveryTry) -> Delivery:
     """The delivery with one more try."""
-    tries = (*delivery.tries, tried)
+    after = delivery.model_copy(update={"tries": (*delivery.tries, tried)})
     status = DeliveryStatus.OWED
     if tried.failure is None:
         status = DeliveryStatus.DELIVERED
-    elif tried.status_code == httpx.codes.GONE or len(tries) >= MAX_TRIES:
+    elif tried.status_code == httpx.codes.GONE or _counted(after) >= MAX_TRIES:
         status = DeliveryStatus.FAILED
-    return delivery.model_copy(update={"tries": tries, "status": status})
+    return after.model_copy(update={"status": status})
 
 
 def _log(delivery: Delivery) -> None:
@@ -236,7 +250,7 @@ async def _send(http: httpx.AsyncClient, url: httpx.URL, address: str, request: 
     at = url.copy_with(host=address)
     async with http.stream("POST", at, content=request.body, headers=headers, extensions=extensions) as answer:
         if not answer.is_success:
-            raise TryFailed(TryFailure.STATUS, answer.status_code)
+            raise TryFailed(TryFailure.STATUS, answer.status_code, asked_wait_s(answer, MAX_WAIT_S))
         return answer.status_code
 
 

@@ -44,11 +44,19 @@ class Receiver:
     """Keeps what comes and answers with `answers`, one after the other, then with 204; a context manager.
 
     tls: it speaks https with this certificate. waits: it answers a request only after go_on(). floods: its answers have
-    bodies without end.
+    bodies without end. retry_after: of each of its `answers`.
     """
 
-    def __init__(self, *answers: int, tls: ssl.SSLContext | None = None, waits: bool = False, floods: bool = False):
+    def __init__(
+        self,
+        *answers: int,
+        tls: ssl.SSLContext | None = None,
+        waits: bool = False,
+        floods: bool = False,
+        retry_after: str | None = None,
+    ) -> None:
         self._answers = list(answers)
+        self._retry_after = retry_after
         self._floods = floods
         self._end = threading.Event()
         self._may_answer = threading.Event()
@@ -101,8 +109,11 @@ class Receiver:
         self.all.append(webhook)
         self.came.put(webhook)
         self._may_answer.wait()
+        asks_to_wait = self._answers and self._retry_after
         status = self._answers.pop(0) if self._answers else 204
         request.send_response(status)
+        if asks_to_wait:
+            request.send_header("Retry-After", asks_to_wait)
         request.send_header("Set-Cookie", "receivers=own")
         if 300 <= status < 400:
             request.send_header("Location", "/elsewhere")

@@ -33,6 +33,7 @@
  *   ended_at_s: number,
  *   status?: DeliveryStatus,
  *   tries?: DeliveryTry[],
+ *   forgiven_tries?: number,
  *   next_try_at_s?: number | null,
  * }} Delivery
  */
@@ -42,6 +43,7 @@
  *   at_s: number,
  *   status_code?: number | null,
  *   failure?: TryFailure | null,
+ *   retry_after_s?: number | null,
  * }} DeliveryTry
  */
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */

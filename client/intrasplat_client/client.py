@@ -165,6 +165,10 @@ class Client:
         """The webhooks about the ends of a job that has a callback_url, with every try to deliver them."""
         return run(self._core.deliveries(job_id))
 
+    def send_again(self, job_id: str) -> list[Delivery]:
+        """Have the webhook about a job's last end sent now, whatever became of it; then as deliveries()."""
+        return run(self._core.send_again(job_id))
+
     def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""
         return run(self._core.cancel(job_id))

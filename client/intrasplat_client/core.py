@@ -148,6 +148,11 @@ class Core:
         response = await self._session.request(Call("GET", _path("jobs", job_id, "deliveries"), is_repeatable=True))
         return parsed(response, TypeAdapter(list[Delivery]).validate_json, response.content)
 
+    async def send_again(self, job_id: str) -> list[Delivery]:
+        """Have the webhook about a job's last end sent now, whatever became of it; then as deliveries()."""
+        response = await self._session.request(Call("POST", _path("jobs", job_id, "deliveries")))
+        return parsed(response, TypeAdapter(list[Delivery]).validate_json, response.content)
+
     async def cancel(self, job_id: str) -> JobView:
         """Cancel a job; a running one stops a moment later."""
         return await self._job(Call("DELETE", _path("jobs", job_id), is_repeatable=True))

@@ -219,6 +219,8 @@ class Delivery(Model):
     """when the job ended, UNIX s"""
     status: Annotated[DeliveryStatus | str, Field(union_mode="left_to_right")] = DeliveryStatus.OWED
     tries: tuple[DeliveryTry, ...] = ()
+    forgiven_tries: int = 0
+    """how many of them no longer count, because a caller had the webhook sent again since"""
     next_try_at_s: float | None = None
     """when it is tried next, UNIX s; None: of one that is owed, a try is under way"""
 
@@ -232,6 +234,8 @@ class DeliveryTry(Model):
     """the receiver's answer; None if there was none"""
     failure: Annotated[TryFailure | str, Field(union_mode="left_to_right")] | None = None
     """why it failed; None: the webhook was delivered"""
+    retry_after_s: float | None = None
+    """for how long a receiver that answered 429 or 503 asked to be left alone (Retry-After)"""
 
 
 class FrameScore(Model):

@@ -48,6 +48,8 @@ class AuditAction(StrEnum):
     """Its label or metadata were changed; the audit does not hold them."""
     CANCELLED = "cancelled"
     RETRIED = "retried"
+    SENT_AGAIN = "sent-again"
+    """The webhook about its end."""
     PURGED = "purged"
     """Two lines: "begun", then "done". The outcome also says whether retention did it."""
     REFUSED = "refused"

@@ -11,6 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol
 
+from contract.wire.job import JobRecord
 from contract.wire.webhooks import Delivery
 
 LOAN_S = 30.0
@@ -18,7 +19,7 @@ LOAN_S = 30.0
 
 
 OWED_FOR_S = 26 * 3600.0
-"""The webhook of a job that ended longer ago was delivered or given up, also by a queue that was lost since."""
+"""A webhook that the queue has lost is owed again, unless its job ended longer ago than tries usually go on."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,15 @@ class Deliveries(Protocol):
         """Keep what became of a loan: the delivery with one more try. False if the loan no longer holds.
 
         wait_s: until it is due again; None: it is owed no more.
+        """
+        ...
+
+    def send_again(self, record: JobRecord) -> None:
+        """Make the delivery about a job's last end due now, whatever became of it, with its tries forgiven.
+
+        It stays as it is while a try is under way, and if the job has gone or gone on meanwhile.
+
+        record: of a job that has ended and has a callback.
         """
         ...
 

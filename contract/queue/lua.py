@@ -21,7 +21,7 @@ from contract.wire.names import BUDGETS_S
 
 NAMES = (
     *("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget"),
-    *("lend", "note", "announce"),
+    *("lend", "note", "again", "announce"),
 )
 
 UNREADABLE = JobError(

@@ -228,6 +228,12 @@ class MemoryQueue:
         with self._changed:
             return self._deliveries.note(loan, delivery, wait_s)
 
+    def send_again(self, record: JobRecord) -> None:
+        with self._changed:
+            known = self._records.get(record.job_id)
+            if known and (known.attempt, known.state) == (record.attempt, record.state):
+                self._deliveries.send_again(known)
+
     def deliveries(self, job_id: str) -> list[Delivery]:
         with self._changed:
             return self._deliveries.of(job_id)

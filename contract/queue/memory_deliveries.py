@@ -8,7 +8,7 @@ from collections.abc import Collection
 
 from contract.queue.deliveries import LOAN_S, Loan
 from contract.wire.job import JobRecord
-from contract.wire.webhooks import Delivery, DeliveryStatus, event_id
+from contract.wire.webhooks import Delivery, DeliveryStatus
 
 
 class MemoryDeliveries:
@@ -33,14 +33,9 @@ class MemoryDeliveries:
 
     def owe(self, record: JobRecord) -> None:
         """The delivery of a job that has just ended, if it has a callback."""
-        event = event_id(record.job_id, record.attempt, record.state)
-        if record.callback_url is None or event in self._all:
-            return
-        error_code = record.error.code.value if record.error else None
-        ended_at_s = record.finished_at_s or time.time()
-        self._all[event] = Delivery(event_id=event, state=record.state, error_code=error_code, ended_at_s=ended_at_s)
-        self._due_at_s[event] = time.time()
-        self._tenants[event] = record.tenant
+        delivery = Delivery.of(record)
+        if record.callback_url is not None and delivery.event_id not in self._all:
+            self._set_due(delivery, record.tenant)
 
     def lend(self, token: str, passed: Collection[str]) -> tuple[Delivery, str] | None:
         """The delivery and the mark of its loan."""
@@ -74,6 +69,12 @@ class MemoryDeliveries:
             self._due_at_s[event] = time.time() + wait_s
         return True
 
+    def send_again(self, record: JobRecord) -> None:
+        """As Deliveries.send_again has it, of a job that is as the record says."""
+        delivery = Delivery.of(record)
+        if not self._is_tried(delivery.event_id):
+            self._set_due(self._all.get(delivery.event_id, delivery).again(), record.tenant)
+
     def of(self, job_id: str) -> list[Delivery]:
         """The deliveries of a job, with when they are tried next."""
         found = [each for each in self._all.values() if each.job_id == job_id]
@@ -87,6 +88,13 @@ class MemoryDeliveries:
             self._due_at_s.pop(delivery.event_id, None)
             self._trying.pop(delivery.event_id, None)
 
+    def _set_due(self, delivery: Delivery, tenant: str) -> None:
+        self._all[delivery.event_id] = delivery
+        self._due_at_s[delivery.event_id] = time.time()
+        self._tenants[delivery.event_id] = tenant
+
+    def _is_tried(self, event: str) -> bool:
+        return self._trying.get(event, 0.0) > time.time()
+
     def _next_at_s(self, event: str) -> float | None:
-        is_tried = self._trying.get(event, 0.0) > time.time()
-        return None if is_tried else self._due_at_s.get(event)
+        return None if self._is_tried(event) else self._due_at_s.get(event)

@@ -1,4 +1,4 @@
-"""The queue on Redis 7+ or Valkey Streams. This file and contract/queue/scripts/ are all that touches keys.
+"""The queue on Redis 7+ or Valkey Streams. This file, redis_deliveries.py and scripts/ are all that touches keys.
 
 Keys (the braces put all of them in one cluster slot, so that a script may touch several):
     {intrasplat}:jobs:high|standard     stream; an entry has one field, `job` = job id. Group `workers`; an entry stays
@@ -54,12 +54,10 @@ import logging
 import time
 import uuid
 from collections import Counter
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import redis
 
-from contract.queue.deliveries import LOAN_S, Loan, delivery_of
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -82,12 +80,13 @@ from contract.queue.interface import (
 )
 from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import PATIENCE_S, connect, reachable
+from contract.queue.redis_deliveries import RedisDeliveries
 from contract.queue.redis_hash import BESIDE_EVENTS, label_fields, new_record, record_of, table_of
 from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
-from contract.wire.webhooks import Delivery, DeliveryStatus
+from contract.wire.webhooks import DeliveryStatus
 
 PREFIX = "{intrasplat}:"
 INDEX = PREFIX + "index"
@@ -106,7 +105,7 @@ LEASE_CHECK_S = 0.5
 logger = logging.getLogger("intrasplat.queue")
 
 
-class RedisQueue:
+class RedisQueue(RedisDeliveries):
     """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
 
     patience_s: how long, in all, a call waits for a server that does not answer. Who claims needs more than BLOCK_S for
@@ -122,8 +121,8 @@ class RedisQueue:
         lease_s: float = LEASE_S,
         preempt_after_s: float = PREEMPT_AFTER_S,
     ) -> None:
-        self._client: Any = connect(url, patience_s)
-        self._scripts = Scripts(self._client, PREFIX, lease_s, preempt_after_s)
+        client = connect(url, patience_s)
+        super().__init__(client, Scripts(client, PREFIX, lease_s, preempt_after_s), PREFIX)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         limits = (admission.queued, admission.queued_per_tenant) if admission else ("", "")
@@ -241,35 +240,6 @@ class RedisQueue:
         idempotency_key = (record and record.idempotency_key) or ""
         return bool(self._scripts.run("forget", job_id, terminal, idempotency_key, uuid.uuid4().hex))
 
-    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
-        while answer := self._scripts.run("lend", token, round(LOAN_S * 1000), *passed):
-            event, document, url, tenant, mark, trace = answer
-            if delivery := delivery_of(document):
-                return Loan(delivery, url, tenant, mark, trace or None)
-            if self._scripts.run("note", event, mark, "", DeliveryStatus.FAILED.value, "", tenant):
-                logger.error("A webhook cannot be read and is given up.", extra={"job_id": event.partition(".")[0]})
-        return None
-
-    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
-        wait_ms = "" if wait_s is None else round(wait_s * 1000)
-        document = delivery.model_dump_json(exclude={"next_try_at_s"})
-        told = (delivery.event_id, loan.mark, document, delivery.status.value, wait_ms, loan.tenant)
-        return bool(self._scripts.run("note", *told))
-
-    def deliveries(self, job_id: str) -> list[Delivery]:
-        with reachable():
-            found = [each for each in map(delivery_of, self._client.hvals(_deliveries_key(job_id))) if each]
-            if not found:
-                return []
-            tenant = self._client.hget(_job_key(job_id), "tenant")
-            with self._client.pipeline(transaction=True) as batch:
-                batch.zmscore(f"{PREFIX}tenant:{tenant}:owed", [each.event_id for each in found])
-                batch.mget([f"{PREFIX}trying:{each.event_id}" for each in found])
-                due, trying = batch.execute()
-        next_s = [None if is_tried else at_s for at_s, is_tried in zip(due, trying, strict=True)]
-        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
-        return sorted(told, key=lambda each: each.ended_at_s)
-
     def rewrite_log(self) -> bool:
         try:
             with reachable():
@@ -383,10 +353,6 @@ def _address(name: str, document: str) -> WorkerAddress | None:
 
 def _job_key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}"
-
-
-def _deliveries_key(job_id: str) -> str:
-    return f"{PREFIX}deliveries:{job_id}"
 
 
 def _worker_key(name: str) -> str:

@@ -6,6 +6,7 @@ whoever receives it asks for the rest with a key.
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated
@@ -13,11 +14,13 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.codes import known_code
-from contract.wire.job import JobState
+from contract.wire.job import JobRecord, JobState
 from contract.wire.names import JOB_ID_PATTERN
 
 CALLBACK_PART = "callback_url"
 MAX_CALLBACK_CHARACTERS = 1000
+MAX_TRIES_BEFORE_AGAIN = 100
+"""A webhook that was tried this often is not sent again: every try stands in its log."""
 CALLBACK_ABOUT = "where a webhook goes when the job has ended: a URL at a host that the service's operator has allowed"
 
 
@@ -53,6 +56,10 @@ class DeliveryTry(BaseModel):
     failure: Annotated[TryFailure | None, known_code(TryFailure)] = Field(
         default=None, description="why it failed; None: the webhook was delivered"
     )
+    retry_after_s: float | None = Field(
+        default=None,
+        description="for how long a receiver that answered 429 or 503 asked to be left alone (Retry-After)",
+    )
 
 
 class Delivery(BaseModel):
@@ -66,6 +73,9 @@ class Delivery(BaseModel):
     ended_at_s: float = Field(description="when the job ended, UNIX s")
     status: DeliveryStatus = DeliveryStatus.OWED
     tries: tuple[DeliveryTry, ...] = ()
+    forgiven_tries: int = Field(
+        default=0, description="how many of them no longer count, because a caller had the webhook sent again since"
+    )
     next_try_at_s: float | None = Field(
         default=None, description="when it is tried next, UNIX s; None: of one that is owed, a try is under way"
     )
@@ -74,6 +84,20 @@ class Delivery(BaseModel):
     def job_id(self) -> str:
         """The job."""
         return self.event_id.partition(".")[0]
+
+    @classmethod
+    def of(cls, record: JobRecord) -> Delivery:
+        """What is owed about the end of a job that has ended."""
+        return cls(
+            event_id=event_id(record.job_id, record.attempt, record.state),
+            state=record.state,
+            error_code=record.error.code.value if record.error else None,
+            ended_at_s=record.finished_at_s or time.time(),
+        )
+
+    def again(self) -> Delivery:
+        """The same, owed anew: the tries so far are forgiven."""
+        return self.model_copy(update={"status": DeliveryStatus.OWED, "forgiven_tries": len(self.tries)})
 
 
 class EndedJob(BaseModel):

@@ -47,6 +47,9 @@ def test_a_caller_is_told_of_its_jobs_end_and_sees_the_log(
         while not (deliveries := client.deliveries(job.id))[0].tries:
             time.sleep(0.02)
         assert [each.status_code for each in deliveries[0].tries] == [204]
+        (owed,) = client.send_again(job.id)
+        assert (owed.event_id, owed.forgiven_tries) == (deliveries[0].event_id, 1)
+        assert receiver.next().headers["webhook-id"] == owed.event_id
 
 
 def test_a_place_that_is_not_allowed_is_refused_by_its_name(telling: LocalService, clip: Path) -> None:

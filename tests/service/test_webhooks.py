@@ -22,17 +22,10 @@ from contract.store.shelf import new_job_id
 from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from service import webhooks
-from service.webhooks import FIRST_WAIT_S, JITTER, MAX_TRIES, MAX_WAIT_S, wait_after
+from service.webhooks import MAX_TRIES
 from tests.receiver import Receiver, Webhook
 from tests.service.telling import LOG_WITHIN_S, PATIENT, SECRET, accepted, cancelled, failure_of, log_of, sent, telling
 from tests.service.under_test import ServiceUnderTest, another_clip, assert_problem, bearer, running_service
-
-
-@pytest.fixture
-def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Failed tries are repeated at once."""
-    monkeypatch.setattr(webhooks, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(webhooks, "MAX_WAIT_S", 0.001)
 
 
 @pytest.fixture
@@ -127,15 +120,6 @@ def test_a_receiver_that_wants_no_more_hears_no_more(tmp_path: Path) -> None:
     with Receiver(410) as receiver, telling(receiver, tmp_path) as service:
         job_id = cancelled(service, f"{receiver.origin}/")
         assert len(log_of(service, job_id, lambda delivery: delivery["status"] == "failed")["tries"]) == 1
-
-
-def test_waits_grow_fourfold_from_seconds_to_hours_and_differ_a_little() -> None:
-    waits_s = [wait_after(tries) for tries in range(1, MAX_TRIES)]
-    assert waits_s[0] == pytest.approx(FIRST_WAIT_S, rel=JITTER)
-    assert waits_s[1] == pytest.approx(4 * FIRST_WAIT_S, rel=JITTER)
-    assert waits_s[-1] == pytest.approx(MAX_WAIT_S, rel=JITTER)
-    assert len({wait_after(1) for _ in range(9)}) > 1
-    assert sum(min(FIRST_WAIT_S * 4.0**n, MAX_WAIT_S) for n in range(MAX_TRIES - 1)) / 3600 == pytest.approx(26, abs=1)
 
 
 def test_a_receiver_that_does_not_answer_costs_one_try(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,8 +27,9 @@ local function owed_of(tenant) return P .. 'tenant:' .. tenant .. ':owed' end
 -- Stands while a service tries.
 local function trying(event) return P .. 'trying:' .. event end
 local function deliveries(id) return P .. 'deliveries:' .. id end
--- The job of an event (contract/wire/webhooks.py: event_id).
+-- The job of an event, and the event of a job's last end (contract/wire/webhooks.py: event_id).
 local function job_of(event) return string.match(event, '^[^.]*') end
+local function event_of(job) return job.id .. '.' .. job.attempt .. '.' .. job.state end
 
 local function table_of(flat)
   local found = {}
@@ -91,7 +92,7 @@ end
 local function owe(job)
   if not job.callback then return end
   local is_json, fault = pcall(cjson.decode, job.error or '')
-  local delivery = {event_id = job.id .. '.' .. job.attempt .. '.' .. job.state, state = job.state, ended_at_s = job.finished}
+  local delivery = {event_id = event_of(job), state = job.state, ended_at_s = job.finished}
   if is_json and type(fault) == 'table' then delivery.error_code = fault.code end
   if redis.call('HSETNX', deliveries(job.id), delivery.event_id, cjson.encode(delivery)) == 1 then
     set_due(job.tenant, delivery.event_id, now())

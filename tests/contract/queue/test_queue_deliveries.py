@@ -9,13 +9,13 @@ from itertools import count
 import pytest
 import redis
 
-from contract.queue import memory_deliveries, redis_queue
+from contract.queue import memory_deliveries, redis_deliveries
 from contract.queue.deliveries import Loan
 from contract.queue.interface import MAX_ATTEMPTS, Claim, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
-from contract.wire.job import JobState
+from contract.wire.job import JobRecord, JobState
 from contract.wire.webhooks import DeliveryStatus, DeliveryTry, TryFailure
-from tests.contract.queues import ERROR, claimed, job
+from tests.contract.queues import ERROR, claimed, job, known
 
 CALLBACK = "https://his.example/done"
 TOKENS = (f"{number:032x}" for number in count())
@@ -35,7 +35,7 @@ def tried(queue: Queue, loan: Loan, failure: TryFailure | None, wait_s: float | 
 
 @pytest.fixture
 def lending_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (memory_deliveries, redis_queue):
+    for module in (memory_deliveries, redis_deliveries):
         monkeypatch.setattr(module, "LOAN_S", 0.001)
 
 
@@ -240,3 +240,119 @@ def test_a_job_that_the_queue_had_lost_owes_its_webhook_again_unless_it_ended_lo
     assert loan.delivery.event_id == f"{record.job_id}.2.done"
     assert loan.delivery.ended_at_s == ended_at_s
     assert lent(queue) is None
+
+
+def given_up(queue: Queue) -> JobRecord:
+    """A job whose webhook was given up after one try."""
+    record = queue.submit(job(callback_url=CALLBACK))
+    queue.cancel(record.job_id)
+    loan = lent(queue)
+    assert loan is not None
+    assert tried(queue, loan, TryFailure.STATUS, None)
+    return known(queue, record.job_id)
+
+
+@pytest.mark.parametrize("failure", [None, TryFailure.TIMEOUT])
+def test_a_webhook_that_was_given_up_or_delivered_is_due_once_more_under_its_id_with_its_tries_forgiven(
+    queue: Queue, failure: TryFailure | None
+) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    first = lent(queue)
+    assert first is not None
+    assert tried(queue, first, failure, None)
+    for _ in range(2):
+        queue.send_again(known(queue, job_id))
+    (delivery,) = queue.deliveries(job_id)
+    assert (delivery.status, len(delivery.tries), delivery.forgiven_tries) == (DeliveryStatus.OWED, 1, 1)
+    assert delivery.next_try_at_s is not None
+    assert queue.figures().webhooks[DeliveryStatus.OWED] == 1
+    second = lent(queue)
+    assert second is not None
+    assert second.delivery.event_id == first.delivery.event_id
+    assert tried(queue, second, None, None)
+    assert lent(queue) is None
+    assert [len(each.tries) for each in queue.deliveries(job_id)] == [2]
+
+
+def test_a_webhook_that_waits_for_its_next_try_is_due_at_once_and_one_that_is_lent_stays_lent(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.cancel(job_id)
+    first = lent(queue)
+    assert first is not None
+    queue.send_again(known(queue, job_id))
+    assert lent(queue) is None
+    assert tried(queue, first, TryFailure.TIMEOUT, 3600.0)
+    assert lent(queue) is None
+    queue.send_again(known(queue, job_id))
+    second = lent(queue)
+    assert second is not None
+    assert (len(second.delivery.tries), second.delivery.forgiven_tries) == (1, 1)
+    assert lent(queue) is None
+
+
+def test_only_the_last_end_is_sent_again_and_none_of_a_job_that_went_on_or_has_gone(queue: Queue) -> None:
+    job_id = queue.submit(job(callback_url=CALLBACK)).job_id
+    queue.fail(claimed(queue)[1], ERROR)
+    failed = known(queue, job_id)
+    queue.retry(job_id)
+    while loan := lent(queue):
+        assert tried(queue, loan, None, None)
+    queue.send_again(failed)
+    assert lent(queue) is None
+    queue.finish(claimed(queue)[1])
+    while loan := lent(queue):
+        assert tried(queue, loan, None, None)
+    queue.send_again(failed)
+    assert lent(queue) is None
+    queue.send_again(known(queue, job_id))
+    again = lent(queue)
+    assert again is not None
+    assert again.delivery.state is JobState.DONE
+    done = known(queue, job_id)
+    assert queue.forget(job_id)
+    queue.send_again(done)
+    assert queue.deliveries(job_id) == []
+
+
+def test_a_webhook_that_a_lost_queue_no_longer_knows_is_sent_again(queue: Queue) -> None:
+    ended = {"state": JobState.DONE, "attempt": 1, "finished_at_s": 2000.0}
+    record = job(callback_url=CALLBACK).model_copy(update=ended)
+    assert queue.restore(record)
+    assert queue.deliveries(record.job_id) == []
+    queue.send_again(known(queue, record.job_id))
+    loan = lent(queue)
+    assert loan is not None
+    assert (loan.delivery.event_id, loan.delivery.ended_at_s) == (f"{record.job_id}.1.done", 2000.0)
+
+
+def test_a_webhook_that_could_not_be_read_is_written_anew_and_sent_again(
+    served: RedisQueue, client: redis.Redis
+) -> None:
+    record = given_up(served)
+    client.hset(f"{PREFIX}deliveries:{record.job_id}", f"{record.job_id}.0.cancelled", '{"of": "a later version"}')
+    served.send_again(record)
+    loan = lent(served)
+    assert loan is not None
+    assert (loan.delivery.job_id, loan.delivery.tries) == (record.job_id, ())
+
+
+def test_a_late_repetition_does_not_send_again_what_was_tried_since(
+    served: RedisQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record, calls, run = given_up(served), [], served._scripts.run
+
+    def noting(name: str, *arguments: object) -> object:
+        calls.append((name, *arguments))
+        return run(name, *arguments)
+
+    monkeypatch.setattr(served._scripts, "run", noting)
+    served.send_again(record)
+    (repetition,) = calls
+    loan = lent(served)
+    assert loan is not None
+    run(*repetition)
+    assert tried(served, loan, None, None)
+    run(*repetition)
+    assert lent(served) is None
+    assert [each.status for each in served.deliveries(record.job_id)] == [DeliveryStatus.DELIVERED]

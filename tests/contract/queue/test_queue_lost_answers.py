@@ -97,6 +97,21 @@ def _note(queue: Queue) -> tuple[Act, str]:
     return lambda lossy: lossy.note_try(loan, noted, None), record.job_id
 
 
+def _again(queue: Queue) -> tuple[Act, str]:
+    """A repeated call makes one delivery due, which is lent once."""
+    record = queue.submit(job(callback_url="https://his.example/done"))
+    queue.cancel(record.job_id)
+    loan = queue.lend_delivery("a" * 32)
+    assert loan is not None
+    queue.note_try(loan, loan.delivery.model_copy(update={"status": DeliveryStatus.FAILED}), None)
+
+    def again(lossy: Queue) -> object:
+        lossy.send_again(known(queue, record.job_id))
+        return [queue.lend_delivery(token * 32) is not None for token in "bc"]
+
+    return again, record.job_id
+
+
 def _forget(queue: Queue) -> tuple[Act, str]:
     record = queue.submit(job())
     queue.cancel(record.job_id)
@@ -120,6 +135,7 @@ LOST_ANSWERS: dict[str, tuple[Lost, object, int]] = {
     "restore": (_restore, True, 1),
     "lend": (_lend, True, 2),
     "note": (_note, True, 2),
+    "again": (_again, [True, False], 2),
     "forget": (_forget, True, 0),
 }
 

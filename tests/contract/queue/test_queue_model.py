@@ -156,6 +156,12 @@ class BothQueues(RuleBasedStateMachine):
                 assert queue.note_try(loan, noted, wait_s if failure else None)
 
     @rule(pick=PICK)
+    def send_again(self, pick: int) -> None:
+        record = self.server.get(self.some_job(pick))
+        if record is not None and record.state in TERMINAL_STATES and record.callback_url is not None:
+            self.both("send_again", record)
+
+    @rule(pick=PICK)
     def look(self, pick: int) -> None:
         job_id = self.some_job(pick)
         self.both("get", job_id)

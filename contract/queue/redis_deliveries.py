@@ -1,0 +1,67 @@
+"""Deliveries on Redis or Valkey; contract/queue/redis_queue.py lists the keys."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from typing import Any
+
+from contract.queue.deliveries import LOAN_S, Loan, delivery_of
+from contract.queue.lua import Scripts
+from contract.queue.redis_client import reachable
+from contract.wire.job import JobRecord
+from contract.wire.webhooks import Delivery, DeliveryStatus
+
+logger = logging.getLogger("intrasplat.queue")
+
+
+class RedisDeliveries:
+    """The part of RedisQueue that is Deliveries."""
+
+    def __init__(self, client: Any, scripts: Scripts, prefix: str) -> None:
+        self._client = client
+        self._scripts = scripts
+        self._prefix = prefix
+
+    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
+        while answer := self._scripts.run("lend", token, round(LOAN_S * 1000), *passed):
+            event, document, url, tenant, mark, trace = answer
+            if delivery := delivery_of(document):
+                return Loan(delivery, url, tenant, mark, trace or None)
+            if self._scripts.run("note", event, mark, "", DeliveryStatus.FAILED.value, "", tenant):
+                logger.error("A webhook cannot be read and is given up.", extra={"job_id": event.partition(".")[0]})
+        return None
+
+    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+        wait_ms = "" if wait_s is None else round(wait_s * 1000)
+        told = (delivery.event_id, loan.mark, _document(delivery), delivery.status.value, wait_ms, loan.tenant)
+        return bool(self._scripts.run("note", *told))
+
+    def send_again(self, record: JobRecord) -> None:
+        delivery = Delivery.of(record)
+        with reachable():
+            known = self._client.hget(self._kept(record.job_id), delivery.event_id) or ""
+        again = (delivery_of(known) or delivery).again()
+        self._scripts.run("again", delivery.event_id, known, _document(again))
+
+    def deliveries(self, job_id: str) -> list[Delivery]:
+        with reachable():
+            found = [each for each in map(delivery_of, self._client.hvals(self._kept(job_id))) if each]
+            if not found:
+                return []
+            tenant = self._client.hget(f"{self._prefix}job:{job_id}", "tenant")
+            with self._client.pipeline(transaction=True) as batch:
+                batch.zmscore(f"{self._prefix}tenant:{tenant}:owed", [each.event_id for each in found])
+                batch.mget([f"{self._prefix}trying:{each.event_id}" for each in found])
+                due, trying = batch.execute()
+        next_s = [None if is_tried else at_s for at_s, is_tried in zip(due, trying, strict=True)]
+        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
+        return sorted(told, key=lambda each: each.ended_at_s)
+
+    def _kept(self, job_id: str) -> str:
+        return f"{self._prefix}deliveries:{job_id}"
+
+
+def _document(delivery: Delivery) -> str:
+    """As it is kept: when it is due stands elsewhere."""
+    return delivery.model_dump_json(exclude={"next_try_at_s"})

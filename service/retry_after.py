@@ -1,0 +1,26 @@
+"""What receivers of webhooks say of when to come again: Retry-After (RFC 9110), in seconds or as a date."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+
+import httpx
+
+ASKS_TO_WAIT = frozenset({httpx.codes.TOO_MANY_REQUESTS, httpx.codes.SERVICE_UNAVAILABLE})
+
+
+def asked_wait_s(answer: httpx.Response, most_s: float) -> float | None:
+    """For how long an answer asks to be left alone, at most most_s; None if it asks for nothing that can be read."""
+    text = answer.headers.get("retry-after", "")
+    if answer.status_code not in ASKS_TO_WAIT:
+        return None
+    if re.fullmatch(r"\d+", text, re.ASCII):
+        return min(float(text), most_s)
+    try:
+        at = parsedate_to_datetime(text)
+    except (ValueError, OverflowError):
+        return None
+    at = at if at.tzinfo else at.replace(tzinfo=UTC)  # HTTP's dates are UTC, also where they do not say so
+    return max(0.0, min((at - datetime.now(UTC)).total_seconds(), most_s))
