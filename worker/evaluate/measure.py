@@ -26,10 +26,11 @@ from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
 from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, is_rival_system, options_of, preset_of
 from worker.evaluate.right_eye import right_eye_ranks
-from worker.evaluate.rivals import RIVAL_SYSTEMS
+from worker.evaluate.rivals import RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.run import Length, Make, RivalCandidate, every_core, run_rival
-from worker.evaluate.rows import KEY, NO_RESULT, SCORES, commit, machine
+from worker.evaluate.rows import COPIES, KEY, NO_RESULT, SCORES, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
+from worker.evaluate.thinned import thinned
 from worker.evaluate.truth import Candidate, SceneCandidate, Truth
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.timing import Timings
@@ -49,6 +50,9 @@ UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
 MAX_TIMING_S = 30.0
 """After so long the renders that are timed already are enough."""
 MAX_ERROR_CHARACTERS = 300
+OF_WHOLE_PICTURES = ("ssim", "psnr_clear_db", "psnr_right_clear_db", *COPIES)
+"""Figures in which a pixel's neighbours have a part: a lattice of pixels has none."""
+WHY_THINNED = "ssim, clear and the copies need neighbours, and scores are of every {0}th pixel of every {0}th row"
 
 Values = dict[str, object]
 
@@ -65,7 +69,7 @@ class Bench:
     rivals: Mapping[str, Make] = field(default_factory=lambda: RIVAL_SYSTEMS)
     _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
     _open: dict[tuple[str, str], OpenClip] = field(default_factory=dict)
-    _truth: dict[tuple[str, str], Truth] = field(default_factory=dict)
+    _truth: dict[tuple[str, str, int], Truth] = field(default_factory=dict)
 
     def measure(self, cell: Cell, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         """The row and the curve of a cell; a failure's row says why in `error` and has no curve.
@@ -136,14 +140,15 @@ class Bench:
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         if opened.phantom is None:
             return values | right_eye_ranks(scene, opened.clip, report.held_out), curve
-        return values | self._true(place, opened, SceneCandidate(scene), report), curve
+        return values | self._true(cell, opened, SceneCandidate(scene), report), curve
 
     def _measured_rival(self, cell: Cell, opened: OpenClip, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         """The same of a system that has no scene."""
         device, timings, options = choose_device(self.device), Timings(), options_of(cell)
         with timings.measure("open_s"):
             clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, Timings(), device)
-        on_the_way = _OnTheWay(clip)
+        step_px = scored_step_px(cell.series, device)
+        on_the_way = _OnTheWay(thinned(clip, step_px))
         fitted = run_rival(
             cell.series,
             self.rivals[cell.series],
@@ -154,6 +159,7 @@ class Bench:
             device=device,
             waited_s=sum(opened.seconds.values()) + timings.seconds["open_s"],
             hooks=dataclasses.replace(hooks, on_held_out=on_the_way.judge),
+            step_px=step_px,
         )
         report, rival = fitted.report, fitted.rival
         curve = on_the_way.completed([dataclasses.asdict(point) for point in fitted.curve], in_t_post_s=False)
@@ -164,19 +170,25 @@ class Bench:
         values = _reported(report, {**opened.seconds, **report.seconds}) | speed
         values |= {"machine": machine(report.device), "scene_bytes": report.scene_bytes, "bases": None}
         values |= {"gaussians": rival.gaussians or None, "not_measured": rival.not_measured}
+        if step_px > 1:
+            values |= dict.fromkeys(OF_WHOLE_PICTURES)
+            values["not_measured"] = f"{rival.not_measured}; whole pictures: {WHY_THINNED.format(step_px)}"
+            curve = [{**point, "ssim": None} for point in curve]
         if opened.phantom is None:
             return values, curve
-        place = (cell.clip, cell.holdout)
-        return values | self._true(place, opened, RivalCandidate(fitted, clip), report), curve
+        return values | self._true(cell, opened, RivalCandidate(fitted, clip, step_px), report, step_px), curve
 
-    def _true(self, place: tuple[str, str], opened: OpenClip, candidate: Candidate, report: Report) -> Values:
-        """The scores of a phantom's candidate against the truth."""
+    def _true(self, cell: Cell, opened: OpenClip, candidate: Candidate, report: Report, step_px: int = 1) -> Values:
+        """The scores of a phantom's candidate against the truth, on a lattice of pixels."""
         if opened.phantom is None or not report.held_out:
             return {}
+        place = (cell.clip, cell.holdout, step_px)
         if place not in self._truth:
             unused = {*report.held_out, *report.repeated}
             train = [frame for frame in range(report.frame_count) if frame not in unused]
-            self._truth[place] = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
+            self._truth[place] = Truth(
+                opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right, step_px
+            )
         return dataclasses.asdict(self._truth[place].score(candidate))
 
 

@@ -38,9 +38,10 @@ from worker.evaluate.conditions import (
     clean_given,
     write_recording,
 )
-from worker.evaluate.rivals import RIVAL_SYSTEMS
+from worker.evaluate.rivals import RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.run import Length, every_core, run_rival
 from worker.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
+from worker.evaluate.thinned import lattice, thinned_camera
 from worker.input.clip import split_frames
 from worker.machine.timing import Timings
 from worker.model.metrics import psnr_tissue
@@ -261,11 +262,13 @@ def moments_of(given: Given, held_out: Sequence[int], frame_count: int) -> list[
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """A finished model of either kind: its report, the poses [S, 4, 4] it took, and its picture at a moment."""
+    """A finished model of either kind: its report, the poses [S, 4, 4] it took, and its picture at a moment, on a
+    lattice of pixels."""
 
     report: Report
     world_from_camera: NDArray[np.float64]
     show: Callable[[Moment], RenderedFrame]
+    step_px: int = 1
 
 
 def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks: TrainingHooks) -> _Made:
@@ -287,7 +290,9 @@ def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks:
 
 def _made_by_rival(request: ReconstructionRequest, cell: StabilityCell, hooks: TrainingHooks) -> _Made:
     options, device = request.options, choose_device(request.device)
+    step_px = scored_step_px(cell.series, device)
     clip = open_with_depth(request, hooks, Timings(), device)
+    drawn_by = thinned_camera(clip.intrinsics, step_px)
     fitted = run_rival(
         cell.series,
         RIVAL_SYSTEMS[cell.series],
@@ -298,12 +303,13 @@ def _made_by_rival(request: ReconstructionRequest, cell: StabilityCell, hooks: T
         device=device,
         waited_s=0.0,
         hooks=hooks,
+        step_px=step_px,
     )
 
     def show(moment: Moment) -> RenderedFrame:
-        return fitted.renders(moment.t, clip.world_from_camera[moment.frame], clip.intrinsics)
+        return fitted.renders(moment.t, clip.world_from_camera[moment.frame], drawn_by)
 
-    return _Made(fitted.report, clip.world_from_camera, show)
+    return _Made(fitted.report, clip.world_from_camera, show, step_px)
 
 
 def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: TrainingHooks) -> Row:
@@ -334,12 +340,12 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
 
 def _judged(given: Given, made: _Made, moments: Sequence[Moment]) -> tuple[float, float]:
     """Mean psnr in dB and mean |z - truth| in mm over the moments' scored pixels; NaN where there is none."""
-    scores, errors_mm = [], []
+    scores, errors_mm, drawn = [], [], lattice(made.step_px)
     for moment in moments:
         shown = made.show(moment)
         depth_mm = shown.depth_mm
-        truth, scored = given.depth_mm[moment.truth], given.scored[moment.truth]
-        scores.append(psnr_tissue(shown.rgb, given.rgb[moment.truth], scored))
+        rgb, truth, scored = (each[moment.truth][drawn] for each in (given.rgb, given.depth_mm, given.scored))
+        scores.append(psnr_tissue(shown.rgb, rgb, scored))
         both = scored & (truth > 0) & (depth_mm > 0)
         errors_mm.append(np.abs(depth_mm[both] - truth[both]))
     return _mean(scores), _mean(np.concatenate(errors_mm))

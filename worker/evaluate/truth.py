@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from contract.wire.pose import OrbitPose, world_from_camera
 from worker.evaluate.ranking import PixelErrors, pixel_errors, rank_scores, together
+from worker.evaluate.thinned import lattice
 from worker.model.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from worker.phantom import Phantom
 from worker.render.camera import view_camera
@@ -119,7 +120,8 @@ class TruthScores:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A picture, the same with mirrored light as the endoscope sees it, the pixels both are judged on, and depth."""
+    """A picture, the same with mirrored light as the endoscope sees it, the pixels both are judged on, depth, and
+    clear_mm, up to which nothing solid may be drawn; all of the lattice's pixels alone."""
 
     frame: int
     pose: Pose
@@ -127,6 +129,7 @@ class Expected:
     baked: NDArray[np.float32]
     judged: NDArray[np.bool_]
     depth_mm: NDArray[np.float32]
+    clear_mm: NDArray[np.float32]
 
 
 class Truth:
@@ -139,9 +142,14 @@ class Truth:
         train: Sequence[int],
         held_out: Sequence[int],
         tissue_right: NDArray[np.bool_] | None = None,
+        step_px: int = 1,
     ) -> None:
-        """tissue [T, H, W]: exact, of the left eye; tissue_right: of a stereo clip's right eye, which shows it too."""
-        self._phantom, self._tissue = phantom, tissue
+        """tissue [T, H, W]: exact, of the left eye; tissue_right: of a stereo clip's right eye, which shows it too.
+
+        step_px: candidates draw, and are judged on, that lattice of pixels alone (worker/evaluate/thinned.py).
+        """
+        self._phantom, self._lattice = phantom, lattice(step_px)
+        self._tissue, self._tissue_of_tracks = tissue[(slice(None), *self._lattice)], tissue[0]
         self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
         self._seen, pivot_mm = _seen_by(phantom, train, tissue, tissue_right)
         self._tracks = phantom.trajectories(TRACK_STRIDE_PX)
@@ -204,7 +212,8 @@ class Truth:
         eye_mm = self._phantom.world_from_camera(frame)[:3, 3]
         baked = rgb if np.array_equal(pose[:3, 3], eye_mm) else self._phantom.render(frame, pose, eye_mm=eye_mm)[0]
         row, column, shows = _cells(self._phantom.surface_pixels(frame, pose).atlas_xy)
-        return Expected(frame, pose, rgb, baked, shows & self._seen[row, column], depth_mm)
+        judged, clear_mm, at = shows & self._seen[row, column], _clear_mm(depth_mm), self._lattice
+        return Expected(frame, pose, rgb[at], baked[at], judged[at], depth_mm[at], clear_mm[at])
 
     def _behind_instrument(self, own: Expected) -> Expected:
         return replace(own, judged=own.judged & ~self._tissue[own.frame])
@@ -219,7 +228,7 @@ class Truth:
     def _motion(self, candidate: Candidate) -> tuple[float, float, float]:
         """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
         row, column = self._tracks.pixels.T
-        tissue = self._tissue[0][row, column]
+        tissue = self._tissue_of_tracks[row, column]
         row, column, points_mm = row[tissue], column[tissue], self._tracks.points_mm[:, tissue]
         errors, moves = [np.empty(0)], [np.empty(0)]
         for frame in self._judged_frames:
@@ -297,11 +306,16 @@ def seen_now(
     return np.asarray(shows & seen[row, column])
 
 
-def _is_clear(shown: ShownView, expected: Expected) -> NDArray[np.bool_]:
-    """[H, W] whether nothing solid is drawn in front of the nearest true surface within one pixel."""
-    true_mm = np.where(expected.depth_mm > 0, expected.depth_mm, np.inf).astype(np.float32)
+def _clear_mm(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W] up to where nothing solid may be drawn: a little before the nearest true surface within one pixel."""
+    true_mm = np.where(depth_mm > 0, depth_mm, np.inf).astype(np.float32)
     nearest_mm = cv2.erode(true_mm, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray((shown.depth_mm <= 0) | (shown.depth_mm >= nearest_mm * (1 - FREE_SPACE)), np.bool_)
+    return np.asarray(nearest_mm * (1 - FREE_SPACE), np.float32)
+
+
+def _is_clear(shown: ShownView, expected: Expected) -> NDArray[np.bool_]:
+    """[H, W] whether nothing solid is drawn where nothing may be."""
+    return np.asarray((shown.depth_mm <= 0) | (shown.depth_mm >= expected.clear_mm), np.bool_)
 
 
 def _share_solid(shown: Sequence[ShownView], expected: Sequence[Expected]) -> float:

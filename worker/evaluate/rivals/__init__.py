@@ -14,6 +14,7 @@ from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.run import Make
+from worker.raster.backend import Device
 
 RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType(
     {"endonerf": EndoNerf, "lerplane": LerPlane, "endogaussian": EndoGaussian}
@@ -21,3 +22,11 @@ RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType(
 """By the name of their series."""
 RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""
+RAY_BY_RAY = frozenset({"endonerf", "lerplane"})
+CPU_STEP_PX = 4
+"""A picture of 160x128 of such a system takes two cores up to half a minute."""
+
+
+def scored_step_px(series: str, device: Device) -> int:
+    """The lattice of pixels that a system is scored on (worker/evaluate/thinned.py): coarse where rays take long."""
+    return CPU_STEP_PX if series in RAY_BY_RAY and device.kind == "cpu" else 1

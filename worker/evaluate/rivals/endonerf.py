@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from worker.evaluate.rivals.fields import SOLID, Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
 from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.thinned import dense_camera, lattice
 from worker.input.camera import Intrinsics
 from worker.stereo.right_eye import nearest_known
 from worker.train.hooks import RenderedFrame
@@ -131,8 +132,12 @@ class EndoNerf(Rival):
         self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
 
     def _guide_mm(self, t: float, pose: Tensor, camera: Intrinsics) -> Tensor:
-        """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's."""
-        seen, found = self._seen, np.zeros((camera.height, camera.width), np.float32)
+        """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's. A camera of
+        few pixels sees what those of the training frames would see in their places."""
+        seen = self._seen
+        step_px = max(1, round(seen.intrinsics.fx / camera.fx))
+        camera = dense_camera(camera, step_px)
+        found = np.zeros((camera.height, camera.width), np.float32)
         camera_from_world = torch.linalg.inv(pose.double())
         order = torch.argsort((seen.t - t).abs(), stable=True).tolist()
         for frame in order[:GUIDES]:
@@ -149,7 +154,7 @@ class EndoNerf(Rival):
             np.minimum.at(nearest, (i[inside], j[inside]), z[inside].astype(np.float32))
             found = np.where((found == 0) & np.isfinite(nearest), nearest, found)
         filled = nearest_known(found, found > 0)
-        return torch.from_numpy(np.where(filled > 0, filled, self._box.far_mm)).to(seen.rgb)
+        return torch.from_numpy(np.where(filled > 0, filled, self._box.far_mm)[lattice(step_px)]).to(seen.rgb)
 
 
 class _Trunk(nn.Module):

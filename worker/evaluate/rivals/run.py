@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from contract.wire.errors import Cancelled, TrainingDiverged
 from contract.wire.report import Report
 from worker.evaluate.rivals.rival import Rival, Seen, torch_threads
+from worker.evaluate.thinned import thinned, thinned_camera
 from worker.evaluate.truth import Pose, ShownView
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, Eye, FrameSplit
@@ -34,8 +35,7 @@ from worker.train.run import CurvePoint
 from worker.train.scoring import MAX_SCORED_FRAMES, FrameRenderer, score_held_out
 
 SCORED_SECONDS = (1, 3, 10, 30, 60, 120, 300, 600, 1200)
-"""Training times at which held-out frames are scored, the clock paused; fewer than of our presets, for a picture of a
-radiance field takes a processor many seconds."""
+"""Training times at which held-out frames are scored, the clock paused."""
 SCORED_ON_THE_WAY = 4
 """Held-out frames of such a score; the end is scored on as many as everybody's."""
 
@@ -132,16 +132,20 @@ def run_rival(
     device: Device,
     waited_s: float,
     hooks: TrainingHooks,
+    step_px: int = 1,
 ) -> Fitted:
     """Train a rival on the left eye of the clip's training frames, and judge it.
 
-    waited_s: from the request to the start of training. t_post_s is that and t_train_s: scoring belongs to neither.
+    Args:
+        waited_s: from the request to the start of training. t_post_s is that and t_train_s: scoring belongs to neither.
+        step_px: it is scored on that lattice of pixels alone (worker/evaluate/thinned.py), which hooks see.
 
     Raises:
         InputError: no training frame has valid depth.
         Cancelled: hooks.should_stop said so.
         TrainingDiverged: the loss or a render is not finite.
     """
+    scored = thinned(clip, step_px)
     clock = Stopwatch()
     curve: list[CurvePoint] = []
     rival = make(Seen.of(clip, split.train, device.memory), seed)
@@ -149,7 +153,7 @@ def run_rival(
     start_s = clock.elapsed_s
 
     def render_as(eye: Eye | None) -> FrameRenderer:
-        by: Eye = clip if eye is None else eye
+        by: Eye = scored if eye is None else eye
 
         def view(index: int) -> RenderedFrame:
             return renders(float(clip.t[index]), by.world_from_camera[index], by.intrinsics)
@@ -160,7 +164,7 @@ def run_rival(
         t_train_s = clock.elapsed_s
         renders.forget()
         most = MAX_SCORED_FRAMES if length.progress(made, t_train_s) >= 1 else SCORED_ON_THE_WAY
-        found = score_held_out(clip, split.held_out, render_as, hooks, most)
+        found = score_held_out(scored, split.held_out, render_as, hooks, most)
         if not math.isnan(found.left_db):
             right_db = None if math.isnan(found.right_db) else found.right_db
             curve.append(CurvePoint(t_train_s, made, found.left_db, right_db, waited_s + t_train_s))
@@ -170,8 +174,8 @@ def run_rival(
     t_train_s = curve[-1].t_train_s if curve else clock.elapsed_s
     seconds = {"start_s": start_s, "optimise_s": t_train_s - start_s, "t_train_s": t_train_s}
     seconds["t_post_s"] = waited_s + t_train_s
-    first = first_report(clip, split, _training(name, rival, made, seed, device, seconds))
-    return Fitted(rival, renders, judged(first, clip, split.train, renders, hooks), tuple(curve))
+    first = first_report(scored, split, _training(name, rival, made, seed, device, seconds))
+    return Fitted(rival, renders, judged(first, scored, split.train, renders, hooks), tuple(curve))
 
 
 def every_core() -> AbstractContextManager[None]:
@@ -180,13 +184,14 @@ def every_core() -> AbstractContextManager[None]:
 
 
 class RivalCandidate:
-    """A trained rival before the truth (worker/evaluate/truth.py)."""
+    """A trained rival before the truth (worker/evaluate/truth.py), on a lattice of pixels."""
 
-    def __init__(self, fitted: Fitted, clip: DepthClip) -> None:
+    def __init__(self, fitted: Fitted, clip: DepthClip, step_px: int) -> None:
         self._rival, self._renders, self._clip = fitted.rival, fitted.renders, clip
+        self._drawn_by = thinned_camera(clip.intrinsics, step_px)
 
     def view(self, frame: int, pose: Pose) -> ShownView:
-        shown = self._renders(float(self._clip.t[frame]), pose, self._clip.intrinsics)
+        shown = self._renders(float(self._clip.t[frame]), pose, self._drawn_by)
         unknown = np.full(shown.depth_mm.shape, np.nan, np.float32)  # no rival says how far to trust it
         return ShownView(shown.rgb, shown.depth_mm, unknown)
 

@@ -16,7 +16,7 @@ from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIAN
 from tests.worker.evaluate.rivals.test_endonerf import TINY
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, plan, preset_of
-from worker.evaluate.measure import Bench
+from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
@@ -41,7 +41,7 @@ def tiny_gaussians(seen: Seen, seed: int) -> EndoGaussian:
 
 @pytest.mark.parametrize(
     ("series", "make", "not_measured"),
-    [("endonerf", tiny, ("motion", "confidence")), ("endogaussian", tiny_gaussians, ("confidence",))],
+    [("endonerf", tiny, ("motion", "confidence", "whole pictures")), ("endogaussian", tiny_gaussians, ("confidence",))],
 )
 def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     series: str, make: Make, not_measured: tuple[str, ...]
@@ -60,16 +60,18 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     of_scenes = {"bases", "floats_a_gaussian", "stored_loss_held_out_db"}
     of_moving = {"moving_mm", "moving_error_mm"}  # nothing moves a millimetre in so short a clip
     of_gaussians: set[str] = set() if made[0].gaussians else {"gaussians"}
-    figures = {"motion": "mo", "confidence": "rank_"}
-    cannot = {name for name in TRUTH if name.startswith(tuple(figures[each] for each in not_measured))}
+    figures = {"motion": ("mo",), "confidence": ("rank_",), "whole pictures": OF_WHOLE_PICTURES}
+    starts = sum((figures[each] for each in not_measured), ())
+    cannot = {name for name in RUN_FIELDS if name in TRUTH + OF_WHOLE_PICTURES and name.startswith(starts)}
     assert empty == {"error", *of_the_right_eye, *of_scenes, *of_moving, *of_gaussians, *cannot}
     assert [each.partition(":")[0] for each in str(row["not_measured"]).split("; ")] == list(not_measured)
     assert row["scene_bytes"] == 4 * sum(each.numel() for each in made[0].parameters())
     end = curve[-1]  # a slow machine has points on the way, too
     assert set(CURVE_FIELDS) - set(KEY) == set(end)
+    assert (end["ssim"] is None) == ("ssim" in cannot)
     assert (end["iteration"], end["t_train_s"]) == (2, row["t_train_s"])
     assert row["t_post_s"] == end["t_post_s"] >= row["t_train_s"]  # type: ignore[operator]
-    for name in ("psnr_tissue_db", "ssim", "depth_agreement_mm"):
+    for name in {"psnr_tissue_db", "ssim", "depth_agreement_mm"} - cannot:
         assert end[name] == pytest.approx(row[name], abs=1e-3)
 
 

@@ -1,0 +1,60 @@
+"""A clip at every nth pixel of every nth row, to score methods that draw ray by ray: each pixel costs them the same.
+
+What is left are pixels of the clip itself, not means of several. A camera of those pixels sends the same rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+from worker.input.camera import Intrinsics
+from worker.input.clip import DepthClip, Eye
+from worker.input.clip.types import PIXELS
+
+SomeEye = TypeVar("SomeEye", bound=Eye)
+
+
+def lattice(step_px: int) -> tuple[slice, slice]:
+    """The rows and the columns that are left of a picture."""
+    each = slice(step_px // 2, None, step_px)
+    return each, each
+
+
+def thinned_camera(camera: Intrinsics, step_px: int) -> Intrinsics:
+    """The camera whose pixels are those of the lattice."""
+    first = step_px // 2
+    return Intrinsics(
+        width=len(range(first, camera.width, step_px)),
+        height=len(range(first, camera.height, step_px)),
+        fx=camera.fx / step_px,
+        fy=camera.fy / step_px,
+        cx=(camera.cx - first - 0.5) / step_px + 0.5,
+        cy=(camera.cy - first - 0.5) / step_px + 0.5,
+    )
+
+
+def dense_camera(thin: Intrinsics, step_px: int) -> Intrinsics:
+    """A camera of which thinned_camera makes the given one."""
+    first = step_px // 2
+    return Intrinsics(
+        width=thin.width * step_px,
+        height=thin.height * step_px,
+        fx=thin.fx * step_px,
+        fy=thin.fy * step_px,
+        cx=(thin.cx - 0.5) * step_px + first + 0.5,
+        cy=(thin.cy - 0.5) * step_px + first + 0.5,
+    )
+
+
+def thinned(clip: DepthClip, step_px: int) -> DepthClip:
+    """The clip of those pixels alone, both eyes; 1 leaves it as it is."""
+    if step_px == 1:
+        return clip
+    right = None if clip.right is None else _thinned_eye(clip.right, step_px)
+    return replace(_thinned_eye(clip, step_px), right=right)
+
+
+def _thinned_eye(eye: SomeEye, step_px: int) -> SomeEye:
+    arrays = {name: getattr(eye, name)[(slice(None), *lattice(step_px))] for name in PIXELS}
+    return replace(eye, intrinsics=thinned_camera(eye.intrinsics, step_px), **arrays)
