@@ -28,7 +28,8 @@ MAX_NESTING = 64  # of a calibration, whose own levels are four
 _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or StereoMIS ini."
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
-_NOT_FINITE = re.compile(r"(?<![\w\"'./-])[-+]?\.?(nan|inf|infinity)(?![\w\"'.=:-])", re.IGNORECASE)
+_NOT_FINITE = re.compile(r"(?:nan|inf(?:inity)?)(?![\w\"'.=:-])")
+_BEFORE_A_NUMBER = re.compile(r"(?<![\w\"'./-])[-+]?\.?\Z")
 _COMMENT = re.compile(r"[#;].*|<!--(?:(?!<!--).)*?-->")
 """The last of several beginnings counts: a search for the end from each of them would take the square of the length."""
 
@@ -82,11 +83,19 @@ def check_calibration_file(text: str, field: str, label: str) -> None:
 
 
 def _check_numbers(text: str, field: str, label: str) -> None:
-    """InputError for a number that is none or not finite, as a calibration that failed writes it."""
-    text = _COMMENT.sub("", "\n".join(text.splitlines()))
-    if found := _NOT_FINITE.search(text):
-        line = text.count("\n", 0, found.start()) + 1
-        problem = f"{label} holds {found.group()[:20]}, which is not a finite number, in line {line}."
+    """InputError for a number that is none or not finite, as a calibration that failed writes it.
+
+    The other threads wait for each call of a pattern: none looks at what a plain search for the letters rules out.
+    """
+    small = text.lower()
+    if "nan" not in small and "inf" not in small:
+        return
+    small = _COMMENT.sub("", "\n".join(small.splitlines()))
+    for found in _NOT_FINITE.finditer(small):
+        if (sign := _BEFORE_A_NUMBER.search(small, max(0, found.start() - 3), found.start())) is None:
+            continue
+        line = small.count("\n", 0, found.start()) + 1
+        problem = f"{label} holds {sign.group()}{found.group()}, which is not a finite number, in line {line}."
         raise InputError(field, problem, "Calibrate again, or give the calibration of this recording.")
 
 
