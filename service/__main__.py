@@ -7,6 +7,7 @@ import logging
 import sys
 
 from contract.access.keys import check_keys
+from contract.queue.installed import check_queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime import traces
 from contract.runtime.exits import ExitCode, end_by
@@ -42,7 +43,7 @@ def main() -> int:
     traces.configure("service")
     try:
         queue = RedisQueue(settings.redis_url, patience_s=QUEUE_PATIENCE_S)
-        _ask(queue)
+        check_queue(queue)
         store = open_store(settings)
     except IntrasplatError as error:
         return end_by(error)
@@ -54,16 +55,6 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         server.run()
     return ExitCode.OK if server.started else ExitCode.UNAVAILABLE
-
-
-def _ask(queue: RedisQueue) -> None:
-    """Return if the queue answers, or may do so later: finished scenes need none. UnavailableError if it never will."""
-    try:
-        queue.ping()
-    except UnavailableError as error:
-        if not error.may_return:
-            raise
-        logger.warning("starting without the queue: %s", error.problem)
 
 
 if __name__ == "__main__":

@@ -195,7 +195,7 @@ def _queue(settings: Settings) -> list[Finding]:
         try:
             queue.ping()
         except UnavailableError as error:
-            return [Finding("queue", f"REDIS_URL is set; {error.problem}", "start that server, or unset REDIS_URL")]
+            return [Finding("queue", f"REDIS_URL is set; {error.problem}", error.remedy)]
         finally:
             queue.close()
         return [Finding("queue", "REDIS_URL; it answers")]

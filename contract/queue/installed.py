@@ -1,7 +1,8 @@
-"""The queue of an installation for a command that works beside it, or while it is not running."""
+"""The queue of an installation: for a command that works beside it or without it, and for a process that starts."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,6 +10,9 @@ from contract.queue.embedded import EmbeddedServer
 from contract.queue.interface import Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
+from contract.wire.errors import UnavailableError
+
+logger = logging.getLogger("intrasplat.queue")
 
 
 @contextmanager
@@ -37,3 +41,13 @@ def _answering(url: str) -> Iterator[Queue]:
         yield queue
     finally:
         queue.close()
+
+
+def check_queue(queue: Queue) -> None:
+    """Return if the queue answers, or may do so later: finished scenes need none. UnavailableError if it never will."""
+    try:
+        queue.ping()
+    except UnavailableError as error:
+        if not error.may_return:
+            raise
+        logger.warning("starting without the queue: %s", error)

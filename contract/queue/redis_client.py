@@ -7,15 +7,21 @@ from contextlib import contextmanager
 from typing import Any
 
 import redis
-from redis.backoff import ExponentialBackoff, NoBackoff
+from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
+from redis.sentinel import MasterNotFoundError
 
-from contract.runtime.queue_url import VARIABLE, QueueUrl, parse_queue_url
+from contract.queue.sentinels import SentinelsRefuseError, primary_of
+from contract.runtime.queue_url import VARIABLE, parse_queue_url
 from contract.wire.errors import InputError, UnavailableError
 
 PATIENCE_S = 12.0
 """How long to try, in all, until the server counts as away."""
 QUEUE_REMEDY = "See whether its server runs, reachable at REDIS_URL; without REDIS_URL, `intrasplat up` starts it."
+SENTINELS_REMEDY = "See whether one runs, and monitors a server that is up by the name that stands last in REDIS_URL."
+REFUSED_REMEDY = (
+    "Correct sentinel_username= and sentinel_password= behind the ? of REDIS_URL; the user needs +sentinel|masters."
+)
 RETRIES = 2
 MAX_CONNECT_TIMEOUT_S = 2.0
 
@@ -53,7 +59,7 @@ def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
         "socket_connect_timeout": min(timeout_s, MAX_CONNECT_TIMEOUT_S),
     }
     try:
-        client: Any = _by_sentinels(where, options) if where.sentinels else redis.Redis.from_url(where.url, **options)
+        client: Any = primary_of(where, options) if where.sentinels else redis.Redis.from_url(where.url, **options)
         pool = client.connection_pool
         pool.connection_class(**pool.connection_kwargs)  # connects to nothing, and refuses unknown options
     except (ValueError, TypeError) as error:  # its text may quote a part of the password
@@ -62,30 +68,18 @@ def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
     return client
 
 
-def _by_sentinels(where: QueueUrl, options: dict[str, Any]) -> Any:
-    """A client of the primary. Sentinels share the URL's TLS; `sentinel_username`, `sentinel_password` are for them."""
-    untyped: Any = redis
-    told = untyped.connection.parse_url(where.url)
-    for name in ("host", "port"):
-        told.pop(name, None)
-    if told.pop("connection_class", None) is redis.SSLConnection:
-        told["ssl"] = True
-    given = options | told
-    asking = {name: value for name, value in given.items() if name.startswith(("ssl", "socket_"))}
-    asking |= {"retry": Retry(NoBackoff(), 0), "protocol": options["protocol"]}  # the next Sentinel is asked instead
-    for name in ("username", "password"):
-        if (value := given.pop(f"sentinel_{name}", None)) is not None:
-            asking[name] = value
-    return untyped.sentinel.Sentinel(where.sentinels, sentinel_kwargs=asking, **given).master_for(where.primary)
-
-
 @contextmanager
 def reachable() -> Iterator[None]:
     """Raise errors of the connection or the server as UnavailableError with the remedy."""
     try:
         yield
     except redis.exceptions.AuthenticationError as error:
-        raise UnavailableError("The queue refuses this user or password.", "Correct REDIS_URL.") from error
+        remedy = "Correct the user and the password before the @ of REDIS_URL."
+        raise UnavailableError("The queue refuses this user or password.", remedy) from error
+    except SentinelsRefuseError as error:
+        raise UnavailableError("The queue's Sentinels refuse this user or password.", REFUSED_REMEDY) from error
+    except MasterNotFoundError as error:
+        raise UnavailableError("No Sentinel names the queue's server.", SENTINELS_REMEDY, may_return=True) from error
     except (redis.ConnectionError, redis.TimeoutError) as error:
         problem = f"The queue does not answer ({type(error).__name__})."
         raise UnavailableError(problem, QUEUE_REMEDY, may_return=True) from error

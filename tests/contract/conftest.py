@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -140,3 +142,14 @@ def bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     yield bucket
     bucket.object_versions.delete()
     bucket.delete()
+
+
+@pytest.fixture
+def certificates(tmp_path: Path) -> Path:
+    """A folder with cert.pem for localhost, which has signed itself, and key.pem."""
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl on PATH")
+    command = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -keyout key.pem -out cert.pem"
+    command += " -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
+    subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
+    return tmp_path

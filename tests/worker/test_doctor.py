@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from contract.runtime.settings import Settings
+from tests.contract.queues import RunningServer, valkey_binary
 from worker.doctor import (
     FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
@@ -79,7 +80,16 @@ def test_a_gpu_whose_triton_is_too_old_lies_idle_with_both_versions_named() -> N
 
 def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
     finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://{tmp_path}/nobody.sock"))["queue"]
-    assert finding.remedy == "start that server, or unset REDIS_URL"
+    assert finding.remedy is not None
+    assert "See whether its server runs" in finding.remedy
+
+
+def test_a_queue_that_refuses_the_password_has_another_remedy(tmp_path: Path) -> None:
+    server = RunningServer(valkey_binary(), tmp_path / "queue", requirepass="secret")
+    finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://:wrong@{server.socket}"))["queue"]
+    server.stop()
+    assert finding.remedy is not None
+    assert "Correct the user and the password" in finding.remedy
 
 
 def test_a_full_disk_has_a_remedy(tmp_path: Path) -> None:

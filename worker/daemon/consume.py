@@ -102,7 +102,7 @@ class Consumer:
                 record = self._queue.claim(self._owner, claim_timeout_s)
             except UnavailableError as error:
                 if not away:
-                    logger.warning("waiting for the queue: %s", error.problem)
+                    logger.warning("waiting for the queue: %s", error)
                 away = True
                 self._end.wait(UNREACHABLE_PAUSE_S)
                 continue

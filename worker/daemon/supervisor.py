@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+from contract.queue.installed import check_queue
 from contract.queue.interface import ANNOUNCE_PERIOD_S, Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
@@ -49,7 +50,8 @@ def run_supervisor(
         renders_only: claim no jobs; answer renders of finished scenes.
 
     Raises:
-        UnavailableError: a worker of this name already works on this data directory, or the child cannot work here.
+        UnavailableError: a worker of this name already works on this data directory, the queue refuses this one, or the
+            child cannot work here.
     """
     assert settings.redis_url is not None
     store = open_store(settings)
@@ -64,6 +66,7 @@ def run_supervisor(
     # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
     consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
     try:
+        check_queue(queue)
         with (
             announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
             kept_tidy(store),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-import shutil
-import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -250,17 +248,6 @@ def test_an_unreachable_queue_is_a_typed_error_with_a_remedy(tmp_path: Path) -> 
     with pytest.raises(UnavailableError):
         queue.figures()
     queue.close()
-
-
-@pytest.fixture
-def certificates(tmp_path: Path) -> Path:
-    """A folder with cert.pem for localhost, which has signed itself, and key.pem."""
-    if shutil.which("openssl") is None:
-        pytest.skip("no openssl on PATH")
-    command = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -keyout key.pem -out cert.pem"
-    command += " -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
-    subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
-    return tmp_path
 
 
 def full_course(queue: Queue) -> None:

@@ -23,6 +23,7 @@ from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobState
 from contract.wire.options import ReconstructionOptions
+from tests.contract.queues import RunningServer, valkey_binary
 from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
 from worker.daemon.supervisor import run_supervisor
 from worker.phantom import PhantomSettings, make_phantom, write_endonerf
@@ -199,6 +200,14 @@ def test_a_worker_waits_for_a_queue_that_is_not_there_yet(tmp_path: Path) -> Non
         eventually(lambda: len(bench.queue.workers()) == 1)
         assert worker.poll() is None
     bench.close()
+
+
+def test_a_worker_whom_the_queue_refuses_ends_and_says_what_to_correct(tmp_path: Path) -> None:
+    server = RunningServer(valkey_binary(), tmp_path / "queue", requirepass="secret")
+    settings = Settings(data_dir=tmp_path / "data", redis_url=f"unix://:wrong@{server.socket}")
+    with pytest.raises(UnavailableError, match=r"Correct .* of REDIS_URL"):
+        run_supervisor(settings, threading.Event(), [sys.executable, str(STANDIN)])
+    server.stop()
 
 
 def test_the_supervisor_loads_nothing_that_could_hang_or_eat_memory() -> None:
