@@ -99,6 +99,10 @@ class Site:
         assert sent.status_code == 202, sent.text
         return str(sent.json()["id"])
 
+    def told(self, job_id: str) -> int:
+        """How many webhooks about the job have come."""
+        return sum(each.document["data"]["job_id"] == job_id for each in self.receiver.all)
+
     def assert_is_shown(self, job_id: str) -> None:
         """The job is done, and what a caller asks of its scene is answered."""
         assert self.job(job_id)["state"] == JobState.DONE
@@ -144,6 +148,9 @@ def test_worker_and_then_service_are_replaced_under_a_job_and_back_again(site: S
     service = site.start_service(NEW)
     site.assert_is_shown(first)
     site.assert_is_shown(waiting)
+    eventually(lambda: site.told(first) == 1)
+    assert site.http.post(f"/jobs/{first}/deliveries").status_code == 202
+    eventually(lambda: site.told(first) == 2)
 
     end_process(worker, 60.0)
     site.start_worker(old)
