@@ -5,11 +5,11 @@ A 166 kB file can decode to 18 GB, so sizes are checked in the header and again 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from contract.runtime.memory import memory_bytes
 from contract.wire.errors import LimitError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ stereo makes the depth, frame by frame, the clip lies in files; a clip that has 
 MAX_CLIP_BYTES = 8 * 1024**3  # of a clip in files, on any machine: more frames would train for too long
 
 MAX_MEMORY_BYTES = MAX_CLIP_BYTES  # of a clip with depth, on any machine
-MEMORY_PARTS = 2  # a clip gets one of this many parts of the machine's memory; the rest is for the model
+MEMORY_PARTS = 2  # a clip gets one of this many parts of memory_bytes(); the rest is for the model
 
 EYES = 2  # of a stereo clip; the largest picture accepted holds both
 
@@ -37,12 +37,9 @@ MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and each pixel a
 
 
 def memory_for_clip_bytes() -> int:
-    """Memory that a clip may take on this machine: half of its memory, at most 8 GiB."""
-    try:
-        memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # not every system tells
-        return MAX_MEMORY_BYTES
-    return min(MAX_MEMORY_BYTES, memory_bytes // MEMORY_PARTS) if memory_bytes > 0 else MAX_MEMORY_BYTES
+    """Memory that a clip may take here: half of the machine's or the container's, at most 8 GiB."""
+    there = memory_bytes()
+    return MAX_MEMORY_BYTES if there is None else min(MAX_MEMORY_BYTES, there // MEMORY_PARTS)
 
 
 def _ignore() -> None:
@@ -58,7 +55,7 @@ class ClipLimits:
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
     clip_bytes        bytes of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL)
     decoded_bytes     memory of a clip that has its depth, likewise, and bytes of everything in an archive once
-                      inflated; default: half of this machine's memory, at most 8 GiB
+                      inflated; default: memory_for_clip_bytes()
     on_picture        called after each decoded picture, from any thread, as a sign of progress
     """
 

@@ -37,6 +37,7 @@ END = b"\n"  # of the output; no line is one
 PROGRAM = ("-m", "worker.input.decode.child")
 NONSENSE = "the decoder talks nonsense"
 MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what a false answer may raise
+MEMORY_REMEDY = "Cut it shorter or scale it down, or give the worker's machine or container more memory."
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
 _PACKAGES = Path(__file__).resolve().parents[3]  # the folder that holds `worker` and `contract`
 _KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
@@ -301,7 +302,8 @@ def _result(answer: dict[str, Any] | None, status: int, field: str, allowance: A
         kind = LimitError if error["kind"] == "limit" else InputError
         raise kind(str(error["field"]), str(error["problem"]), str(error["remedy"]))
     if error["kind"] == "memory":
-        raise _undecodable(field, f"the decoder needed more than {allowance.memory_bytes / 2**30:.1f} GiB of memory")
+        problem = f"its decoder needed more than {allowance.memory_bytes / 2**30:.1f} GiB of memory."
+        raise LimitError(field, problem, MEMORY_REMEDY)
     if error["kind"] == "fault":
         return _fault(error, field, allowance)
     if status == -signal.SIGXCPU:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from contract.intake.calibration.check import check_calibration
 from contract.intake.calibration.types import RawCalibration, RectifiedCalibration, StereoCalibration, parse_calibration
+from contract.runtime.memory import memory_bytes
 from contract.wire.errors import InputError
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.options import ClipOptions
@@ -33,6 +34,7 @@ from worker.machine.mapped import let_go, mapped_zeros
 
 STAGE = "decode"
 LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy, OpenCV and a decoder's threads
+MAX_SHARE = 2 / 3  # of the memory there is; the rest is for the worker and the scenes that it shows
 MAX_CPU_S = 1800  # of all cores together; the same as MAX_TOTAL_S of one core
 
 
@@ -107,9 +109,7 @@ def decode_clip(
         "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
         "limits": limits.numbers(),
     }
-    allowance = Allowance(
-        LIBRARIES_BYTES + limits.decoded_bytes, max(limits.clip_bytes, limits.decoded_bytes), MAX_CPU_S
-    )
+    allowance = allowance_of(limits)
     decoder = take_decoder()
     decoder.ask(
         request,
@@ -123,6 +123,13 @@ def decode_clip(
     except (*MALFORMED, OSError) as error:
         decoder.close()
         raise _unfit(error) from error
+
+
+def allowance_of(limits: ClipLimits) -> Allowance:
+    """Of the process that decodes a clip: what libraries and clip may take, and at most MAX_SHARE of the memory."""
+    wanted, there = LIBRARIES_BYTES + limits.decoded_bytes, memory_bytes()
+    allowed = wanted if there is None else min(wanted, int(MAX_SHARE * there))
+    return Allowance(allowed, max(limits.clip_bytes, limits.decoded_bytes), MAX_CPU_S)
 
 
 def _unfit(error: Exception) -> InputError:

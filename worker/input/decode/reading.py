@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
@@ -26,7 +27,21 @@ _OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames
 
 def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
     """Write the clip's arrays into `folder`. Returns the rest of a clip with depth, for JSON; a stereo clip's is told
-    when it is opened, and masks and times are complete by then."""
+    when it is opened, and masks and times are complete by then.
+
+    Raises:
+        MemoryError: there is too little, also where OpenCV says so.
+        InputError: the clip or its calibration cannot be used.
+    """
+    try:
+        return _read_clip(request, folder, reports)
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError from error
+        raise
+
+
+def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
     max_frames = request["limits"]["frames"]
     opened = 0
 

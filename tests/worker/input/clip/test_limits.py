@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 
-from contract.intake.limits import HELD_BYTES_PER_PIXEL, MAX_MEMORY_BYTES, memory_for_clip_bytes
+from contract.intake import limits as limits_module
+from contract.intake.limits import HELD_BYTES_PER_PIXEL, memory_for_clip_bytes
 from contract.runtime.settings import Settings
 from contract.wire.errors import LimitError
 from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from worker.input.clip import ClipLimits, open_clip
+from worker.input.decode import decoding
 from worker.train.targets import TrainingFrames
 
 GIB = 1024**3
@@ -28,18 +28,22 @@ def test_a_pixel_takes_what_both_eyes_of_the_clip_hold_of_it_and_training_frames
     assert HELD_BYTES_PER_PIXEL - 1 < held / pixels <= HELD_BYTES_PER_PIXEL + 1  # poses and frame times, too
 
 
-@pytest.mark.parametrize(("memory_bytes", "share_bytes"), [(4 * GIB, 2 * GIB), (64 * GIB, 8 * GIB), (-1, 8 * GIB)])
-def test_a_clip_may_take_half_of_the_memory_and_at_most_eight_gib(
-    monkeypatch: pytest.MonkeyPatch, memory_bytes: int, share_bytes: int
+@pytest.mark.parametrize(
+    ("there", "clip", "decoder"),
+    [
+        (2 * GIB, GIB, 4 / 3 * GIB),
+        (8 * GIB, 4 * GIB, 16 / 3 * GIB),
+        (64 * GIB, 8 * GIB, 10 * GIB),
+        (None, 8 * GIB, 10 * GIB),
+    ],
+)
+def test_a_clip_takes_half_of_the_memory_at_most_and_its_decoder_two_thirds(
+    monkeypatch: pytest.MonkeyPatch, there: int | None, clip: int, decoder: float
 ) -> None:
-    answers = {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": memory_bytes}
-    monkeypatch.setattr(os, "sysconf", answers.__getitem__)
-    assert ClipLimits().decoded_bytes == memory_for_clip_bytes() == share_bytes
-
-
-def test_where_the_system_does_not_tell_its_memory_eight_gib_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(os, "sysconf")
-    assert memory_for_clip_bytes() == MAX_MEMORY_BYTES
+    for module in (limits_module, decoding):
+        monkeypatch.setattr(module, "memory_bytes", lambda: there)
+    assert ClipLimits().decoded_bytes == memory_for_clip_bytes() == clip
+    assert decoding.allowance_of(ClipLimits()).memory_bytes == pytest.approx(decoder, abs=1)
 
 
 def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
