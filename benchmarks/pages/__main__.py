@@ -2,7 +2,7 @@
 
     python -m benchmarks.pages
 
-Reads docs/results/{runs,curves}.csv and capacity/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
+Reads docs/results/{runs,curves}.csv, capacity/ and table1/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
 stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long,poses,keyframes,masks}.csv,
 off-axis.jpg, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
@@ -20,6 +20,7 @@ from benchmarks.pages.moving import moving_sections
 from benchmarks.pages.post import post_sections
 from benchmarks.pages.right_eye import two_eyes_sections
 from benchmarks.pages.stability import stability_sections
+from benchmarks.pages.table1 import table1_sections
 from benchmarks.pages.truth import confidence_sections, measure_sections, off_axis_sections, stereo_truth_sections
 from worker.evaluate.stability import STABILITY
 
@@ -108,6 +109,7 @@ def main() -> None:
     parts = [
         _INTRODUCTION,
         *sections(RESULTS),
+        *table1_sections(RESULTS),
         *post_sections(RESULTS),
         *two_eyes_sections(RESULTS),
         *off_axis_sections(RESULTS),

@@ -36,8 +36,8 @@ SHOWN_BELOW_WORST_DB = 6.0
 """Curves begin far below where they end; what lies this far under the worst end is cut off."""
 MAX_FINE_TICKS = 500
 """An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
-REAL_CLIP, PAPERS_HOLDOUT = "d4d-a", "every8"
-"""Published figures are drawn for the real clip alone, held out as the papers do."""
+REAL_CLIPS, PAPERS_HOLDOUT = ("d4d-a", "d4d-a-320x256"), "every8"
+"""Published figures are drawn for the real clip alone, at any size, held out as the papers do."""
 SCORE, DECIBEL = "psnr_tissue_db", "held-out psnr_tissue, dB"
 TRAINING, SINCE_REQUEST, SPEED = "t_train_s", "t_post_s", "render_fps"
 OVER_TIME = {
@@ -119,7 +119,7 @@ def _draw_presets(presets: Sequence[Group], curves: Sequence[Row], folder: Path)
 def clip_alone(groups: Sequence[Group]) -> str:
     """The clip of the chart that shows one alone: the real one if it was measured, else the first."""
     clips = [group.clip for group in groups if group.rows]
-    return REAL_CLIP if REAL_CLIP in clips else clips[0]
+    return next((clip for clip in REAL_CLIPS if clip in clips), clips[0])
 
 
 def _draw(groups: Sequence[Group], draw_panel: DrawPanel, folder: Path, name: str, across: Sequence[str]) -> None:
@@ -201,7 +201,7 @@ def _ends(axis: Any, groups: Sequence[Group], across: str, *, score: str = SCORE
     without = _marks(axis, groups, across, score)
     if across != SPEED:
         _front(axis, groups, across, score)
-    if across != SINCE_REQUEST and groups and groups[0].place == (REAL_CLIP, PAPERS_HOLDOUT):
+    if across != SINCE_REQUEST and groups and _has_published(groups[0].place):
         _published(axis, across)
     return without
 
@@ -340,10 +340,16 @@ def _handles(groups: Sequence[Group], name: str) -> list[Any]:
     for megabytes in LEGEND_MEGABYTES:
         disc: dict[str, Any] = {"marker": "o", "markersize": math.sqrt(AREA_A_MEGABYTE * megabytes)}
         handles.append(Line2D([], [], color=FAINT, linestyle="none", label=f"{megabytes} MB", **disc))
-    if name != "pareto-post" and (REAL_CLIP, PAPERS_HOLDOUT) in _places(groups):
+    if name != "pareto-post" and any(map(_has_published, _places(groups))):
         hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "none"}
         handles.append(Line2D([], [], color=GREY, linestyle="none", label=LABEL, **hollow))
     return handles
+
+
+def _has_published(place: Place) -> bool:
+    """Whether published figures are drawn beside those of a place."""
+    clip, holdout = place
+    return clip in REAL_CLIPS and holdout == PAPERS_HOLDOUT
 
 
 def _places(groups: Sequence[Group]) -> list[Place]:

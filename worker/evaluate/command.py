@@ -38,7 +38,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "clips",
         nargs="*",
         metavar="CLIP",
-        help=f"a path, {PHANTOM_SPELLING}, or d4d_endonerf or d4d_stereo of INTRASPLAT_DATA",
+        help=f"a path, {PHANTOM_SPELLING}, or d4d_endonerf[:WxH] or d4d_stereo of INTRASPLAT_DATA",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rows, summary and charts; goes on there"

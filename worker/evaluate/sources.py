@@ -9,7 +9,8 @@ phantom:MOTION[:...]:nomasks                without masks of the instruments
 phantom:MOTION[:...]:stereo                 the same tissue as a stereo clip: both eyes without loss, their calibration
                                             and the left eye's masks, rectified and matched as a user's clip is; it has
                                             no poses
-d4d_endonerf, d4d_stereo                    the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a
+d4d_endonerf[:WxH], d4d_stereo              the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a.
+                                            WxH, of a clip with depth: shrunk by a whole number to this size
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
 from contract.wire.options import ClipOptions, ReconstructionOptions
+from worker.evaluate.thinned import shrunk
 from worker.input.clip import DepthClip
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
@@ -58,6 +60,7 @@ class Source:
     clip     the recording's file or folder
     files    beside it: calibration, masks
     options  how the files are to be read
+    size     (width, height) that a recording with depth is shrunk to; None leaves it as it is
     """
 
     name: str
@@ -68,6 +71,7 @@ class Source:
     clip: Path = Path()
     files: Mapping[str, Path] = field(default_factory=dict)
     options: ClipOptions = field(default_factory=ClipOptions)
+    size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +97,7 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
     """
     if argument.startswith("phantom:"):
         return _drawn(argument)
-    if argument in RECORDINGS and not Path(argument).exists():
+    if argument.partition(":")[0] in RECORDINGS and not Path(argument).exists():
         return _recording(argument)
     if not Path(argument).exists():
         remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
@@ -133,19 +137,38 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
     calibration, masks = source.files.get("calibration"), source.files.get("masks")
     request = ReconstructionRequest(source.clip, options, calibration=calibration, masks=masks)
     clip = open_with_depth(request, hooks, timings, device)
+    clip = clip if source.size is None else shrunk(clip, _shrinks_by(clip, source))
     return OpenClip(clip, None, timings.seconds, clip.tissue)
 
 
+def _shrinks_by(clip: DepthClip, source: Source) -> int:
+    """The whole number by which the clip shrinks to the source's size. InputError if there is none."""
+    assert source.size is not None
+    height, width = clip.intrinsics.height, clip.intrinsics.width
+    step = width // source.size[0]
+    if (width, height) != (step * source.size[0], step * source.size[1]):
+        problem = f"{source.argument} has {width}x{height} pixels, which no whole number shrinks to that size."
+        raise InputError("CLIP", problem, f"Write {source.argument.partition(':')[0]}:{width // 2}x{height // 2}.")
+    return step
+
+
 def _recording(argument: str) -> Source:
-    name, file, beside = RECORDINGS[argument]
+    known_as, _, size = argument.partition(":")
+    name, file, beside = RECORDINGS[known_as]
+    wanted = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", size)
+    if size and (wanted is None or beside):
+        raise InputError("CLIP", f"{argument!r} is not known.", "Write d4d_endonerf:WxH, or leave the size out.")
     folder, remedy = os.environ.get(DATA_VARIABLE), f"Set {DATA_VARIABLE} to the folder that holds it, or leave it out."
     if not folder:
         problem = f"{argument} is looked for where {DATA_VARIABLE} says, and that is not set."
         raise InputError("CLIP", problem, remedy)
     path = Path(folder) / file
     if not path.exists():
-        raise InputError("CLIP", f"{argument} is not under {folder}.", remedy)
-    return Source(name, argument, clip=path, files={key: path.parent / each for key, each in beside.items()})
+        raise InputError("CLIP", f"{known_as} is not under {folder}.", remedy)
+    files = {key: path.parent / each for key, each in beside.items()}
+    if wanted is None:
+        return Source(name, argument, clip=path, files=files)
+    return Source(f"{name}-{size}", argument, clip=path, files=files, size=(int(wanted[1]), int(wanted[2])))
 
 
 def _drawn(argument: str) -> Source:

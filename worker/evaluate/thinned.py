@@ -1,12 +1,15 @@
-"""A clip at every nth pixel of every nth row, to score methods that draw ray by ray: each pixel costs them the same.
+"""A clip of fewer pixels, for methods that draw ray by ray: each pixel costs them the same.
 
-What is left are pixels of the clip itself, not means of several. A camera of those pixels sends the same rays.
+thinned  every nth pixel of every nth row, to score on: pixels of the clip itself; their camera sends the same rays
+shrunk   squares of n pixels become one, to train on, as a recording at a smaller size would be
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
 
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip, Eye
@@ -55,6 +58,22 @@ def thinned(clip: DepthClip, step_px: int) -> DepthClip:
     return replace(_thinned_eye(clip, step_px), right=right)
 
 
+def shrunk(clip: DepthClip, step_px: int) -> DepthClip:
+    """The left eye at 1 / step_px of its width and height, which it divides. Colours are means; tissue is where all of
+    a square is; depth is one of its middle pixels, not a mean over an edge."""
+    frames, height, width, _ = clip.rgb.shape
+    squares = (frames, height // step_px, step_px, width // step_px, step_px)
+    size = clip.intrinsics.resized(width // step_px, height // step_px)
+    rgb = np.rint(clip.rgb.reshape(*squares, 3).mean((2, 4), dtype=np.float32)).astype(np.uint8)
+    depths = {name: _at_lattice(clip, name, step_px) for name in ("depth_mm", "depth_confidence")}
+    tissue = np.asarray(clip.tissue.reshape(squares).all((2, 4)))
+    return replace(clip, rgb=rgb, tissue=tissue, intrinsics=size, right=None, **depths)
+
+
+def _at_lattice(eye: Eye, name: str, step_px: int) -> Any:
+    return getattr(eye, name)[(slice(None), *lattice(step_px))]
+
+
 def _thinned_eye(eye: SomeEye, step_px: int) -> SomeEye:
-    arrays = {name: getattr(eye, name)[(slice(None), *lattice(step_px))] for name in PIXELS}
+    arrays = {name: _at_lattice(eye, name, step_px) for name in PIXELS}
     return replace(eye, intrinsics=thinned_camera(eye.intrinsics, step_px), **arrays)

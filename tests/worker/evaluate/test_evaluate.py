@@ -23,7 +23,7 @@ from worker.evaluate.measure import Bench, Values, _OnTheWay, command_of, second
 from worker.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, adding_alone, read_rows
 from worker.evaluate.sources import DATA_VARIABLE, open_source, source_of
 from worker.machine.hooks import Hooks, Progress
-from worker.phantom import PhantomSettings
+from worker.phantom import PhantomSettings, make_phantom, write_endonerf
 from worker.train.hooks import RenderedFrame, TrainingHooks
 
 CLIP = "phantom:pull:96x80:12frames"
@@ -154,6 +154,23 @@ def test_the_curve_of_a_row_has_the_clock_of_a_run_that_nobody_evaluates() -> No
     on_the_way.judge(1, view)
     curve: list[Values] = [{"t_post_s": "10.000"}, {"t_post_s": "16.000"}]
     assert [point["t_post_s"] for point in on_the_way.completed(curve)] == [10.0, 14.0]
+
+
+def test_a_recording_is_shrunk_by_a_whole_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=9)), tmp_path / "d4d_endonerf")
+    monkeypatch.setenv("INTRASPLAT_DATA", str(tmp_path))
+    whole, half = (open_source(source_of(f"d4d_endonerf{size}"), "every8", TrainingHooks()) for size in ("", ":32x24"))
+    assert source_of("d4d_endonerf:32x24").name == "d4d-a-32x24"
+    np.testing.assert_allclose(half.clip.rgb[0, 0, 0], whole.clip.rgb[0, :2, :2].mean((0, 1)), atol=0.51)
+    assert half.tissue[0, 5, 5] == whole.tissue[0, 10:12, 10:12].all()
+    assert half.clip.depth_mm[0, 5, 5] == whole.clip.depth_mm[0, 11, 11]
+    assert half.clip.intrinsics == whole.clip.intrinsics.resized(32, 24)
+    for size in (":30x24", ":640x480"):
+        with pytest.raises(InputError, match="no whole number"):
+            open_source(source_of(f"d4d_endonerf{size}"), "every8", TrainingHooks())
+    for unknown in ("d4d_endonerf:half", "d4d_stereo:337x256"):
+        with pytest.raises(InputError, match="is not known"):
+            source_of(unknown)
 
 
 def test_a_recording_is_looked_for_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from benchmarks.bm_post import FIELDS
 from benchmarks.pages.evaluation import CAPACITY, MARKS, sections, write_readme
 from benchmarks.pages.post import POST, post_claim, post_sections
+from benchmarks.pages.table1 import TABLE_1, table1_sections
 from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
 from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, write_rows
 
@@ -104,3 +105,20 @@ def test_the_page_says_which_runs_count_scoring_as_waiting(tmp_path: Path) -> No
     assert "t_post_s" not in "".join(sections(tmp_path)), "without the chart"
     (tmp_path / "pareto-post.png").touch()
     assert "1 of 2 runs were measured when a scene was scored before" in "".join(sections(tmp_path))
+
+
+def test_each_system_of_table_1_stands_beside_the_next_and_the_papers_difference(tmp_path: Path) -> None:
+    assert table1_sections(tmp_path) == []
+    folder = tmp_path / TABLE_1
+    folder.mkdir()
+    runs = [
+        run_row("paper", 34.0, limit="3000 iterations", render_fps=60),
+        run_row("endogaussian", 30.0, t_train_s=60, render_fps=20),
+        run_row("endogaussian", 31.5, limit="300 s", t_train_s=300, render_fps=20),
+        run_row("endonerf", 25.0, render_fps=0.04),
+    ]
+    write_rows(folder / RUNS, RUN_FIELDS, runs)
+    page = "".join(table1_sections(tmp_path))
+    assert "| d4d-a | every8 | 2.5 | – | – | 3.0 | – | – |" in page, "the longest run of each counts"
+    assert "| published, EndoNeRF data |  | 0.2 | 1.1 | 1.0 | 2.6 | 88.4 | 48.3 |" in page
+    assert page.index("| endogaussian | 60 s") < page.index("| endogaussian | 300 s") < page.index("| endonerf |")

@@ -1,0 +1,99 @@
+"""The part of docs/results/index.md on the four systems of the paper's table 1: the rows of `make table1`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmarks.pages.markdown import number, origin, table
+from worker.evaluate.published import RESULTS, Published
+from worker.evaluate.rows import Results
+from worker.evaluate.summary import Group, Place, groups_of
+
+TABLE_1 = "table1"
+"""The folder beside runs.csv that holds the rows, and their charts."""
+SYSTEMS = {"paper": "Deform3DGS", "endogaussian": "EndoGaussian", "lerplane": "LerPlane", "endonerf": "EndoNeRF"}
+"""By series: what the paper calls it. In the paper's order: each is better and faster than the next."""
+_INTRODUCTION = """
+## The paper's table 1 under one clock
+
+`make table1` ([table1/runs.csv](table1/runs.csv), [curves.csv](table1/curves.csv)): EndoNeRF, LerPlane and EndoGaussian
+written anew from their papers, beside Deform3DGS (`paper`) and `fast`, on the same frames, by the same scores and clock
+([decision 078](../decisions/078-rivals.md) lists what had to differ and why). `d4d-a-320x256` is `d4d-a` at half its
+size. Hollow marks are published.
+
+![Held-out psnr_tissue against seconds of training, for each system](table1/curves.png)
+
+![Final psnr_tissue against seconds of training](table1/pareto.png)
+
+![Final psnr_tissue against images rendered a second](table1/frames.png)
+"""
+_ORDERS = """
+The paper's table has each system better than the next: {systems}. What the longest run of each comes to here, in dB
+above the next, and how many times as many images it renders a second; below 0, and below 1, the order is another:
+"""
+_COLUMNS = {
+    "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "iterations": ("steps", 0), "render_fps": ("images/s", 2),
+    "psnr_view10_db": ("10°, dB", 1), "bound10_db": ("bound", 1), "psnr_hidden_db": ("hidden, dB", 1),
+    "depth_error_mm": ("depth, mm", 2), "moving_error_mm": ("moving, mm", 2), "moving_mm": ("moved by, mm", 2),
+}  # fmt: skip
+"""By column of runs.csv: its name and digits."""
+
+
+def table1_sections(folder: Path) -> list[str]:
+    """The section; nothing without rows."""
+    results = Results(folder / TABLE_1)
+    groups = [group for group in groups_of(results.runs) if group.rows]
+    if not groups:
+        return []
+    places = list(dict.fromkeys(group.place for group in groups))
+    rows = [_row(group) for place in places for group in _in_order(groups, place)]
+    header = ["clip", "held out", "series", "given", *(name for name, _ in _COLUMNS.values()), "MB"]
+    return [_INTRODUCTION, table(header, rows), *_orders(groups, places), origin(results.runs)]
+
+
+def _row(group: Group) -> list[str]:
+    figures = [number(group.median(name), digits) for name, (_, digits) in _COLUMNS.items()]
+    return [*group.place, group.series, group.limit, *figures, number(group.median("scene_bytes") / 1e6, 1)]
+
+
+def _in_order(groups: Sequence[Group], place: Place) -> list[Group]:
+    """The groups of a place, system by system, short runs first."""
+    order = ["fast", *SYSTEMS]
+    here = [group for group in groups if group.place == place and group.series in order]
+    return sorted(here, key=lambda group: (order.index(group.series), group.median("t_train_s")))
+
+
+def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
+    """Each system beside the next, by the longest run of each; nothing where no two ran at one place."""
+    pairs = list(itertools.pairwise(SYSTEMS))
+    rows = []
+    for data in dict.fromkeys(each.data for each in RESULTS):
+        known = {each.method: each for each in RESULTS if each.data == data}
+        rows.append(
+            [f"published, {data} data", "", *_compared(pairs, lambda series, known=known: known[SYSTEMS[series]])]
+        )
+    for place in places:
+        longest = {group.series: group for group in _in_order(groups, place)}
+        rows.append([*place, *_compared(pairs, longest)])
+    header = ["clip", "held out", *(f"{a} – {b}, dB" for a, b in pairs), *(f"{a} / {b}, images" for a, b in pairs)]
+    told = all(each == "–" for row in rows[len(rows) - len(places) :] for each in row[2:])
+    return [] if told else [_ORDERS.format(systems=", ".join(SYSTEMS.values())), table(header, rows)]
+
+
+def _compared(pairs: Sequence[tuple[str, str]], found: Mapping[str, Published | Group]) -> list[str]:
+    """Differences in dB of the pairs, then quotients of images a second; dashes where one of the two is missing."""
+    figures = {series: _figures(found.get(series)) for series in SYSTEMS}
+    above = [number(figures[a][0] - figures[b][0], 1) for a, b in pairs]
+    return above + [number(figures[a][1] / figures[b][1], 1) for a, b in pairs]
+
+
+def _figures(found: Published | Group | None) -> tuple[float, float]:
+    """dB and images a second."""
+    if found is None:
+        return math.nan, math.nan
+    if isinstance(found, Published):
+        return found.psnr_paper_db, found.fps or math.nan
+    return found.median("psnr_tissue_db"), found.median("render_fps")
