@@ -69,18 +69,19 @@ def _in_order(groups: Sequence[Group], place: Place) -> list[Group]:
 def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
     """Each system beside the next, by the longest run of each; nothing where no two ran at one place."""
     pairs = list(itertools.pairwise(SYSTEMS))
-    rows = []
-    for data in dict.fromkeys(each.data for each in RESULTS):
-        known = {each.method: each for each in RESULTS if each.data == data}
-        rows.append(
-            [f"published, {data} data", "", *_compared(pairs, lambda series, known=known: known[SYSTEMS[series]])]
-        )
+    measured = []
     for place in places:
         longest = {group.series: group for group in _in_order(groups, place)}
-        rows.append([*place, *_compared(pairs, longest)])
+        measured.append([*place, *_compared(pairs, longest)])
+    if all(figure == "–" for row in measured for figure in row[2:]):
+        return []
+    published = []
+    for data in dict.fromkeys(each.data for each in RESULTS):
+        methods = {each.method: each for each in RESULTS if each.data == data}
+        known = {series: methods[name] for series, name in SYSTEMS.items()}
+        published.append([f"published, {data} data", "", *_compared(pairs, known)])
     header = ["clip", "held out", *(f"{a} – {b}, dB" for a, b in pairs), *(f"{a} / {b}, images" for a, b in pairs)]
-    told = all(each == "–" for row in rows[len(rows) - len(places) :] for each in row[2:])
-    return [] if told else [_ORDERS.format(systems=", ".join(SYSTEMS.values())), table(header, rows)]
+    return [_ORDERS.format(systems=", ".join(SYSTEMS.values())), table(header, published + measured)]
 
 
 def _compared(pairs: Sequence[tuple[str, str]], found: Mapping[str, Published | Group]) -> list[str]:
