@@ -29,6 +29,7 @@ __all__ = ["valkey_url"]
 
 FOLDER = REPOSITORY / "docker" / "kubernetes"
 README = (FOLDER / "README.md").read_text(encoding="utf-8")
+SENTINEL_CONF = (REPOSITORY / "docker" / "sentinel.conf").read_text(encoding="utf-8")
 PARTS = frozenset({"kustomization.yaml", "patch.yaml"})
 """What kustomize reads; no documents of a cluster."""
 WITHOUT_SCHEMA = frozenset({"keda.sh/v1alpha1"})
@@ -42,9 +43,13 @@ def documents_of(text: str) -> list[Document]:
     return [each for each in yaml.safe_load_all(text) if each]
 
 
+def of_kind(documents: list[Document], *kinds: str) -> dict[str, Document]:
+    return {each["metadata"]["name"]: each for each in documents if each["kind"] in kinds}
+
+
 FILES = sorted(path for path in FOLDER.rglob("*.yaml") if path.name not in PARTS)
 DOCUMENTS = [each for path in FILES for each in documents_of(path.read_text(encoding="utf-8"))]
-WORKLOADS = {each["metadata"]["name"]: each for each in DOCUMENTS if each["kind"] in ("Deployment", "StatefulSet")}
+WORKLOADS = of_kind(DOCUMENTS, "Deployment", "StatefulSet")
 COMPOSED = {"intrasplat-service": "service", "intrasplat-worker": "worker"}
 """By workload: the same container in docker/compose.yml."""
 
@@ -82,21 +87,28 @@ def test_a_document_with_a_misspelt_name_would_be_found() -> None:
         check({**WORKLOADS["intrasplat-worker"], "spek": {}})
 
 
-@needs_kubectl
-@pytest.mark.parametrize("left_out", [(), ("gpu",), ("keda",), ("gpu", "keda")], ids=str)
-def test_kustomize_joins_the_parts_to_sound_documents(left_out: tuple[str, ...], tmp_path: Path) -> None:
-    shutil.copytree(FOLDER, tmp_path / "kubernetes")
-    mine = tmp_path / "kubernetes" / "kustomization.yaml"
+def joined(folder: Path, left_out: tuple[str, ...] = (), added: tuple[str, ...] = ()) -> list[Document]:
+    """What kustomize makes of kustomization.yaml without some of its parts and with further components."""
+    shutil.copytree(FOLDER, folder / "kubernetes")
+    mine = folder / "kubernetes" / "kustomization.yaml"
     content = yaml.safe_load(mine.read_text(encoding="utf-8"))
     for key in ("resources", "components"):
         content[key] = [each for each in content[key] if each not in left_out]
+    content["components"] += added
     mine.write_text(yaml.safe_dump(content), encoding="utf-8")
     command = ["kubectl", "kustomize", str(mine.parent)]
     made = documents_of(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
     for document in made:
         check(document)
+    return made
+
+
+@needs_kubectl
+@pytest.mark.parametrize("left_out", [(), ("gpu",), ("keda",), ("gpu", "keda")], ids=str)
+def test_kustomize_joins_the_parts_to_sound_documents(left_out: tuple[str, ...], tmp_path: Path) -> None:
+    made = joined(tmp_path, left_out)
     assert {each["metadata"]["namespace"] for each in made} == {"intrasplat"}
-    workloads = {each["metadata"]["name"]: each for each in made if each["kind"] in ("Deployment", "StatefulSet")}
+    workloads = of_kind(made, "Deployment", "StatefulSet")
     gpu = set() if "gpu" in left_out else {"intrasplat-worker-gpu"}
     assert set(workloads) == {"intrasplat-service", "intrasplat-worker"} | gpu
     (config,) = (each for each in made if each["kind"] == "ConfigMap")
@@ -110,6 +122,46 @@ def test_kustomize_joins_the_parts_to_sound_documents(left_out: tuple[str, ...],
     (ingress,) = (each for each in made if each["kind"] == "Ingress")
     assert {rule["host"] for rule in ingress["spec"]["rules"]} == {config["data"]["INTRASPLAT_HOSTS"]}
     assert {host for each in ingress["spec"]["tls"] for host in each["hosts"]} == {config["data"]["INTRASPLAT_HOSTS"]}
+
+
+@needs_kubectl
+@pytest.mark.parametrize("left_out", [(), ("keda",)], ids=str)
+def test_behind_sentinels_keda_asks_them_as_their_user_and_their_port_is_open(
+    left_out: tuple[str, ...], tmp_path: Path
+) -> None:
+    made = joined(tmp_path, left_out, ("sentinels",))
+    for policy in of_kind(made, "NetworkPolicy").values():
+        assert {6379, 26379} <= {each["port"] for each in policy["spec"]["egress"][-1]["ports"]}
+    if left_out:
+        return
+    (scaled,) = of_kind(made, "ScaledObject").values()
+    for trigger in scaled["spec"]["triggers"]:
+        assert trigger["type"] == "redis-sentinel"
+        assert re.search(rf"^sentinel monitor {trigger['metadata']['sentinelMaster']} ", SENTINEL_CONF, re.MULTILINE)
+    (login,) = of_kind(made, "TriggerAuthentication").values()
+    told = {each["parameter"]: each["key"] for each in login["spec"]["secretTargetRef"]}
+    assert told.keys() == {"addresses", "username", "password", "sentinelUsername", "sentinelPassword"}
+    assert all(f"--from-literal={key}=" in README for key in told.values())
+
+
+@needs_kubectl
+@pytest.mark.parametrize("left_out", [(), ("gpu", "keda")], ids=str)
+def test_while_a_backup_is_restored_one_pod_waits_with_the_services_settings_and_no_worker_runs(
+    left_out: tuple[str, ...], tmp_path: Path
+) -> None:
+    made = joined(tmp_path, left_out, ("restore",))
+    assert {each["spec"]["replicas"] for each in of_kind(made, "Deployment").values()} == {0}
+    (waiting,) = of_kind(made, "StatefulSet").values()
+    pod, usual = pod_of(waiting), pod_of(WORKLOADS["intrasplat-service"])
+    assert waiting["spec"]["replicas"] == 1
+    assert "initContainers" not in pod  # it would put a file into the volume, which must be empty
+    ((container,), (service,)) = (pod["containers"], usual["containers"])
+    assert container["command"] == ["sleep", "infinity"]
+    assert not [name for name in container if name.endswith("Probe")]
+    for same in ("env", "volumeMounts", "securityContext"):
+        assert container[same] == service[same]
+    for scaled in of_kind(made, "ScaledObject").values():
+        assert scaled["metadata"]["annotations"] == {"autoscaling.keda.sh/paused-replicas": "0"}
 
 
 @each_workload
@@ -192,8 +244,8 @@ def test_every_secret_that_is_read_is_one_that_the_page_makes() -> None:
     named = set(re.findall(r"secretName: ([\w-]+)|secretRef: \{name: ([\w-]+)\}|name: (intrasplat-scaler)", text))
     made = set(re.findall(r"create secret \w+ ([\w-]+)", README))
     assert {name for each in named for name in each if name} == made
-    for key in ("redis_url", "render_secret"):
-        assert f"/run/secrets/intrasplat/{key}" in text
+    for key in ("redis_url", "render_secret", "webhook_secret"):
+        assert f"/run/secrets/intrasplat/{key}" in text + README
         assert f"--from-literal={key}=" in README
 
 
@@ -276,4 +328,5 @@ def test_keda_never_counts_what_a_group_has_pending() -> None:
 
 def test_tags_of_images_are_this_version() -> None:
     images = re.findall(r"image: \S+:([\w.-]+)", "\n".join(path.read_text() for path in FOLDER.rglob("*.yaml")))
+    images += re.findall(r"intrasplat-(?:\$name|service|worker):([\w.-]+)", README)
     assert {tag.removesuffix("-gpu") for tag in images} == {project()["version"]}

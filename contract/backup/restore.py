@@ -111,7 +111,8 @@ def restore_backup(
     with _writing(data_dir):
         data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         _check_empty(data_dir)
-        data_dir.chmod(0o700)
+        if data_dir.stat().st_uid == os.geteuid():  # else a volume that is its group's, and its modes another's to set
+            data_dir.chmod(0o700)
         marker, lock = data_dir / RESTORING, FolderLock(data_dir / RESTORING)
         if not lock.take():
             raise UnavailableError(f"Another restore fills {data_dir}.", "Wait until it has ended.")

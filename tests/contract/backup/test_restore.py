@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from contract.store.store import RESTORING, Store, open_store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobFiles, JobRecord, JobState
 from tests.contract.queues import ERROR, claimed, job, known
-from tests.contract.stores import BUCKET_URL, files_no_larger_than, finished, published
+from tests.contract.stores import BUCKET_URL, SERVICE, files_no_larger_than, finished, given_to, published
 
 
 class Site:
@@ -101,6 +103,39 @@ def test_modes_are_the_owners_alone_and_the_audit_tells_of_the_restore(site: Sit
     assert modes == {(True, 0o700), (False, 0o600)}
     actions = [json.loads(line)["action"] for line in (new / AUDIT_FILE).read_text().splitlines()]
     assert actions == ["backed-up", "restored"]
+
+
+@pytest.fixture
+def volume() -> Iterator[Path]:
+    """As a cluster gives it to a pod: root's, and writable by the group of the pod, which this process is meanwhile."""
+    base = Path(tempfile.mkdtemp(prefix="intrasplat-test-"))
+    base.chmod(0o755)
+    made = base / "volume"
+    made.mkdir()
+    os.chown(made, 0, SERVICE)
+    made.chmod(0o2775)
+    (made / "lost+found").mkdir(mode=0o700)
+    groups = os.getgroups()
+    yield made
+    os.seteuid(0)
+    os.setegid(0)
+    os.setgroups(groups)
+    shutil.rmtree(base)
+
+
+def become_service() -> None:
+    os.setgroups([])
+    os.setegid(SERVICE)
+    os.seteuid(SERVICE)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may become another user")
+def test_the_volume_of_a_pod_is_filled_though_it_is_its_groups_alone(site: Site, volume: Path) -> None:
+    site.done()
+    backup = site.backup(volume.parent / "backups")
+    given_to(SERVICE, backup.parent)
+    become_service()
+    assert restored(volume, MemoryQueue(), backup).jobs[JobState.DONE] == 1
 
 
 def test_what_later_audits_tell_was_purged_or_revoked_does_not_come_back(site: Site, tmp_path: Path) -> None:
