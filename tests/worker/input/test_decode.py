@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import platform
-import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +20,7 @@ from contract.wire.errors import Cancelled, InputError, LimitError
 from tests.worker.input.clip.conftest import Studio
 from worker.input.calibration import load_calibration, rectify
 from worker.input.clip import ClipLimits, DepthClip, open_clip
-from worker.input.decode import StereoRecording, decode_clip, decoding
+from worker.input.decode import StereoRecording, decode_clip
 from worker.input.decode.contained import DecoderKilledError, Patience, keep_decoder_ready, run_contained
 from worker.input.decode.guard import PROTECTIONS, Allowance
 from worker.machine.hooks import Hooks, Progress
@@ -250,37 +247,6 @@ def test_a_decoder_that_runs_out_of_its_memory_names_the_limit_and_the_remedy(tm
         run_stand_in(tmp_path, "bytearray(2 << 30)")
     assert caught.value.field == "clip"
     assert "container more memory" in caught.value.remedy
-
-
-@linux
-def test_a_picture_that_opencv_finds_no_memory_for_is_told_so(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoding, "memory_bytes", lambda: 3 << 29)
-    folder = studio.root / "frames"
-    for eye in ("left", "right"):
-        (folder / eye).mkdir(parents=True)
-        (folder / eye / "000000.png").write_bytes(png_of_zeros(24_000, 16_000))
-    calibration = studio.root / "calibration.json"
-    sizes = {"width": 24_000, "height": 16_000, "fx_px": 2e4, "fy_px": 2e4, "cx_px": 1.2e4, "cy_px": 8e3}
-    calibration.write_text(json.dumps({"model": "rectified", **sizes, "baseline_mm": 4.0}))
-
-    def decode() -> None:
-        recording = decode_clip(folder, calibration=calibration, limits=ClipLimits(pixels_per_frame=1 << 30))
-        assert isinstance(recording, StereoRecording)
-        list(recording.clip.pairs())
-
-    with pytest.raises(LimitError, match=r"needed more than 1\.0 GiB of memory"):
-        decode()
-
-
-def png_of_zeros(width: int, height: int) -> bytes:
-    """An RGB picture that ends after its first row."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    rows = zlib.compress(bytes(1 + 3 * width))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def test_a_decoder_that_something_killed_is_no_error_of_its_clip(tmp_path: Path) -> None:
