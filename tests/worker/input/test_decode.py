@@ -378,12 +378,16 @@ def test_a_decoder_ends_with_its_worker(tmp_path: Path) -> None:
     """The kernel kills it as soon as its parent is gone, however that went."""
     script = tmp_path / "parent.py"
     script.write_text(
-        "import os, sys, threading\n"
+        "import os, threading, time\n"
         "from pathlib import Path\n"
         "from tests.worker.input.test_decode import run_stand_in\n"
         "work = 'import time, os\\n' 'while True: (folder / \"beat\").write_text(str(time.time())); time.sleep(0.02)'\n"
-        "threading.Timer(1.5, os._exit, (0,)).start()\n"
-        f"run_stand_in(Path({str(tmp_path)!r}), work)\n"
+        f"folder = Path({str(tmp_path)!r})\n"
+        "def end():\n"
+        "    while not list(folder.glob('intrasplat-*/beat')): time.sleep(0.02)\n"
+        "    os._exit(0)\n"
+        "threading.Thread(target=end).start()\n"
+        "run_stand_in(folder, work)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "TMPDIR": str(tmp_path)}
     subprocess.run([sys.executable, str(script)], env=environment, check=True, timeout=60)
