@@ -17,7 +17,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from worker.evaluate.rivals.fields import SOLID, Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.fields import (
+    SOLID,
+    Box,
+    Shown,
+    cumulated,
+    drawn_pixels,
+    picture,
+    pose_tensor,
+    rays,
+    weights_along,
+)
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.thinned import dense_camera, lattice
 from worker.input.camera import Intrinsics
@@ -48,7 +58,7 @@ class EndoNerfSettings:
     width: int = 256
     spread: float = 0.02
     space_octaves: int = 10
-    time_octaves: int = 10
+    time_octaves: int = 4
     view_octaves: int = 4
     rate: float = 5e-4
     last_rate: float = 5e-5
@@ -88,7 +98,7 @@ class EndoNerf(Rival):
         """Of rays of one frame: mean squared colour error and mean depth error where there is depth."""
         seen, random = self._seen, self.generator(iteration)
         frame = self._measured[int(torch.randint(len(self._measured), (), generator=random))]
-        drawn = drawn_pixels(self._importance * seen.tissue[frame], self.settings.rays, random)
+        drawn = drawn_pixels(cumulated(self._importance * seen.tissue[frame]), self.settings.rays, random)
         width = seen.intrinsics.width
         row, column = drawn // width, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])

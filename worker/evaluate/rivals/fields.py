@@ -99,9 +99,13 @@ def weights_along(density: Tensor, length: Tensor) -> Tensor:
     return alpha * torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], -1)
 
 
-def drawn_pixels(weight: Tensor, count: int, random: torch.Generator) -> Tensor:
-    """[count] indices of the flat weights, drawn with probabilities in proportion to them."""
-    total = torch.cumsum(weight.flatten().double(), 0)
+def cumulated(weight: Tensor) -> Tensor:
+    """What drawn_pixels draws by, of weights of any shape."""
+    return torch.cumsum(weight.flatten().double(), 0)
+
+
+def drawn_pixels(total: Tensor, count: int, random: torch.Generator) -> Tensor:
+    """[count] indices of the flat weights that were cumulated(), drawn with probabilities in proportion to them."""
     drawn = torch.rand(count, generator=random, dtype=torch.float64).to(total.device) * total[-1]
     return torch.searchsorted(total, drawn, right=True).clamp(max=total.numel() - 1)
 

@@ -20,13 +20,25 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from worker.evaluate.rivals.fields import SOLID, Box, Shown, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.fields import (
+    SOLID,
+    Box,
+    Shown,
+    cumulated,
+    drawn_pixels,
+    picture,
+    pose_tensor,
+    rays,
+    weights_along,
+)
 from worker.evaluate.rivals.planes import Planes
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.input.camera import Intrinsics
 from worker.train.hooks import RenderedFrame
 
 MAX_LOG_DENSITY = 15.0
+PADDING = 0.01
+"""Weight that each interval has besides its own when the next samples are placed, as where the proposals come from."""
 WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
 
@@ -89,13 +101,14 @@ class LerPlane(Rival):
     def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:
         self.seed, self.settings = seed, settings or LerPlaneSettings.on(seen.rgb.device)
         self._seen, self._box = seen, Box.of(seen)
-        self._importance = importance(seen, self.settings.least, self.settings.most)
+        self._cumulated = cumulated(importance(seen, self.settings.least, self.settings.most))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             time_cells = max(2, min(self.settings.time_cells, len(seen)))
             self.field = _Field(self.settings, time_cells).to(seen.rgb)
             self.proposal = _Proposal(self.settings, time_cells).to(seen.rgb)
-        self.optimizer = torch.optim.Adam([*self.field.parameters(), *self.proposal.parameters()], fused=True)
+        every = [*self.field.parameters(), *self.proposal.parameters()]
+        self.optimizer = torch.optim.Adam(every, eps=1e-15, fused=True)  # a cell of a fine plane has tiny gradients
 
     def rates(self, progress: float) -> Sequence[float]:
         warm_up = self.settings.warm_up
@@ -106,7 +119,7 @@ class LerPlane(Rival):
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Colour, depth, proposals, and how even the planes are."""
         seen, chosen, random = self._seen, self.settings, self.generator(iteration)
-        drawn = drawn_pixels(self._importance, chosen.rays, random)
+        drawn = drawn_pixels(self._cumulated, chosen.rays, random)
         height, width = seen.tissue.shape[1:]
         frame, row, column = drawn // (height * width), drawn // width % height, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
@@ -144,14 +157,13 @@ class LerPlane(Rival):
             edges = drawn_edges(edges, weight.detach() ** sharpness, count, random)
             place = self._places(origin, direction, edges)
             density = self.proposal(place, t.repeat_interleave(count)).reshape(-1, count)
-            weight = weights_along(density, edges.diff(dim=-1))
+            weight = weights_along(density, _lengths(edges))
             proposed.append((edges, weight))
         edges = drawn_edges(edges, weight.detach() ** sharpness, self.settings.samples, random)
         place = self._places(origin, direction, edges)
         density, rgb = self.field(place, t.repeat_interleave(self.settings.samples))
         s = (edges[:, 1:] + edges[:, :-1]) / 2
-        length = torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(s[:, :1], SOLID)], 1)
-        weight = weights_along(density.reshape(s.shape), length)
+        weight = weights_along(density.reshape(s.shape), _lengths(edges))
         spread = sum((excess(edges, weight.detach(), *each) for each in proposed), weight.new_zeros(()))
         colour = (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1)
         return (colour, (weight * s).sum(1), weight.sum(1)), spread
@@ -185,7 +197,7 @@ def importance(seen: Seen, least: float, most: float) -> Tensor:
 
 def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generator | None) -> Tensor:
     """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1]."""
-    weight = weight + 1e-3 / weight.shape[1]  # a ray without any weight is looked at evenly
+    weight = weight + PADDING
     share = torch.cumsum(weight / weight.sum(-1, keepdim=True), -1)
     share = torch.cat([torch.zeros_like(share[:, :1]), share[:, :-1], torch.ones_like(share[:, :1])], -1)
     wanted = torch.linspace(0, 1, count + 1).to(edges).expand(len(edges), -1)
@@ -197,6 +209,11 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generat
     inside = ((wanted - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
     start, end = (edges.gather(1, each) for each in (above - 1, above))
     return start + inside * (end - start)
+
+
+def _lengths(edges: Tensor) -> Tensor:
+    """Of the intervals between the edges [M, K + 1]; the last one is opaque."""
+    return torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(edges[:, :1], SOLID)], 1)
 
 
 def excess(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:

@@ -67,7 +67,8 @@ def test_samples_gather_where_the_proposals_have_weight() -> None:
     found = drawn_edges(edges, weight, 20, None)
     assert bool((found.diff(dim=-1) >= 0).all())
     for row, (low, high) in zip(found, ((0.3, 0.4), (0.8, 0.9)), strict=True):
-        assert float(((row >= low - 1e-6) & (row <= high + 1e-6)).float().mean()) > 0.9
+        there = (row >= low - 1e-6) & (row <= high + 1e-6)
+        assert 0.8 < float(there.float().mean()) < 1, "most of them, and some look elsewhere"
 
 
 def test_it_overfits_one_frame_above_30_db() -> None:
