@@ -45,7 +45,7 @@ class EndoGaussianSettings:
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
-    resting         share of the training without motion: on two cores a quarter of the steps, which take a fifth as long
+    resting         share of the training without motion: a quarter of the steps on two cores, where they are quick
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
     """
