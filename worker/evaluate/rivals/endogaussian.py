@@ -59,7 +59,8 @@ class EndoGaussianSettings:
     time_cells: int = 150
     resting: float = 0.06
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
-    field_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
+    decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
+    plane_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
     quaternion_rate: float = 1e-3
     log_scale_rate: float = 5e-3
     opacity_rate: float = 5e-2
@@ -87,7 +88,8 @@ class EndoGaussian(Rival):
             torch.manual_seed(seed)
             self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)
         self.field.to(seen.rgb)
-        groups = [[self._moves[0]], list(self.field.parameters()), *([each] for each in self._moves[1:])]
+        of_field = [list(each.parameters()) for each in (self.field.decode, self.field.planes)]
+        groups = [[self._moves[0]], *of_field, *([each] for each in self._moves[1:])]
         groups += [[self._colour], [self._harmonics]]
         self.optimizer = torch.optim.Adam([{"params": each} for each in groups], eps=1e-15, fused=True)
 
@@ -98,7 +100,8 @@ class EndoGaussian(Rival):
     def rates(self, progress: float) -> Sequence[float]:
         chosen = self.settings
         moved = max(0.0, progress - chosen.resting) / (1 - chosen.resting)
-        falling = [first * (last / first) ** moved for first, last in (chosen.mean_rate, chosen.field_rate)]
+        pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
+        falling = [first * (last / first) ** moved for first, last in pairs]
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
 
