@@ -170,6 +170,7 @@ class Bench:
         values = _reported(report, {**opened.seconds, **report.seconds}) | speed
         values |= {"machine": machine(report.device), "scene_bytes": report.scene_bytes, "bases": None}
         values |= {"gaussians": rival.gaussians or None, "not_measured": rival.not_measured}
+        values |= {"width": camera.width, "height": camera.height}
         if step_px > 1:
             values |= dict.fromkeys(OF_WHOLE_PICTURES)
             values["not_measured"] = f"{rival.not_measured}; whole pictures: {WHY_THINNED.format(step_px)}"
