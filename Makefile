@@ -120,7 +120,7 @@ evaluate: setup ## every preset on every clip, and the charts; takes hours, and 
 table1: setup ## the systems of the paper's table 1: presets as they are, the others for TABLE_SECONDS each; takes a day, and resumes (TABLE_CLIPS=...)
 	@$(EVALUATE) $(TABLE_CLIPS) --series paper fast --out docs/results/table1
 	@for seconds in $(TABLE_SECONDS); do \
-		$(EVALUATE) $(TABLE_CLIPS) --series endogaussian lerplane endonerf --budget-s $$seconds --out docs/results/table1; \
+		$(EVALUATE) $(TABLE_CLIPS) --series endogaussian lerplane endonerf --budget-s $$seconds --out docs/results/table1 || exit; \
 	done
 	@$(BIN)/python -m benchmarks.pages
 

@@ -10,6 +10,7 @@ The Gaussians are learnt without motion first, from the first frame, then with m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,9 +107,8 @@ class EndoGaussian(Rival):
         return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
 
     def step(self, iteration: int, progress: float) -> float:
-        if progress >= self.settings.resting:
-            return super().step(iteration, progress)
-        with torch_threads(1):  # more of them spin while the rasteriser's own threads work, which takes most of a step
+        rests = progress < self.settings.resting  # more threads spin while the rasteriser's own do most of such a step
+        with torch_threads(1) if rests else nullcontext():
             return super().step(iteration, progress)
 
     def loss(self, iteration: int, progress: float) -> Tensor:
