@@ -23,6 +23,11 @@ def opacity_gradient(v_logit: Tensor, logit: Tensor) -> Tensor:
     return (v_logit.double() / slope).float()
 
 
+def scale_gradient(v_log_scale: Tensor, scale: Tensor) -> Tensor:
+    """dL/dscale [N, 3] float32 from dL/dlog_scale, finite also where a scale has underflowed to 0."""
+    return v_log_scale / scale.clamp(min=torch.finfo(scale.dtype).tiny)
+
+
 def pose_gradient(rows: Tensor, like: Tensor) -> Tensor:
     """dL/dcamera_from_world [4, 4] from that of its upper three rows, [12]; the last row gets 0."""
     pose = torch.zeros_like(like)

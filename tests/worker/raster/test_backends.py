@@ -158,6 +158,17 @@ def test_gaussians_that_are_culled_get_zero_gradient(rasterize: Rasterize) -> No
         assert not gradients[name][hidden].any(), name
 
 
+def test_a_scale_of_zero_gets_a_gradient_that_is_a_number(rasterize: Rasterize) -> None:
+    scene = random_scene(**affordable(rasterize, 40, width=19, height=11)).to(torch.float32)
+    scale = scene.scale.clone()
+    scale[::2, 1] = 0.0  # exp(-104) in float32
+    _, gradients = values_and_gradients(
+        dataclasses.replace(scene, scale=scale), rasterize, random_cotangent(scene, no_pixel(scene))
+    )
+    for name, gradient in gradients.items():
+        assert bool(torch.isfinite(gradient).all()), name
+
+
 def test_permuting_the_gaussians_permutes_their_gradients(rasterize: Rasterize) -> None:
     scene = random_scene(**affordable(rasterize, 150, width=31, height=27), seed=14).to(torch.float32)
     order = torch.randperm(len(scene.mean), generator=torch.Generator().manual_seed(0))

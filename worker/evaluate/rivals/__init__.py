@@ -1,7 +1,7 @@
 """The systems of the paper's table 1, written anew from their papers to be measured beside ours, and for that alone: no
 scene of theirs is stored or served.
 
-Read in this order: rival (what a rival is), fields (what radiance fields share), endonerf, planes, lerplane,
+Read in this order: rival (what a rival is), fields (what radiance fields share), endonerf, planes, proposals, lerplane,
 endogaussian, run (how one is trained and judged). docs/decisions/078 says where they differ from what was published.
 """
 

@@ -46,7 +46,8 @@ class EndoGaussianSettings:
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
-    resting         share of the training without motion: a quarter of the steps on two cores, where they are quick
+    resting         share of the training without motion: a quarter of the steps on two cores, where they are quick;
+                    resting_most is its most iterations
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
     """
@@ -59,6 +60,7 @@ class EndoGaussianSettings:
     features: int = 16
     time_cells: int = 150
     resting: float = 0.06
+    resting_most: int = 1000
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
     decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     plane_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
@@ -107,14 +109,14 @@ class EndoGaussian(Rival):
         return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
 
     def step(self, iteration: int, progress: float) -> float:
-        rests = progress < self.settings.resting  # more threads spin while the rasteriser's own do most of such a step
-        with torch_threads(1) if rests else nullcontext():
+        # at rest the rasteriser's own threads do most of a step, while torch's would only spin
+        with torch_threads(1) if self._rests(iteration, progress) else nullcontext():
             return super().step(iteration, progress)
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
         seen, frame = self._seen, self._measured[0]
-        rests = progress < self.settings.resting
+        rests = self._rests(iteration, progress)
         if not rests:
             drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
             frame = self._measured[int(drawn)]
@@ -147,6 +149,9 @@ class EndoGaussian(Rival):
         alpha = shown.alpha[..., None]
         motion = torch.where(alpha >= COVERED_ALPHA, shown.rgb / alpha.clamp(min=COVERED_ALPHA), torch.nan)
         return motion.float().cpu().numpy()
+
+    def _rests(self, iteration: int, progress: float) -> bool:
+        return progress < self.settings.resting and iteration <= self.settings.resting_most
 
     def _moved(self, t: float) -> Tensor:
         """What moves, at time t: [N, MOVING].

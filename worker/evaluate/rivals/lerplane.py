@@ -20,25 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from worker.evaluate.rivals.fields import (
-    SOLID,
-    Box,
-    Shown,
-    cumulated,
-    drawn_pixels,
-    picture,
-    pose_tensor,
-    rays,
-    weights_along,
-)
+from worker.evaluate.rivals.fields import Box, Shown, cumulated, drawn_pixels, picture, pose_tensor, rays, weights_along
 from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, lengths
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.input.camera import Intrinsics
 from worker.train.hooks import RenderedFrame
 
 MAX_LOG_DENSITY = 15.0
-PADDING = 0.01
-"""Weight that each interval has besides its own when the next samples are placed, as where the proposals come from."""
 WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
 
@@ -123,7 +112,7 @@ class LerPlane(Rival):
         height, width = seen.tissue.shape[1:]
         frame, row, column = drawn // (height * width), drawn // width % height, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
-        sharpness = _annealed(progress / chosen.annealed)
+        sharpness = annealed(progress / chosen.annealed)
         (rgb, depth_s, _), spread = self._shown(origin, direction, seen.t[frame], sharpness, random)
         depth_mm = seen.depth_mm[frame, row, column]
         known = depth_mm > 0
@@ -157,13 +146,13 @@ class LerPlane(Rival):
             edges = drawn_edges(edges, weight.detach() ** sharpness, count, random)
             place = self._places(origin, direction, edges)
             density = self.proposal(place, t.repeat_interleave(count)).reshape(-1, count)
-            weight = weights_along(density, _lengths(edges))
+            weight = weights_along(density, lengths(edges))
             proposed.append((edges, weight))
         edges = drawn_edges(edges, weight.detach() ** sharpness, self.settings.samples, random)
         place = self._places(origin, direction, edges)
         density, rgb = self.field(place, t.repeat_interleave(self.settings.samples))
         s = (edges[:, 1:] + edges[:, :-1]) / 2
-        weight = weights_along(density.reshape(s.shape), _lengths(edges))
+        weight = weights_along(density.reshape(s.shape), lengths(edges))
         spread = sum((excess(edges, weight.detach(), *each) for each in proposed), weight.new_zeros(()))
         colour = (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1)
         return (colour, (weight * s).sum(1), weight.sum(1)), spread
@@ -193,44 +182,6 @@ def importance(seen: Seen, least: float, most: float) -> Tensor:
         changes = [(shown[frame] - shown[other]).abs().mean(-1) for other in around] or [torch.zeros_like(often)]
         weight[frame] = torch.stack(changes).mean(0).clamp(least, most) / often * seen.tissue[frame]
     return weight
-
-
-def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generator | None) -> Tensor:
-    """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1]."""
-    weight = weight + PADDING
-    share = torch.cumsum(weight / weight.sum(-1, keepdim=True), -1)
-    share = torch.cat([torch.zeros_like(share[:, :1]), share[:, :-1], torch.ones_like(share[:, :1])], -1)
-    wanted = torch.linspace(0, 1, count + 1).to(edges).expand(len(edges), -1)
-    if random is not None:
-        jitter = (torch.rand(len(edges), count + 1, generator=random).to(edges) - 0.5) / count
-        wanted = (wanted + jitter).clamp(0, 1)
-    above = torch.searchsorted(share, wanted.contiguous(), right=True).clamp(1, share.shape[1] - 1)
-    low, high = (share.gather(1, each) for each in (above - 1, above))
-    inside = ((wanted - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
-    start, end = (edges.gather(1, each) for each in (above - 1, above))
-    return start + inside * (end - start)
-
-
-def _lengths(edges: Tensor) -> Tensor:
-    """Of the intervals between the edges [M, K + 1]; the last one is opaque."""
-    return torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(edges[:, :1], SOLID)], 1)
-
-
-def excess(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
-    """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap (Barron et al., 2022)."""
-    total = torch.cat([torch.zeros_like(proposed[:, :1]), torch.cumsum(proposed, -1)], -1)
-    most = proposed.shape[1]
-    at = proposed_edges.contiguous()
-    first = (torch.searchsorted(at, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, most)
-    last = torch.searchsorted(at, edges[:, 1:].contiguous()).clamp(0, most)
-    bound = total.gather(1, last) - total.gather(1, first)
-    return ((weight - bound).clamp(min=0).square() / (weight + 1e-7)).sum(-1).mean()
-
-
-def _annealed(done: float) -> float:
-    """The exponent of the proposals' weights: 0 at first, 1 from done = 1 on."""
-    done = min(done, 1.0)
-    return 10 * done / (9 * done + 1)
 
 
 class _Proposal(nn.Module):

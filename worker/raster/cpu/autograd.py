@@ -17,6 +17,7 @@ from worker.raster.autograd import (
     opacity_gradient,
     pose_gradient,
     rasterize_by,
+    scale_gradient,
     stacked,
 )
 from worker.raster.cpu.rasterizer import Floats, Rasterizer, padded
@@ -54,7 +55,7 @@ class _Rasterize(torch.autograd.Function):
         return (
             state[:, MEAN],
             state[:, QUATERNION],
-            state[:, LOG_SCALE] / scale,
+            scale_gradient(state[:, LOG_SCALE], scale),
             opacity_gradient(v_logit, logit),
             torch.from_numpy(gradients.colour[:, : ctx.count].T.copy()),
             pose_gradient(torch.from_numpy(gradients.pose.sum(0)), camera_from_world),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster import Camera, Rendered
-from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, stacked
+from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, scale_gradient, stacked
 from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import camera_vector
 
@@ -47,7 +47,7 @@ class _Rasterize(torch.autograd.Function):
         return (
             state[:, MEAN],
             state[:, QUATERNION],
-            state[:, LOG_SCALE] / scale,
+            scale_gradient(state[:, LOG_SCALE], scale),
             opacity_gradient(gradients.opacity_logit[0], logit),
             gradients.colour[0].T.clone(),
             pose_gradient(gradients.pose.sum((0, 1)), camera_from_world),

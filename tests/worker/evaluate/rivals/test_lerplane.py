@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
-from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, drawn_edges, excess, importance
+from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
 from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.proposals import drawn_edges, excess
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = LerPlaneSettings(
