@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.pages.markdown import number, origin, table
 from worker.evaluate.published import RESULTS, Published
+from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Results
 from worker.evaluate.summary import Group, Place, groups_of
 
@@ -31,8 +32,9 @@ size. Hollow marks are published.
 ![Final psnr_tissue against images rendered a second](table1/frames.png)
 """
 _ORDERS = """
-The paper's table has each system better than the next: {systems}. What the longest run of each comes to here, in dB
-above the next, and how many times as many images it renders a second; below 0, and below 1, the order is another:
+The paper's table has each system better than the next: {systems}.
+For each system beside the next, after its longest run (two rivals: the longest that both have had): the difference in
+dB, and how many times as many images it renders a second. Below 0, and below 1, the order is another:
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "iterations": ("steps", 0), "render_fps": ("images/s", 2),
@@ -67,28 +69,37 @@ def _in_order(groups: Sequence[Group], place: Place) -> list[Group]:
 
 
 def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
-    """Each system beside the next, by the longest run of each; nothing where no two ran at one place."""
+    """Each system beside the next; nothing where no two ran at one place."""
     pairs = list(itertools.pairwise(SYSTEMS))
     measured = []
     for place in places:
-        longest = {group.series: group for group in _in_order(groups, place)}
-        measured.append([*place, *_compared(pairs, longest)])
+        here = _in_order(groups, place)
+        measured.append([*place, *_compared([_longest(here, a, b) for a, b in pairs])])
     if all(figure == "–" for row in measured for figure in row[2:]):
         return []
     published = []
     for data in dict.fromkeys(each.data for each in RESULTS):
         methods = {each.method: each for each in RESULTS if each.data == data}
-        known = {series: methods[name] for series, name in SYSTEMS.items()}
-        published.append([f"published, {data} data", "", *_compared(pairs, known)])
+        known = [(methods[SYSTEMS[a]], methods[SYSTEMS[b]]) for a, b in pairs]
+        published.append([f"published, {data} data", "", *_compared(known)])
     header = ["clip", "held out", *(f"{a} – {b}, dB" for a, b in pairs), *(f"{a} / {b}, images" for a, b in pairs)]
     return [_ORDERS.format(systems=", ".join(SYSTEMS.values())), table(header, published + measured)]
 
 
-def _compared(pairs: Sequence[tuple[str, str]], found: Mapping[str, Published | Group]) -> list[str]:
+def _longest(here: Sequence[Group], a: str, b: str) -> tuple[Group | None, Group | None]:
+    """The longest runs of two systems at a place; of two rivals the longest of a length that both have had."""
+    of_a, of_b = ({group.limit: group for group in here if group.series == series} for series in (a, b))
+    if a in RIVAL_SYSTEMS and b in RIVAL_SYSTEMS:
+        shared = of_a.keys() & of_b.keys()
+        of_a, of_b = ({limit: each[limit] for limit in each if limit in shared} for each in (of_a, of_b))
+    last_a, last_b = (next(reversed(each.values()), None) for each in (of_a, of_b))
+    return last_a, last_b
+
+
+def _compared(pairs: Sequence[tuple[Published | Group | None, Published | Group | None]]) -> list[str]:
     """Differences in dB of the pairs, then quotients of images a second; dashes where one of the two is missing."""
-    figures = {series: _figures(found.get(series)) for series in SYSTEMS}
-    above = [number(figures[a][0] - figures[b][0], 1) for a, b in pairs]
-    return above + [number(figures[a][1] / figures[b][1], 1) for a, b in pairs]
+    figures = [(_figures(a), _figures(b)) for a, b in pairs]
+    return [number(a[0] - b[0], 1) for a, b in figures] + [number(a[1] / b[1], 1) for a, b in figures]
 
 
 def _figures(found: Published | Group | None) -> tuple[float, float]:
