@@ -46,8 +46,7 @@ class EndoGaussianSettings:
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
-    resting         share of the training without motion: a quarter of the steps on two cores, where they are quick;
-                    resting_most is its most iterations
+    resting         share of the training without motion
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
     """
@@ -60,7 +59,6 @@ class EndoGaussianSettings:
     features: int = 16
     time_cells: int = 150
     resting: float = 0.06
-    resting_most: int = 1000
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
     decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     plane_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
@@ -76,6 +74,7 @@ class EndoGaussian(Rival):
     """A training EndoGaussian."""
 
     not_measured = "confidence: it has none"
+    published_steps = 4000
 
     def __init__(self, seen: Seen, seed: int, settings: EndoGaussianSettings | None = None) -> None:
         self.seed, self.settings, self._seen = seed, settings or EndoGaussianSettings(), seen
@@ -110,13 +109,13 @@ class EndoGaussian(Rival):
 
     def step(self, iteration: int, progress: float) -> float:
         # at rest the rasteriser's own threads do most of a step, while torch's would only spin
-        with torch_threads(1) if self._rests(iteration, progress) else nullcontext():
+        with torch_threads(1) if self._rests(progress) else nullcontext():
             return super().step(iteration, progress)
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
         seen, frame = self._seen, self._measured[0]
-        rests = self._rests(iteration, progress)
+        rests = self._rests(progress)
         if not rests:
             drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
             frame = self._measured[int(drawn)]
@@ -150,8 +149,8 @@ class EndoGaussian(Rival):
         motion = torch.where(alpha >= COVERED_ALPHA, shown.rgb / alpha.clamp(min=COVERED_ALPHA), torch.nan)
         return motion.float().cpu().numpy()
 
-    def _rests(self, iteration: int, progress: float) -> bool:
-        return progress < self.settings.resting and iteration <= self.settings.resting_most
+    def _rests(self, progress: float) -> bool:
+        return progress < self.settings.resting
 
     def _moved(self, t: float) -> Tensor:
         """What moves, at time t: [N, MOVING].

@@ -76,6 +76,7 @@ class EndoNerf(Rival):
     """A training EndoNeRF."""
 
     not_measured = "motion: it maps each moment to the canonical one, not back; confidence: it has none"
+    published_steps = 100_000
 
     def __init__(self, seen: Seen, seed: int, settings: EndoNerfSettings | None = None) -> None:
         self.seed, self.settings = seed, settings or EndoNerfSettings.on(seen.rgb.device)

@@ -86,6 +86,7 @@ class LerPlane(Rival):
     """A training LerPlane."""
 
     not_measured = "motion: it has a field for each moment and no points that move; confidence: it has none"
+    published_steps = 32_000
 
     def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:
         self.seed, self.settings = seed, settings or LerPlaneSettings.on(seen.rgb.device)

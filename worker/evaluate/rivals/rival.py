@@ -62,11 +62,13 @@ class Seen:
 class Rival(ABC):
     """A method in training. All that is random follows from its seed and the iteration.
 
-    not_measured  which figures of a row it cannot have, and why
-    optimizer     has all that is trained; its groups' rates are set before every step
+    not_measured     which figures of a row it cannot have, and why
+    published_steps  iterations of its paper, at which a run with a longer budget ends: more would over-fit
+    optimizer        has all that is trained; its groups' rates are set before every step
     """
 
     not_measured: ClassVar[str]
+    published_steps: ClassVar[int]
     optimizer: torch.optim.Optimizer
     seed: int
 

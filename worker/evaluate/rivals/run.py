@@ -1,7 +1,8 @@
 """A rival is trained on a clip and judged as every model is: same frames, same clock, same scores.
 
-Rates follow the share of the budget that is used, so a longer run is a slower one. With a number of iterations nothing
-reads the clock, and the same seed gives the same numbers.
+Rates follow the share of the budget that is used, so a longer run is a slower one; it ends with the iterations
+of the paper if these come first. With a number of iterations nothing reads the clock, and the same seed gives the same
+numbers.
 """
 
 from __future__ import annotations
@@ -45,17 +46,15 @@ Make = Callable[[Seen, int], Rival]
 
 @dataclass(frozen=True)
 class Length:
-    """How long a rival trains: one of the two is given."""
+    """How long a rival trains: to the first of what is given."""
 
     iterations: int | None
     budget_s: float | None
 
     def progress(self, made: int, elapsed_s: float) -> float:
         """The share that is done; 1 or more at the end."""
-        if self.iterations is not None:
-            return made / self.iterations
-        assert self.budget_s is not None
-        return elapsed_s / self.budget_s
+        of_iterations = 0.0 if self.iterations is None else made / self.iterations
+        return of_iterations if self.budget_s is None else max(of_iterations, elapsed_s / self.budget_s)
 
 
 class Renders:
@@ -137,6 +136,7 @@ def run_rival(
     """Train a rival on the left eye of the clip's training frames, and judge it.
 
     Args:
+        length: a budget ends at the published iterations if these come first.
         waited_s: from the request to the start of training. t_post_s is that and t_train_s: scoring belongs to neither.
         step_px: it is scored on that lattice of pixels alone (worker/evaluate/thinned.py), which hooks see.
 
@@ -149,6 +149,8 @@ def run_rival(
     clock = Stopwatch()
     curve: list[CurvePoint] = []
     rival = make(Seen.of(clip, split.train, device.memory), seed)
+    if length.iterations is None:
+        length = Length(rival.published_steps, length.budget_s)
     renders = Renders(rival)
     start_s = clock.elapsed_s
 

@@ -68,7 +68,6 @@ def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -
     rival.loss(1, 0.2).backward()
     assert all(each.grad is None for each in rival.field.parameters())
     assert len(losses(0.3)) == 3
-    assert len({float(rival.loss(SMALL.resting_most + k, 0.2).detach()) for k in range(1, 31)}) == 3, "rest has a limit"
     rival.loss(1, 0.3).backward()
     assert float(rival.field.decode.weight.grad.abs().max()) > 0  # type: ignore[union-attr]
 

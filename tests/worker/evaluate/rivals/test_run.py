@@ -21,10 +21,12 @@ from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.rival import Rival, Seen
-from worker.evaluate.rivals.run import Length, Renders, train_rival
+from worker.evaluate.rivals.run import Length, Renders, run_rival, train_rival
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from worker.evaluate.sources import source_of
+from worker.input.clip import FrameSplit
 from worker.machine.timing import Stopwatch
+from worker.raster.backend import choose_device
 from worker.train.hooks import TrainingHooks
 from worker.train.presets import PRESETS
 
@@ -90,6 +92,23 @@ def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
     assert clock.elapsed_s >= 1.3, "a second of scoring at the mark of 1 s would have ended it"
     assert scored == sorted({*scored, made})
     assert reports == sorted(reports)
+
+
+def test_a_budget_ends_at_the_published_iterations_if_these_come_first() -> None:
+    clip = small_clip(2)
+
+    class Published(EndoGaussian):
+        published_steps = 3
+
+    def make(seen: Seen, seed: int) -> Published:
+        return Published(seen, seed, TINY_GAUSSIANS)
+
+    fitted = run_rival(
+        "endogaussian", make, clip, FrameSplit([1], [0], []), Length(None, 600.0),
+        seed=0, device=choose_device("cpu"), waited_s=0.0, hooks=TrainingHooks(),
+    )  # fmt: skip
+    assert fitted.report.iterations == 3
+    assert Length(4, 600.0).progress(1, 300.0) == 0.5, "the rates follow what is nearer its end"
 
 
 def test_a_rival_stops_when_it_is_asked_to_and_when_its_loss_is_no_number() -> None:
