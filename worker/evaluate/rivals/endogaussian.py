@@ -85,7 +85,10 @@ class EndoGaussian(Rival):
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
         moves = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
         self._moves: list[Tensor] = [nn.Parameter(each.to(seen.rgb)) for each in moves]
-        self._colour, self._harmonics = (nn.Parameter(each.to(seen.rgb)) for each in (start.sh[:, :1], start.sh[:, 1:]))
+        # copies, not views of one tensor: torch's fused Adam updates the wrong numbers of a view
+        self._colour, self._harmonics = (
+            nn.Parameter(each.to(seen.rgb).contiguous()) for each in (start.sh[:, :1], start.sh[:, 1:])
+        )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)

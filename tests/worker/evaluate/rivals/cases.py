@@ -90,6 +90,17 @@ def check_overfit(make: Make, iterations: int) -> None:
     assert depth_error_mm(rival, clip, 1) < 1
 
 
+def check_step(rival: Rival) -> None:
+    """A step changes the numbers that have a gradient, and no others."""
+    before = [each.detach().clone() for each in rival.parameters()]
+    rival.step(1, 0.9)
+    for each, old in zip(rival.parameters(), before, strict=True):
+        assert each.grad is not None
+        has_gradient, changed = each.grad != 0, each.detach() != old
+        assert not bool((changed & ~has_gradient).any())
+        assert int(changed.sum()) >= 0.9 * int(has_gradient.sum())
+
+
 def check_what_counts(make: Make) -> None:
     """Time and the seed change what is learnt; a frame that is held out does not."""
     clip = small_clip(9)

@@ -11,7 +11,7 @@ from worker.evaluate.rivals.rival import Seen
 
 SMALL = EndoGaussianSettings(
     share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),
-    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, colour_rate=1e-2, resting=0.25,
+    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, resting=0.25,
 )  # fmt: skip
 """What learns 64x48 pixels in seconds."""
 TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=2)

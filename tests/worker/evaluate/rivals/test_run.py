@@ -11,15 +11,17 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
-from tests.worker.evaluate.rivals.cases import Make, small_clip
+from tests.worker.evaluate.rivals.cases import Make, check_step, small_clip
 from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIANS
 from tests.worker.evaluate.rivals.test_endonerf import TINY
+from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, plan, preset_of
 from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
+from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.rivals.run import Length, Renders, run_rival, train_rival
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
@@ -75,6 +77,11 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     assert row["t_post_s"] == end["t_post_s"] >= row["t_train_s"]  # type: ignore[operator]
     for name in {"psnr_tissue_db", "ssim", "depth_agreement_mm"} - cannot:
         assert end[name] == pytest.approx(row[name], abs=1e-3)
+
+
+@pytest.mark.parametrize("make", [tiny, tiny_gaussians, lambda seen, seed: LerPlane(seen, seed, TINY_PLANES)])
+def test_a_step_changes_the_numbers_that_have_a_gradient(make: Make) -> None:
+    check_step(make(Seen.of(small_clip(2), [0, 1]), 0))
 
 
 def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
