@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
 from worker.evaluate.rivals.fields import rays
-from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.planes import Evenness, Planes
 from worker.evaluate.rivals.rival import Rival, Seen, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
@@ -32,7 +32,9 @@ from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_dept
 
 MEAN, QUATERNION, LOG_SCALE, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), 10
 """Columns of what moves."""
-MOVING = 11
+WIDTHS = (3, 4, 3, 1)
+"""Of these columns; each has a decoder of its own."""
+MOVING = sum(WIDTHS)
 PUBLISHED_LOSS = LossSettings(normalised_depth=False)
 PUBLISHED_WIDTH = 640
 """Pixels. In a picture half as wide neighbours differ twice as much."""
@@ -46,9 +48,11 @@ class EndoGaussianSettings:
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
+    hidden          width of each decoder's hidden layer
     resting         share of the training without motion
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
+    plane_evenness  weights of the planes' own evenness
     """
 
     share: float = 0.01
@@ -58,6 +62,7 @@ class EndoGaussianSettings:
     cells: tuple[int, ...] = (64, 128, 256)
     features: int = 16
     time_cells: int = 150
+    hidden: int = 64
     resting: float = 0.06
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
     decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
@@ -68,6 +73,7 @@ class EndoGaussianSettings:
     colour_rate: float = 2.5e-3
     harmonics_rate: float = 1.25e-4
     evenness: float = 0.03
+    plane_evenness: Evenness = field(default=Evenness(variation=1e-4, unrest=1e-4, jerk=1e-2))
 
 
 class EndoGaussian(Rival):
@@ -129,13 +135,13 @@ class EndoGaussian(Rival):
         true = seen.rgb[frame], depth, seen.tissue[frame]
         loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
         evenness = self.settings.evenness * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
-        return loss + evenness * (variation(shown.rgb) + variation(shown.depth[..., None]))
+        loss = loss + evenness * (variation(shown.rgb) + variation(shown.depth[..., None]))
+        return loss if rests else loss + self.field.planes.unevenness(self.settings.plane_evenness)
 
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
         camera = camera_in_units(intrinsics, world_from_camera, self._scale)
-        with torch_threads(1):
-            shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
+        shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
         rgb, depth, alpha = (each.float().cpu().numpy() for each in (shown.rgb, shown.depth, shown.alpha))
         return RenderedFrame(rgb, solid_depth_mm(depth, alpha, self._scale), alpha)
 
@@ -210,16 +216,21 @@ class _Field(nn.Module):
     def __init__(self, settings: EndoGaussianSettings, time_cells: int, places: Tensor) -> None:
         super().__init__()
         self.planes = Planes(settings.cells, time_cells, settings.features)
-        self.decode = nn.Linear(self.planes.size, MOVING)  # a linear decoder for each of what moves, side by side
-        nn.init.zeros_(self.decode.weight)
-        nn.init.zeros_(self.decode.bias)
+        self.decode = nn.ModuleList(_decoder(self.planes.size, settings.hidden, width) for width in WIDTHS)
         self.register_buffer("low", places.amin(0))
         self.register_buffer("high", places.amax(0))
 
     def forward(self, place: Tensor, t: float) -> Tensor:
         inside = 2 * (place - self.low) / (self.high - self.low).clamp(min=1e-6) - 1
-        changed: Tensor = self.decode(self.planes(inside, torch.full_like(inside[:, 0], t)))
-        return changed
+        features = self.planes(inside, torch.full_like(inside[:, 0], t))
+        return torch.cat([decode(features) for decode in self.decode], 1)
+
+
+def _decoder(features: int, hidden: int, width: int) -> nn.Sequential:
+    last = nn.Linear(hidden, width)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(features, hidden), nn.ReLU(), last)
 
 
 def _rasterized(moved: Tensor, colour: Tensor, camera: Camera) -> Rendered:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
 from worker.evaluate.rivals.fields import Box, Shown, cumulated, drawn_pixels, picture, pose_tensor, rays, weights_along
-from worker.evaluate.rivals.planes import Planes
+from worker.evaluate.rivals.planes import Evenness, Planes
 from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, lengths
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.input.camera import Intrinsics
@@ -33,15 +33,6 @@ WINDOW = 2
 
 CPU_RAYS = 512
 """Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
-
-
-@dataclass(frozen=True)
-class Evenness:
-    """Weights of how planes of space vary, how far planes of time are from 1, and their second difference in time."""
-
-    variation: float
-    unrest: float
-    jerk: float
 
 
 @dataclass(frozen=True)
@@ -73,8 +64,8 @@ class LerPlaneSettings:
     most: float = 0.1
     depth_weight: float = 1.0
     proposal_weight: float = 1.0
-    evenness: Evenness = Evenness(variation=1e-3, unrest=1e-3, jerk=0.05)
-    proposal_evenness: Evenness = Evenness(variation=1e-4, unrest=1e-4, jerk=1e-4)
+    evenness: Evenness = field(default=Evenness(variation=1e-3, unrest=1e-3, jerk=0.05))
+    proposal_evenness: Evenness = field(default=Evenness(variation=1e-4, unrest=1e-4, jerk=1e-4))
 
     @classmethod
     def on(cls, device: torch.device) -> LerPlaneSettings:
@@ -167,8 +158,7 @@ class LerPlane(Rival):
         total = self._seen.rgb.new_zeros(())
         weights = (self.settings.evenness, self.settings.proposal_evenness)
         for planes, weight in zip((self.field.planes, self.proposal.planes), weights, strict=True):
-            total = total + weight.variation * planes.variation()
-            total = total + weight.unrest * planes.unrest() + weight.jerk * planes.jerk()
+            total = total + planes.unevenness(weight)
         return total
 
 

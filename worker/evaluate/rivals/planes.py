@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,6 +16,15 @@ from torch.autograd import Function
 from torch.nn.functional import grid_sample
 
 SPACE_PAIRS, TIME_PAIRS = ((0, 1), (0, 2), (1, 2)), ((0, 3), (1, 3), (2, 3))
+
+
+@dataclass(frozen=True)
+class Evenness:
+    """Weights of how planes of space vary, how far planes of time are from 1, and their second difference in time."""
+
+    variation: float
+    unrest: float
+    jerk: float
 
 
 class Planes(nn.Module):
@@ -52,6 +62,10 @@ class Planes(nn.Module):
     def unrest(self) -> Tensor:
         """Mean distance of the planes of time from 1, where they change nothing."""
         return torch.stack([(1 - each).abs().mean() for each in self.time]).sum()
+
+    def unevenness(self, weight: Evenness) -> Tensor:
+        """The weighted sum of the three."""
+        return weight.variation * self.variation() + weight.unrest * self.unrest() + weight.jerk * self.jerk()
 
 
 class _MeanSquaredDifference(Function):

@@ -14,7 +14,7 @@ SMALL = EndoGaussianSettings(
     decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, resting=0.25,
 )  # fmt: skip
 """What learns 64x48 pixels in seconds."""
-TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=2)
+TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=3, hidden=8)
 
 
 def small(seen: Seen, seed: int) -> EndoGaussian:
@@ -26,7 +26,8 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     rival = EndoGaussian(seen, 3, TINY)
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():  # at 0 the planes have no part in the loss
-        rival.field.decode.weight.copy_(torch.randn(rival.field.decode.weight.shape, generator=random) / 10)
+        for decode in rival.field.decode:
+            decode[-1].weight.copy_(torch.randn(decode[-1].weight.shape, generator=random) / 10)
     # a step so small that no Gaussian reaches another pixel, where the rasteriser cuts it off
     check_gradient(rival, rival.parameters(), step=1e-9, progress=0.9)
 
@@ -69,7 +70,7 @@ def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -
     assert all(each.grad is None for each in rival.field.parameters())
     assert len(losses(0.3)) == 3
     rival.loss(1, 0.3).backward()
-    assert float(rival.field.decode.weight.grad.abs().max()) > 0  # type: ignore[union-attr]
+    assert all(float(decode[-1].weight.grad.abs().max()) > 0 for decode in rival.field.decode)
 
 
 def test_its_motion_is_the_displacement_of_the_gaussians_that_a_pixel_shows() -> None:
@@ -80,7 +81,10 @@ def test_its_motion_is_the_displacement_of_the_gaussians_that_a_pixel_shows() ->
             space.fill_(1.0)
         for time in rival.field.planes.time:  # the product of the three is t^3
             time.copy_(torch.linspace(0, 1, time.shape[2])[:, None].expand(time.shape))
-        rival.field.decode.weight[0] = 2.0 / rival.field.planes.size
+        of_place = rival.field.decode[0]
+        of_place[0].weight.fill_(1.0 / rival.field.planes.size)
+        of_place[0].bias.zero_()
+        of_place[-1].weight[0] = 2.0 / len(of_place[0].bias)
         rival._moves[3].fill_(5.0)  # nearly opaque
     pose, camera = clip.world_from_camera[0], clip.intrinsics
     moved_mm = rival.motion_mm(0.5, pose, camera)
