@@ -85,6 +85,7 @@ class EndoNerf(Rival):
         self._importance = 1 + hidden / hidden.norm().clamp(min=1e-9)
         self._s = self._box.s_of(seen.depth_mm.clamp(min=1e-3))
         self._has_depth = seen.depth_mm > 0
+        self._refinable = int(self.settings.refined_share * self._has_depth.sum())
         self._measured = [frame for frame in range(len(seen)) if bool(seen.tissue[frame].any())]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -138,8 +139,9 @@ class EndoNerf(Rival):
         return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
 
     def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
-        """Where the field contradicts the stereo depth most, the field is believed."""
-        worst = error > torch.quantile(error, 1 - self.settings.refined_share)
+        """Where the field contradicts the stereo depth most, it is believed: the same share of all as of a batch."""
+        worst = torch.nonzero(error > torch.quantile(error, 1 - self.settings.refined_share))[: self._refinable, 0]
+        self._refinable -= len(worst)
         self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
 
     def _guide_mm(self, t: float, pose: Tensor, camera: Intrinsics) -> Tensor:

@@ -59,3 +59,7 @@ def test_depth_that_the_field_contradicts_gives_way_late() -> None:
     rival.loss(1, 0.5)
     changed = int((rival._s != before).sum())
     assert 0 < changed <= 6, "a hundredth of 512 rays"
+    for iteration in range(2, 40):
+        rival.loss(iteration, 0.5)
+    most = int(0.01 * rival._has_depth.sum())
+    assert 0 < most // 2 < int((rival._s != before).sum()) <= most, "and of all pixels"
