@@ -35,8 +35,8 @@ size. Hollow marks are published.
 reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that have moved,
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
 are scored at every 5th pixel of every 5th row, so that their bound differs. EndoNeRF draws its samples
-about the stereo depth of training frames: its depth error is mostly that of stereo. Curves of these two and
-of EndoGaussian have four held-out frames before their end, so that a curve may jump there.
+about the stereo depth of training frames: its depth error is mostly that of stereo. A curve of a rival is scored on
+four held-out frames on the way and on up to 16 at its end, so that it may jump there.
 """
 _ORDERS = """
 The paper's table has each system better than the next: {systems}.

@@ -155,11 +155,8 @@ class LerPlane(Rival):
         return self._box.place(origin[:, None] + depth_mm[..., None] * direction[:, None]).flatten(0, 1)
 
     def _unevenness(self) -> Tensor:
-        total = self._seen.rgb.new_zeros(())
-        weights = (self.settings.evenness, self.settings.proposal_evenness)
-        for planes, weight in zip((self.field.planes, self.proposal.planes), weights, strict=True):
-            total = total + planes.unevenness(weight)
-        return total
+        of_field = self.field.planes.unevenness(self.settings.evenness)
+        return of_field + self.proposal.planes.unevenness(self.settings.proposal_evenness)
 
 
 def importance(seen: Seen, least: float, most: float) -> Tensor:

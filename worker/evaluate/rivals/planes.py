@@ -64,7 +64,7 @@ class Planes(nn.Module):
         return torch.stack([(1 - each).abs().mean() for each in self.time]).sum()
 
     def unevenness(self, weight: Evenness) -> Tensor:
-        """The weighted sum of the three."""
+        """Weighted sum of variation, unrest and jerk."""
         return weight.variation * self.variation() + weight.unrest * self.unrest() + weight.jerk * self.jerk()
 
 

@@ -63,7 +63,7 @@ class Rival(ABC):
     """A method in training. All that is random follows from its seed and the iteration.
 
     not_measured     which figures of a row it cannot have, and why
-    published_steps  iterations of its paper, at which a run with a longer budget ends: more would over-fit
+    published_steps  iterations of its paper, at which a run ends if its budget does not end it before
     optimizer        has all that is trained; its groups' rates are set before every step
     """
 

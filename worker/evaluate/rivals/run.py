@@ -1,8 +1,7 @@
 """A rival is trained on a clip and judged as every model is: same frames, same clock, same scores.
 
-Rates follow the share of the budget that is used, so a longer run is a slower one; it ends with the iterations
-of the paper if these come first. With a number of iterations nothing reads the clock, and the same seed gives the same
-numbers.
+Rates follow the share of the budget that is used, so a longer run is a slower one. The iterations of the paper end a
+run that has budget left. With a number of iterations nothing reads the clock, and the same seed gives the same numbers.
 """
 
 from __future__ import annotations
@@ -136,7 +135,7 @@ def run_rival(
     """Train a rival on the left eye of the clip's training frames, and judge it.
 
     Args:
-        length: a budget ends at the published iterations if these come first.
+        length: with a budget alone, the published iterations end the run, too.
         waited_s: from the request to the start of training. t_post_s is that and t_train_s: scoring belongs to neither.
         step_px: it is scored on that lattice of pixels alone (worker/evaluate/thinned.py), which hooks see.
 
