@@ -173,7 +173,8 @@ def restored_into(folder: Path, source: Path, *audits: Path) -> tuple[Restored, 
 def test_whatever_happens_while_backups_are_taken_each_holds_all_that_was_acknowledged(tmp_path: Path) -> None:
     old, chance, ended = tmp_path / "old", random.Random(7), threading.Event()
     over: list[str] = []
-    purged: list[str] = []
+    asked: list[str] = []  # to be purged
+    purged: list[str] = []  # of them, those whose purge was acknowledged
     faults: list[BaseException] = []
 
     with installation(old) as (service, url):
@@ -186,8 +187,9 @@ def test_whatever_happens_while_backups_are_taken_each_holds_all_that_was_acknow
                     if act == "send":
                         ward.send()
                     elif act == "purge" and over:
-                        purged.append(over.pop(chance.randrange(len(over))))
-                        ward.purge(purged[-1])
+                        asked.append(over.pop(chance.randrange(len(over))))
+                        ward.purge(asked[-1])
+                        purged.append(asked[-1])
                     elif act == "label" and over:
                         ward.label(chance.choice(over))
                     elif act in ("done", "failed", "cancelled"):
@@ -204,7 +206,7 @@ def test_whatever_happens_while_backups_are_taken_each_holds_all_that_was_acknow
                 time.sleep(0.01)
             before, gone_before = {record.job_id for record in queue.records(None, None)}, set(purged)
             taken = take_backup(Settings(data_dir=old), queue, tmp_path / "backups")
-            kept.append((taken, before - set(purged), gone_before))
+            kept.append((taken, before - set(asked), gone_before))
         ended.set()
         thread.join()
         queue.close()
