@@ -27,6 +27,7 @@ from worker.machine.cores import cores
 from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
 from worker.raster.backend import Device
+from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
 from worker.report.quality import Training, first_report
 from worker.train.hooks import RenderedFrame, TrainingHooks
@@ -132,7 +133,7 @@ def run_rival(
     hooks: TrainingHooks,
     step_px: int = 1,
 ) -> Fitted:
-    """Train a rival on the left eye of the clip's training frames, and judge it.
+    """Train a rival on the left eye of the clip's training frames, and judge it as every model is.
 
     Args:
         length: with a budget alone, the published iterations end the run, too.
@@ -175,7 +176,8 @@ def run_rival(
     t_train_s = curve[-1].t_train_s if curve else clock.elapsed_s
     seconds = {"start_s": start_s, "optimise_s": t_train_s - start_s, "t_train_s": t_train_s}
     seconds["t_post_s"] = waited_s + t_train_s
-    first = first_report(scored, split, _training(name, rival, made, seed, device, seconds))
+    doubts = clip_warnings(clip, split.train)
+    first = first_report(scored, split, _training(name, rival, made, seed, device, seconds), doubts)
     return Fitted(rival, renders, judged(first, scored, split.train, renders, hooks), tuple(curve))
 
 

@@ -158,14 +158,15 @@ def test_a_picture_is_rendered_once_until_the_rival_trains_further() -> None:
     assert renders(0.5, clip.world_from_camera[1], clip.intrinsics) is not first
 
 
-def test_a_rival_has_cells_in_the_atlas(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_rival_has_cells_in_the_atlas_that_tell_of_the_clip(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(stability, "RIVAL_SYSTEMS", {"endonerf": tiny})
     atlas = stability.StabilityBench(tmp_path, stability.Grid(64, 48, frames=9, iterations=2))
-    cells = stability.plan(["depth_noise"], [5], ["endonerf"], [0])
+    cells = stability.plan(["smoke"], [5], ["endonerf"], [0])
     rows = [atlas.measure(cell, TrainingHooks()) for cell in cells]
     assert [row["severity"] for row in rows] == ["0", "5"]
     for row in rows:
         assert row["error"] == "", row["error"]
         assert all(row[name] for name in ("psnr_db", "depth_error_mm", "reported_db"))
         assert row["outcome"] in ("held", "told", "silent")
+    assert ["warning:veiled" in row["codes"].split() for row in rows] == [False, True]
     assert atlas.missing(cells) == []
