@@ -246,11 +246,11 @@ def test_the_command_draws_what_is_there_and_refuses_what_is_not(
     assert "fast" in (tmp_path / "stability.md").read_text()
 
 
-def test_the_page_of_results_counts_how_the_places_ended(tmp_path: Path) -> None:
+def test_the_page_of_results_counts_how_the_places_of_severities_3_and_5_ended(tmp_path: Path) -> None:
     assert stability_sections(tmp_path) == []
     write_rows(tmp_path / STABILITY, FIELDS, ROWS)
     page = "".join(stability_sections(tmp_path))
-    assert "| fast | 6 of 165 | 1 | 1 | 1 | 1 | 1 | 1 | 0 |  |" in page
+    assert "| fast | 3 of 66 | 0 | 0 | 1 | 0 | 1 | 1 | 0 |  |" in page  # severities 3 and 5
     assert "stability-fast.png" not in page
     assert "Why a wrong baseline is silent" not in page
 
