@@ -10,7 +10,7 @@ from worker.evaluate.rows import read_rows
 from worker.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, STABILITY
 
 _COMPARED = (3, 5)
-"""The severities that every method is measured at."""
+"""The severities at which methods are compared."""
 _PLACES = len(CONDITIONS) * len(_COMPARED)
 _INTRODUCTION = f"""
 ## Where methods break, and whether they say so
@@ -23,7 +23,8 @@ the report has no warning that the clean clip's has not. What the user is told o
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
 and not which method is better: one that has hardly learnt loses little. The table counts severities
 {" and ".join(map(str, _COMPARED))}; methods with all {_PLACES} places measured can be compared by their counts. The
-report of a method from another paper has the checks of the clip that ours have: its authors' code has none of them.
+report of a method from another paper has the checks of the clip that ours have: they
+are this program's, not its authors'.
 
 | | measured | {" | ".join(WORST_FIRST)} | map |
 |---|{"---|" * len(WORST_FIRST)}---|---|
