@@ -16,7 +16,7 @@ from worker.evaluate.summary import Group, Place, groups_of
 TABLE_1 = "table1"
 """The folder beside runs.csv that holds the rows, and their charts."""
 SYSTEMS = {"paper": "Deform3DGS", "endogaussian": "EndoGaussian", "lerplane": "LerPlane", "endonerf": "EndoNeRF"}
-"""By series: what the paper calls it. In the paper's order: each is better and faster than the next."""
+"""By series: what the paper calls it. In the paper's order: each has more dB and more images a second than the next."""
 _INTRODUCTION = """
 ## The paper's table 1 under one clock
 
@@ -34,14 +34,15 @@ size. Hollow marks are published.
 `10°` is the score of a camera turned by 10 degrees, `bound` what colours that do not depend on the viewpoint can
 reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that have moved,
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
-are scored at every 5th pixel of every 5th row, so that their bound differs. EndoNeRF draws its samples
-about the stereo depth of training frames: its depth error is mostly that of stereo. A curve of a rival is scored on
-four held-out frames on the way and on up to 16 at its end, so that it may jump there.
+are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are those of one to
+five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the measured depth of the training frames
+nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. A curve of a rival is
+scored on four held-out frames on the way and on up to 16 at its end, so that it may jump there.
 """
 _ORDERS = """
-The paper's table has each system better than the next: {systems}.
-For each system beside the next, after its longest run (two rivals: the longest that both have had): the difference in
-dB, and how many times as many images it renders a second. Below 0, and below 1, the order is another:
+The paper's table has each system ahead of the next in dB and in images a second: {systems}.
+Each column compares a system with the next, after the longest run of each (two rivals: the longest limit that both have
+had). A difference below 0, or a quotient below 1, contradicts the paper's order:
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "iterations": ("steps", 0), "render_fps": ("images/s", 2),

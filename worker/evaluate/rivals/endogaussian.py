@@ -3,7 +3,7 @@
 Symbols: N Gaussians, M pixels, F training frames, H W pixels. docs/decisions/078 lists what differs from the paper,
 and why. Lengths are in optimiser units: the median depth is 60.
 
-The features of a Gaussian's place and a time are decoded, linearly, into how far it has moved, turned, grown and faded.
+Small networks decode the features of a Gaussian's place and time into how far it has moved, turned, grown and faded.
 The Gaussians are learnt without motion first, from the first frame, then with motion from all.
 """
 
@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
 from worker.evaluate.rivals.fields import rays
-from worker.evaluate.rivals.planes import Evenness, Planes
-from worker.evaluate.rivals.rival import Rival, Seen, torch_threads
+from worker.evaluate.rivals.planes import Planes, Smoothness
+from worker.evaluate.rivals.rival import Rival, Seen, seeded, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
 from worker.model.loss import LossSettings, training_loss
@@ -52,7 +52,7 @@ class EndoGaussianSettings:
     resting         share of the training without motion
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
-    plane_evenness  weights of the planes' own evenness
+    smoothness      weights of how smooth the planes are
     """
 
     share: float = 0.01
@@ -73,7 +73,7 @@ class EndoGaussianSettings:
     colour_rate: float = 2.5e-3
     harmonics_rate: float = 1.25e-4
     evenness: float = 0.03
-    plane_evenness: Evenness = field(default=Evenness(variation=1e-4, unrest=1e-4, jerk=1e-2))
+    smoothness: Smoothness = field(default=Smoothness(space=1e-4, time=0.0, rest=1e-4, acceleration=1e-2))
 
 
 class EndoGaussian(Rival):
@@ -85,7 +85,7 @@ class EndoGaussian(Rival):
     def __init__(self, seen: Seen, seed: int, settings: EndoGaussianSettings | None = None) -> None:
         self.seed, self.settings, self._seen = seed, settings or EndoGaussianSettings(), seen
         self._scale = MEDIAN_DEPTH_UNITS / float(seen.depth_mm[seen.depth_mm > 0].median())
-        self._measured = [frame for frame in range(len(seen)) if bool(seen.tissue[frame].any())]
+        self._measured = seen.measured
         poses = seen.world_from_camera.double().cpu().numpy()
         self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
@@ -95,8 +95,7 @@ class EndoGaussian(Rival):
         self._colour, self._harmonics = (
             nn.Parameter(each.to(seen.rgb).contiguous()) for each in (start.sh[:, :1], start.sh[:, 1:])
         )
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with seeded(seed):
             self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)
         self.field.to(seen.rgb)
         of_field = [list(each.parameters()) for each in (self.field.decode, self.field.planes)]
@@ -136,7 +135,7 @@ class EndoGaussian(Rival):
         loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
         evenness = self.settings.evenness * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
         loss = loss + evenness * (variation(shown.rgb) + variation(shown.depth[..., None]))
-        return loss if rests else loss + self.field.planes.unevenness(self.settings.plane_evenness)
+        return loss if rests else loss + self.field.planes.roughness(self.settings.smoothness)
 
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:

@@ -28,7 +28,7 @@ from worker.evaluate.rivals.fields import (
     rays,
     weights_along,
 )
-from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.rivals.rival import Rival, Seen, seeded
 from worker.evaluate.thinned import dense_camera, lattice
 from worker.input.camera import Intrinsics
 from worker.stereo.right_eye import nearest_known
@@ -86,9 +86,8 @@ class EndoNerf(Rival):
         self._s = self._box.s_of(seen.depth_mm.clamp(min=1e-3))
         self._has_depth = seen.depth_mm > 0
         self._refinable = int(self.settings.refined_share * self._has_depth.sum())
-        self._measured = [frame for frame in range(len(seen)) if bool(seen.tissue[frame].any())]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        self._measured = seen.measured
+        with seeded(seed):
             self.field = _Field(self.settings).to(seen.rgb)
         self.optimizer = torch.optim.Adam(self.field.parameters(), fused=True)
 
@@ -145,8 +144,8 @@ class EndoNerf(Rival):
         self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
 
     def _guide_mm(self, t: float, pose: Tensor, camera: Intrinsics) -> Tensor:
-        """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's. A camera of
-        few pixels sees what those of the training frames would see in their places."""
+        """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's. A camera
+        thinned to a lattice gets the guide that the full camera has at those pixels."""
         seen = self._seen
         step_px = max(1, round(seen.intrinsics.fx / camera.fx))
         camera = dense_camera(camera, step_px)
@@ -171,11 +170,11 @@ class EndoNerf(Rival):
 
 
 class _Trunk(nn.Module):
-    """Linear layers with ReLU; the input joins again half-way."""
+    """Linear layers with ReLU; the input joins the output of the fifth of eight again, as in NeRF."""
 
     def __init__(self, size: int, layers: int, width: int) -> None:
         super().__init__()
-        self.again = layers // 2
+        self.again = layers // 2 + 1
         ins = [size if k == 0 else width + size * (k == self.again) for k in range(layers)]
         self.layers = nn.ModuleList([nn.Linear(each, width) for each in ins])
 

@@ -3,9 +3,10 @@
 Symbols: M rays, S samples a ray, K intervals a ray, F training frames, H W pixels. docs/decisions/078 lists what
 differs from the paper, and why.
 
-Planes of space are common to all moments, planes of time multiply them; a small network decodes features, place and
-time into density and colour. A coarser field of its own proposes where a ray's samples lie. Rays are drawn from all
-frames at once, more of them where the picture changes and where instruments often hide the tissue.
+All moments share the planes of space; features of the planes of time multiply theirs. A small network decodes features,
+place and time into density and colour. Two coarser fields of their own propose, one after the other, where a ray's
+samples lie. Rays are drawn from all frames at once, more of them where the picture changes and where instruments often
+hide the tissue.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
 from worker.evaluate.rivals.fields import Box, Shown, cumulated, drawn_pixels, picture, pose_tensor, rays, weights_along
-from worker.evaluate.rivals.planes import Evenness, Planes
-from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, lengths
-from worker.evaluate.rivals.rival import Rival, Seen
+from worker.evaluate.rivals.planes import Planes, Smoothness
+from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, lengths, middles
+from worker.evaluate.rivals.rival import Rival, Seen, seeded
 from worker.input.camera import Intrinsics
 from worker.train.hooks import RenderedFrame
 
 MAX_LOG_DENSITY = 15.0
 WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
+
+HUBER_DELTA = 0.2
+"""In s: the depth error from which its loss is linear."""
 
 CPU_RAYS = 512
 """Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
@@ -40,7 +44,7 @@ class LerPlaneSettings:
     """As published, or as the authors' BSD-licensed configuration says.
 
     cells, features     of the planes, by resolution; time_cells is their most cells of time
-    proposal_*          of the field that proposes samples, and how many intervals it looks at, one round after another
+    proposal_*          of the fields that propose samples, one a round, and how many intervals each looks at
     bins                of the one-blob encoding of place and time
     rate                of Adam: it rises for the share warm_up of the training, then falls like a cosine
     least, most         limits of a pixel's change, for its importance
@@ -63,9 +67,10 @@ class LerPlaneSettings:
     least: float = 0.01
     most: float = 0.1
     depth_weight: float = 1.0
+    proposal_depth_weight: float = 1.0
     proposal_weight: float = 1.0
-    evenness: Evenness = field(default=Evenness(variation=1e-3, unrest=1e-3, jerk=0.05))
-    proposal_evenness: Evenness = field(default=Evenness(variation=1e-4, unrest=1e-4, jerk=1e-4))
+    smoothness: Smoothness = field(default=Smoothness(space=1.2e-2, time=6e-3, rest=3e-3, acceleration=0.15))
+    proposal_smoothness: Smoothness = field(default=Smoothness(space=1.2e-3, time=6e-4, rest=3e-4, acceleration=3e-4))
 
     @classmethod
     def on(cls, device: torch.device) -> LerPlaneSettings:
@@ -83,12 +88,12 @@ class LerPlane(Rival):
         self.seed, self.settings = seed, settings or LerPlaneSettings.on(seen.rgb.device)
         self._seen, self._box = seen, Box.of(seen)
         self._cumulated = cumulated(importance(seen, self.settings.least, self.settings.most))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with seeded(seed):
             time_cells = max(2, min(self.settings.time_cells, len(seen)))
             self.field = _Field(self.settings, time_cells).to(seen.rgb)
-            self.proposal = _Proposal(self.settings, time_cells).to(seen.rgb)
-        every = [*self.field.parameters(), *self.proposal.parameters()]
+            rounds = self.settings.proposal_samples
+            self.proposals = [_Proposal(self.settings, time_cells).to(seen.rgb) for _ in rounds]
+        every = [each for net in (self.field, *self.proposals) for each in net.parameters()]
         self.optimizer = torch.optim.Adam(every, eps=1e-15, fused=True)  # a cell of a fine plane has tiny gradients
 
     def rates(self, progress: float) -> Sequence[float]:
@@ -98,21 +103,25 @@ class LerPlane(Rival):
         return [self.settings.rate * 0.5 * (1 + math.cos(math.pi * (progress - warm_up) / (1 - warm_up)))]
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """Colour, depth, proposals, and how even the planes are."""
+        """Colour, depth, proposals, and how rough the planes are."""
         seen, chosen, random = self._seen, self.settings, self.generator(iteration)
         drawn = drawn_pixels(self._cumulated, chosen.rays, random)
         height, width = seen.tissue.shape[1:]
         frame, row, column = drawn // (height * width), drawn // width % height, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
         sharpness = annealed(progress / chosen.annealed)
-        (rgb, depth_s, _), spread = self._shown(origin, direction, seen.t[frame], sharpness, random)
+        (rgb, _, _), rounds = self._shown(origin, direction, seen.t[frame], sharpness, random)
         depth_mm = seen.depth_mm[frame, row, column]
-        known = depth_mm > 0
-        about = self._box.s_of(depth_mm.clamp(min=1e-3))
-        error = torch.where(known, huber_loss(depth_s, about, reduction="none", delta=0.2), 0.0)
+        known, about = depth_mm > 0, self._box.s_of(depth_mm.clamp(min=1e-3))
         loss = (rgb - seen.rgb[frame, row, column]).square().mean()
-        loss = loss + chosen.depth_weight * error.sum() / known.sum().clamp(min=1)
-        return loss + chosen.proposal_weight * spread + self._unevenness()
+        depth_weights = [*([chosen.proposal_depth_weight] * (len(rounds) - 1)), chosen.depth_weight]
+        for (edges, weight), of_depth in zip(rounds, depth_weights, strict=True):
+            error = huber_loss((weight * middles(edges)).sum(1), about, reduction="none", delta=HUBER_DELTA)
+            loss = loss + of_depth * torch.where(known, error, 0.0).sum() / known.sum().clamp(min=1)
+        *proposed, (edges, weight) = rounds
+        for each in proposed:
+            loss = loss + chosen.proposal_weight * excess(edges, weight.detach(), *each)
+        return loss + self._roughness()
 
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
@@ -127,36 +136,37 @@ class LerPlane(Rival):
 
     def _shown(
         self, origin: Tensor, direction: Tensor, t: Tensor, sharpness: float, random: torch.Generator | None
-    ) -> tuple[Shown, Tensor]:
-        """What is shown by rays at times [M], and the loss of the proposals.
+    ) -> tuple[Shown, list[tuple[Tensor, Tensor]]]:
+        """What is shown by rays at times [M], and each round's edges [M, K + 1] and weights [M, K], the field's last.
 
         random: jitters the intervals; None puts them in the middle.
         """
         edges = origin.new_tensor([0.0, 1.0]).expand(len(origin), 2)
-        weight, proposed = torch.ones_like(edges[:, :1]), []
-        for count in self.settings.proposal_samples:
+        weight, rounds = torch.ones_like(edges[:, :1]), []
+        for count, proposal in zip(self.settings.proposal_samples, self.proposals, strict=True):
             edges = drawn_edges(edges, weight.detach() ** sharpness, count, random)
             place = self._places(origin, direction, edges)
-            density = self.proposal(place, t.repeat_interleave(count)).reshape(-1, count)
+            density = proposal(place, t.repeat_interleave(count)).reshape(-1, count)
             weight = weights_along(density, lengths(edges))
-            proposed.append((edges, weight))
+            rounds.append((edges, weight))
         edges = drawn_edges(edges, weight.detach() ** sharpness, self.settings.samples, random)
         place = self._places(origin, direction, edges)
         density, rgb = self.field(place, t.repeat_interleave(self.settings.samples))
-        s = (edges[:, 1:] + edges[:, :-1]) / 2
+        s = middles(edges)
         weight = weights_along(density.reshape(s.shape), lengths(edges))
-        spread = sum((excess(edges, weight.detach(), *each) for each in proposed), weight.new_zeros(()))
         colour = (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1)
-        return (colour, (weight * s).sum(1), weight.sum(1)), spread
+        return (colour, (weight * s).sum(1), weight.sum(1)), [*rounds, (edges, weight)]
 
     def _places(self, origin: Tensor, direction: Tensor, edges: Tensor) -> Tensor:
         """The middles of the intervals in the box, [M K, 3]."""
-        depth_mm = self._box.depth_mm((edges[:, 1:] + edges[:, :-1]) / 2)
+        depth_mm = self._box.depth_mm(middles(edges))
         return self._box.place(origin[:, None] + depth_mm[..., None] * direction[:, None]).flatten(0, 1)
 
-    def _unevenness(self) -> Tensor:
-        of_field = self.field.planes.unevenness(self.settings.evenness)
-        return of_field + self.proposal.planes.unevenness(self.settings.proposal_evenness)
+    def _roughness(self) -> Tensor:
+        found = self.field.planes.roughness(self.settings.smoothness)
+        for proposal in self.proposals:
+            found = found + proposal.planes.roughness(self.settings.proposal_smoothness)
+        return found
 
 
 def importance(seen: Seen, least: float, most: float) -> Tensor:

@@ -19,12 +19,18 @@ SPACE_PAIRS, TIME_PAIRS = ((0, 1), (0, 2), (1, 2)), ((0, 3), (1, 3), (2, 3))
 
 
 @dataclass(frozen=True)
-class Evenness:
-    """Weights of how planes of space vary, how far planes of time are from 1, and their second difference in time."""
+class Smoothness:
+    """Weights of what is to be small in the planes; each is the mean over the three planes of a resolution.
 
-    variation: float
-    unrest: float
-    jerk: float
+    space, time   squared differences of neighbouring cells of the planes of space and of those of time
+    rest          distance of the planes of time from 1, where they change nothing
+    acceleration  squared second differences in time of the planes of time
+    """
+
+    space: float
+    time: float
+    rest: float
+    acceleration: float
 
 
 class Planes(nn.Module):
@@ -50,22 +56,17 @@ class Planes(nn.Module):
         ]
         return torch.cat(found).T
 
-    def variation(self) -> Tensor:
-        """Mean squared difference of neighbouring cells of the planes of space."""
-        return torch.stack([_mean_squared_difference(each, axis, 1) for each in self.space for axis in (2, 3)]).sum()
-
-    def jerk(self) -> Tensor:
-        """Mean squared second difference in time of the planes of time; 0 where they have fewer than three cells."""
+    def roughness(self, weights: Smoothness) -> Tensor:
+        """The weighted sum, of all resolutions. Second differences count where there are three cells of time."""
         total = torch.zeros((), dtype=self.time[0].dtype, device=self.time[0].device)
-        return total + sum(_mean_squared_difference(each, 2, 2) for each in self.time if each.shape[2] > 2)
-
-    def unrest(self) -> Tensor:
-        """Mean distance of the planes of time from 1, where they change nothing."""
-        return torch.stack([(1 - each).abs().mean() for each in self.time]).sum()
-
-    def unevenness(self, weight: Evenness) -> Tensor:
-        """Weighted sum of variation, unrest and jerk."""
-        return weight.variation * self.variation() + weight.unrest * self.unrest() + weight.jerk * self.jerk()
+        for space, time in zip(self.space, self.time, strict=True):
+            total = total + weights.space * sum(_mean_squared_difference(space, axis, 1) for axis in (2, 3))
+            total = total + weights.rest * (1 - time).abs().mean()
+            if weights.time:
+                total = total + weights.time * sum(_mean_squared_difference(time, axis, 1) for axis in (2, 3))
+            if time.shape[2] > 2:
+                total = total + weights.acceleration * _mean_squared_difference(time, 2, 2)
+        return total
 
 
 class _MeanSquaredDifference(Function):

@@ -36,15 +36,21 @@ def lengths(edges: Tensor) -> Tensor:
     return torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(edges[:, :1], SOLID)], 1)
 
 
+def middles(edges: Tensor) -> Tensor:
+    """Of the intervals between the edges [M, K + 1]: [M, K]."""
+    return (edges[:, 1:] + edges[:, :-1]) / 2
+
+
 def excess(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
-    """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap (Barron et al., 2022)."""
+    """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap, as a mean over samples
+    (Barron et al., 2022)."""
     total = torch.cat([torch.zeros_like(proposed[:, :1]), torch.cumsum(proposed, -1)], -1)
     most = proposed.shape[1]
     at = proposed_edges.contiguous()
     first = (torch.searchsorted(at, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, most)
     last = torch.searchsorted(at, edges[:, 1:].contiguous()).clamp(0, most)
     bound = total.gather(1, last) - total.gather(1, first)
-    return ((weight - bound).clamp(min=0).square() / (weight + 1e-7)).sum(-1).mean()
+    return ((weight - bound).clamp(min=0).square() / (weight + 1e-7)).mean()
 
 
 def annealed(done: float) -> float:

@@ -55,6 +55,11 @@ class Seen:
             intrinsics=clip.intrinsics,
         )
 
+    @property
+    def measured(self) -> list[int]:
+        """The frames that show tissue."""
+        return [frame for frame in range(len(self)) if bool(self.tissue[frame].any())]
+
     def __len__(self) -> int:
         return int(self.rgb.shape[0])
 
@@ -116,8 +121,19 @@ class Rival(ABC):
         return sum(each.numel() for each in self.parameters())
 
     def generator(self, iteration: int) -> torch.Generator:
-        """The random numbers of an iteration; 0 stands for the start. On the CPU, so that a device changes none."""
+        """The random numbers of an iteration; 0 stands for the start.
+
+        They are drawn on the CPU, so that every device gets the same ones.
+        """
         return torch.Generator().manual_seed(1_000_003 * self.seed + iteration)
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """What torch draws on the CPU within the block follows from the seed; what it draws afterwards does not."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """A rival is trained on a clip and judged as every model is: same frames, same clock, same scores.
 
-Rates follow the share of the budget that is used, so a longer run is a slower one. The iterations of the paper end a
-run that has budget left. With a number of iterations nothing reads the clock, and the same seed gives the same numbers.
+Learning rates follow the share of the budget that is used, so a larger budget lowers them later. The iterations of the
+paper end a run that has budget left. With a number of iterations nothing reads the clock, and the same seed gives the
+same numbers.
 """
 
 from __future__ import annotations

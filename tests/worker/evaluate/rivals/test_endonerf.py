@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
+from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, fitted, small_clip
 from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings
 from worker.evaluate.rivals.rival import Seen
 
@@ -40,6 +40,15 @@ def test_it_learns_from_the_start_whatever_the_seed() -> None:
         rival = EndoNerf(seen, seed, TINY)
         rival.loss(1, 0.0).backward()  # type: ignore[no-untyped-call]
         assert all(bool((each.grad != 0).any()) for each in rival.field.density.parameters() if each.grad is not None)
+
+
+def test_its_network_displaces_places_by_their_time() -> None:
+    rival = fitted(small, small_clip(9), [0, 8], 40)
+    assert isinstance(rival, EndoNerf)
+    place, view = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
+    with torch.no_grad():
+        early, late = (torch.cat([each.flatten() for each in rival.field(place, t, view)]) for t in (0.3, 0.9))
+    assert float((early - late).abs().max()) > 1e-3
 
 
 def test_rays_are_drawn_where_there_is_tissue_and_more_often_where_it_hides() -> None:

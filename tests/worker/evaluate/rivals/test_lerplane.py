@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
+from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, fitted, small_clip
+from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
-from worker.evaluate.rivals.planes import Planes
-from worker.evaluate.rivals.proposals import drawn_edges, excess
+from worker.evaluate.rivals.planes import Planes, Smoothness
+from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, middles
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = LerPlaneSettings(
@@ -33,7 +34,7 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     seen = Seen.of(small_clip(2), [0, 1], dtype=torch.float64)
     rival = LerPlane(seen, 3, TINY)
     with torch.no_grad():
-        for each in (*rival.field.planes.time, *rival.proposal.planes.time):
+        for each in (*rival.field.planes.time, *rival.proposals[0].planes.time):
             each.add_(0.1)  # away from 1, where the distance from it has a kink
     check_gradient(rival, rival.field.parameters())
 
@@ -48,18 +49,19 @@ def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_w
     assert float(excess(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
 
 
-def test_how_uneven_planes_are_has_the_gradient_of_finite_differences() -> None:
+def test_how_rough_planes_are_has_the_gradient_of_finite_differences() -> None:
     planes = Planes((3, 5), 4, 2).double()
     with torch.no_grad():
         for each in planes.time:
             each.normal_(1.0, 0.2, generator=torch.Generator().manual_seed(2))
 
-    def uneven(*_: torch.Tensor) -> torch.Tensor:
-        return planes.variation() + planes.jerk()
+    def roughness(*_: torch.Tensor) -> torch.Tensor:
+        return planes.roughness(Smoothness(space=1.0, time=0.7, rest=0.3, acceleration=0.5))
 
-    assert torch.autograd.gradcheck(uneven, tuple(planes.parameters()))
-    first, second = planes.time[0].diff(dim=2).diff(dim=2), planes.time[1].diff(dim=2).diff(dim=2)
-    assert torch.isclose(planes.jerk(), first.square().mean() + second.square().mean())
+    assert torch.autograd.gradcheck(roughness, tuple(planes.parameters()))
+    of_acceleration = planes.roughness(Smoothness(space=0.0, time=0.0, rest=0.0, acceleration=2.0))
+    first, second = (each.diff(dim=2).diff(dim=2).square().mean() for each in planes.time)
+    assert torch.isclose(of_acceleration, 2 * (first + second))
 
 
 def test_samples_gather_where_the_proposals_have_weight() -> None:
@@ -70,6 +72,21 @@ def test_samples_gather_where_the_proposals_have_weight() -> None:
     for row, (low, high) in zip(found, ((0.3, 0.4), (0.8, 0.9)), strict=True):
         there = (row >= low - 1e-6) & (row <= high + 1e-6)
         assert 0.8 < float(there.float().mean()) < 1, "most of them, and some look elsewhere"
+
+
+def test_the_proposals_learn_where_the_field_has_its_weight() -> None:
+    clip, taught_by_the_field_alone = small_clip(2), dataclasses.replace(SMALL, proposal_depth_weight=0.0)
+    rival = fitted(lambda seen, seed: LerPlane(seen, seed, taught_by_the_field_alone), clip, [1], 120)
+    assert isinstance(rival, LerPlane)
+    seen = Seen.of(clip, [1])
+    row, column = (each[::7] for each in torch.nonzero(seen.depth_mm[0] > 0, as_tuple=True))
+    origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[0])
+    with torch.no_grad():
+        _, rounds = rival._shown(origin, direction, seen.t.expand(len(row)), 1.0, None)
+    *proposed, field_s = ((weight * middles(edges)).sum(1) for edges, weight in rounds)
+    for each in proposed:
+        assert float((each - field_s).abs().median()) < 0.1, "of 1, the length of a ray"
+    assert (annealed(0.0), annealed(1.0), annealed(2.0)) == (0.0, 1.0, 1.0)
 
 
 def test_it_overfits_one_frame_above_30_db() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
-from tests.worker.evaluate.rivals.cases import Make, check_step, small_clip
+from tests.worker.evaluate.rivals.cases import check_step, small_clip
 from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIANS
 from tests.worker.evaluate.rivals.test_endonerf import TINY
 from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
@@ -23,7 +23,7 @@ from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.rival import Rival, Seen
-from worker.evaluate.rivals.run import Length, Renders, run_rival, train_rival
+from worker.evaluate.rivals.run import Length, Make, Renders, run_rival, train_rival
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from worker.evaluate.sources import source_of
 from worker.input.clip import FrameSplit
