@@ -17,10 +17,12 @@ from contract.wire.errors import InputError
 from contract.wire.names import Eyes
 from contract.wire.options import ReconstructionOptions, parse_options
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
-from worker.train.presets import PRESETS, Preset, preset_named
+from worker.train.presets import PRESETS, Preset
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
-RIVALS = ("paper", "paper-released", "without_mapf", "pfs", "hexplane")
+PUBLISHED = "paper"
+"""The published method, as printed."""
+RIVALS = (PUBLISHED, "paper-released", "without_mapf", "pfs", "hexplane")
 """The published method, as printed and as released, and what it compares itself with."""
 DEFAULT_SERIES = (*OURS, *RIVALS)
 TABLE_1 = ("fast", "paper", *reversed(tuple(RIVAL_SYSTEMS)))
@@ -105,13 +107,17 @@ def plan(
 
 
 def options_of(cell: Cell) -> ReconstructionOptions:
-    """The options of the cell's reconstruction. The preset is named only if the series changes none of its values.
+    """The options of the cell's reconstruction. The preset is named only if the series changes none of its values; a
+    rival gets the frames of the published method, whatever its budget.
 
     Raises:
         InputError: no reconstruction takes one of them.
     """
-    is_preset = not (is_changed(cell.series) or is_rival_system(cell.series))
-    preset = {"preset": preset_of(cell.series).name} if is_preset else {}
+    preset = {}
+    if is_rival_system(cell.series):
+        preset = {"preset": PUBLISHED}
+    elif not is_changed(cell.series):
+        preset = {"preset": preset_of(cell.series).name}
     length = {"budget_s": cell.budget_s, "iterations": cell.iterations}
     chosen = {"holdout": cell.holdout, "seed": cell.seed, EYES: eyes_of(cell.series)}
     return parse_options(ReconstructionOptions, {**chosen, **length, **preset})
@@ -202,7 +208,11 @@ def _read(series: str) -> tuple[str, Preset]:
     if is_rival_system(series):
         problem = f"{series!r} is no preset: `intrasplat evaluate` and `stability` alone train it."
         raise InputError("--series", problem, f"Use one of: {', '.join(PRESETS)}.")
-    preset = preset_named(name)
+    if name not in PRESETS:
+        shorthands = f"in `intrasplat evaluate` also {', '.join(SHORTHANDS)}"
+        remedy = f"Use one of: {', '.join([*PRESETS, *RIVAL_SYSTEMS])}; {shorthands}."
+        raise InputError("--series", f"there is no series {series!r}.", remedy)
+    preset = PRESETS[name]
     values: dict[str, Any] = {}
     for change in _changes(series):
         field, _, text = change.partition("=")

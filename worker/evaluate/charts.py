@@ -135,7 +135,7 @@ def _draw(groups: Sequence[Group], draw_panel: DrawPanel, folder: Path, name: st
         score, label, _ = OVER_TIME.get(name, (SCORE, DECIBEL, column))
         axis.set_ylabel(EYES["right eye"][1] if name == "pareto-right" else label)
         without = draw_panel(axis, here, column)
-        _name(axis, place, here, _missing(here, {f"without {column}": without}))
+        _name(axis, place, here, _missing(here, {f"without {column if score == SCORE else score}": without}))
         if score == SCORE:
             _dashed(axis, here, WARP_LINES if name == "pareto-right" else COPY_LINES)
         _finish(axis)

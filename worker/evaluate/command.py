@@ -197,6 +197,6 @@ def _outcome(row: dict[str, object]) -> str:
     if row["psnr_right_db"] is not None:
         shown += f", right eye {row['psnr_right_db']:.2f} dB"
     return (
-        f"{shown}, {row['t_train_s']:.1f} s, {row['gaussians'] or 'no'} Gaussians, "
+        f"{shown}, {row['t_train_s']:.1f} s, {row['iterations']} iterations, {row['gaussians'] or 'no'} Gaussians, "
         f"{int(str(row['scene_bytes'])) / 1e6:.1f} MB"
     )

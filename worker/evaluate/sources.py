@@ -97,6 +97,8 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
     """
     if argument.startswith("phantom:"):
         return _drawn(argument)
+    if not argument:
+        raise InputError("CLIP", "its name is empty.", f"Give a path, or phantom:MOTION ({', '.join(MOTIONS)}).")
     if argument.partition(":")[0] in RECORDINGS and not Path(argument).exists():
         return _recording(argument)
     if not Path(argument).exists():

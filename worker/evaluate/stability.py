@@ -89,6 +89,20 @@ class Grid:
         """The clean clip of a seed: each seed has tissue of its own."""
         return PhantomSettings(width=self.width, height=self.height, frames=self.frames, seed=seed)
 
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> Grid:
+        """What these rows share. Raises InputError if they differ in it, or there are none."""
+        found = {tuple(int(row[each.name]) for each in dataclasses.fields(cls)) for row in rows}
+        if not found:
+            raise InputError("--out", "the folder holds no rows.", "Leave --redraw out.")
+        if len(found) > 1:
+            problem = f"the folder holds rows of {len(found)} sizes, lengths or numbers of iterations."
+            raise InputError("--out", problem, f"Keep one of them in {STABILITY}: they cannot be summed up together.")
+        return cls(*found.pop())
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}, {self.frames} frames, {self.iterations} iterations"
+
 
 @dataclass(frozen=True)
 class StabilityCell:

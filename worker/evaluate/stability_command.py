@@ -15,6 +15,7 @@ from contract.wire.errors import InputError
 from contract.wire.job import JobProgress
 from worker.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from worker.evaluate.conditions import CONDITIONS, SEVERITIES
+from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Row, adding_alone, read_rows
 from worker.evaluate.stability import STABILITY, Grid, StabilityBench, StabilityCell, plan
 from worker.train.hooks import TrainingHooks
@@ -25,7 +26,10 @@ TABLE_TITLE = """# What the user is told
 
 Decibels lost against the clean clip (over several seeds their mean, and the spread), millimetres of depth where those
 are the harm. In bold what is a defect; what was not measured is empty. Where the tissue or the picture is another
-(texture, size) that is in the loss, too: below zero it is easier to reproduce than the clean clip.
+(texture, size) that is in the loss, too: below zero it is easier to reproduce than the clean clip. Each method is
+compared with itself, so that one that has learnt little loses little.
+
+All clips: {grid}, but for where size or length is what is spoilt.
 """
 
 
@@ -36,7 +40,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--conditions", nargs="+", default=list(CONDITIONS), metavar="NAME", help=f"of {', '.join(CONDITIONS)} (all)"
     )
-    parser.add_argument("--series", nargs="+", default=list(DEFAULT_SERIES), help="presets (default: %(default)s)")
+    known = f"presets, or systems of table 1 ({', '.join(RIVAL_SYSTEMS)}); default: %(default)s"
+    parser.add_argument("--series", nargs="+", default=list(DEFAULT_SERIES), help=known)
     parser.add_argument(
         "--severities", nargs="+", type=int, choices=SEVERITIES, default=list(SEVERITIES), help="(default: all)"
     )
@@ -61,15 +66,16 @@ def run_cli(options: argparse.Namespace) -> int:
     if not options.redraw:
         width, height = options.size
         cells = plan(options.conditions, options.severities, options.series, range(options.seeds))
+        grid = Grid(width, height, options.frames, options.iterations)
         with adding_alone(out):
-            atlas = StabilityBench(out, Grid(width, height, options.frames, options.iterations))
+            atlas = StabilityBench(out, grid)
+            if atlas.rows and (there := Grid.of(atlas.rows)) != grid:
+                problem = f"{out} holds rows of {there}, and these would be of {grid}."
+                raise InputError("--out", problem, "Name another folder for them.")
             waiting = atlas.missing(cells)
             print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
             measure_all(atlas, waiting)
-    rows = read_rows(out / STABILITY)
-    if not rows:
-        raise InputError("--out", f"{out} holds no rows.", "Leave --redraw out.")
-    draw_all(rows, out)
+    draw_all(read_rows(out / STABILITY), out)
     return ExitCode.OK
 
 
@@ -84,15 +90,15 @@ def measure_all(atlas: StabilityBench, cells: Sequence[StabilityCell]) -> None:
 
 
 def draw_all(rows: Sequence[Row], folder: Path) -> None:
-    """The maps and the table of all methods that have rows."""
-    tables = []
+    """The maps and the table of all methods that have rows. Raises InputError as Grid.of."""
+    tables, grid = [], Grid.of(rows)
     for series in series_in(rows):
         places = places_of(rows, series)
         name = draw_map(places, series, folder)
         tables.append(told_table(places, series))
         counted = ", ".join(f"{number} {outcome}" for outcome, number in count_outcomes(places).items())
         print(f"{series}: {counted or 'clean clips only'}; {folder / name}.png")
-    (folder / TABLE).write_text("\n".join([TABLE_TITLE, *tables]), encoding="utf-8")
+    (folder / TABLE).write_text("\n".join([TABLE_TITLE.format(grid=grid), *tables]), encoding="utf-8")
 
 
 def _line(row: Row) -> str:

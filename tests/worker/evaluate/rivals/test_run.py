@@ -16,7 +16,7 @@ from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIAN
 from tests.worker.evaluate.rivals.test_endonerf import TINY
 from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
-from worker.evaluate.cells import Cell, plan, preset_of
+from worker.evaluate.cells import Cell, options_of, plan, preset_of
 from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.evaluate.rivals.endogaussian import EndoGaussian
@@ -27,6 +27,7 @@ from worker.evaluate.rivals.run import Length, Make, Renders, run_rival, train_r
 from worker.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from worker.evaluate.sources import source_of
 from worker.input.clip import FrameSplit
+from worker.input.clip.sampling import most_frames
 from worker.machine.timing import Stopwatch
 from worker.raster.backend import choose_device
 from worker.train.hooks import TrainingHooks
@@ -145,6 +146,16 @@ def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
             plan(["clip"], [series], ["every8"], [0])
     with pytest.raises(InputError, match="no preset"):
         preset_of("endonerf")
+    with pytest.raises(InputError, match="no series 'nerfies'") as unknown:
+        plan(["clip"], ["nerfies"], ["every8"], [0])
+    assert unknown.value.field == "--series"
+    assert "lerplane" in unknown.value.remedy
+
+
+def test_a_rival_trains_on_the_frames_of_the_published_method_whatever_its_budget() -> None:
+    for series in ("paper", "endonerf"):
+        assert most_frames(options_of(Cell("clip", series, "every8", 0, budget_s=1.0))) is None
+    assert most_frames(options_of(Cell("clip", "fast", "every8", 0, budget_s=1.0))) is not None
 
 
 def test_a_picture_is_rendered_once_until_the_rival_trains_further() -> None:
