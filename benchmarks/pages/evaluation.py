@@ -177,10 +177,10 @@ def write_readme(readme: Path, folder: Path) -> None:
 
 
 _METHOD = (
-    "Medians over the seeds that were run, one of the rivals, on one kind of machine and this program's kernels, "
-    "at the commits named below the last table of this part. The moment is that of the first crossing: a curve "
-    "may fall below the score again before its end, and one that over-fits, as `paper` does where many frames are "
-    "held out in a row, passes its last score long before. Between two samples of a curve the moment is "
+    "Medians over the seeds that were run (one seed of a published method), on one kind of machine and this program's "
+    "kernels, at the commits named below the last table of this part. The moment is that of the first crossing: a "
+    "curve may fall below the score again before its end, and one that over-fits, as `paper` does where many frames "
+    "are held out in a row, passes its last score long before. Between two samples of a curve the moment is "
     "interpolated, the logarithm of time being linear in dB, and a curve that is there at its first sample counts "
     "from that one: it was sooner. Samples are scored on at most sixteen of the held-out frames, ends on all."
 )
