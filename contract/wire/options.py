@@ -150,4 +150,6 @@ def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Op
             remedy = f"Did you mean {near[0]}?" if near else f"The options are {', '.join(model.model_fields)}."
             raise InputError(field, "there is no such option.", remedy) from error
         problem = f"{first['msg'].removeprefix('Value error, ')} (given: {str(first['input'])[:80]!r})."
-        raise InputError(field, problem, "Give a value that /openapi.json allows for it.") from error
+        named = model.model_fields.get(str(first["loc"][0])) if first["loc"] else None
+        allowed = named.description if named and named.description else "a value that /openapi.json allows for it"
+        raise InputError(field, problem, f"Give {allowed}.") from error
