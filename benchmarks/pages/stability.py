@@ -23,8 +23,8 @@ the report has no warning that the clean clip's has not. What the user is told o
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
 and not which method is better: one that has hardly learnt loses little. The table counts severities
 {" and ".join(map(str, _COMPARED))}; methods with all {_PLACES} places measured can be compared by their counts. The
-report of a method from another paper has the checks of the clip that ours have: they
-are this program's, not its authors'.
+report of a method from another paper has the checks of the clip that ours have: they are this program's,
+not its authors'.
 
 | | measured | {" | ".join(WORST_FIRST)} | map |
 |---|{"---|" * len(WORST_FIRST)}---|---|

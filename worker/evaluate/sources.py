@@ -97,11 +97,9 @@ def source_of(argument: str, files: Mapping[str, Path] | None = None, options: C
     """
     if argument.startswith("phantom:"):
         return _drawn(argument)
-    if not argument:
-        raise InputError("CLIP", "its name is empty.", f"Give a path, or phantom:MOTION ({', '.join(MOTIONS)}).")
     if argument.partition(":")[0] in RECORDINGS and not Path(argument).exists():
         return _recording(argument)
-    if not Path(argument).exists():
+    if not argument or not Path(argument).exists():  # an empty path is the current folder
         remedy = f"Give a path, phantom:MOTION ({', '.join(MOTIONS)}), or one of {', '.join(RECORDINGS)}."
         raise InputError("CLIP", f"there is no {argument!r}.", remedy)
     path = Path(argument)

@@ -114,7 +114,7 @@ class LerPlane(Rival):
         depth_mm = seen.depth_mm[frame, row, column]
         known, about = depth_mm > 0, self._box.s_of(depth_mm.clamp(min=1e-3))
         loss = (rgb - seen.rgb[frame, row, column]).square().mean()
-        depth_weights = [*([chosen.proposal_depth_weight] * (len(rounds) - 1)), chosen.depth_weight]
+        depth_weights = [chosen.proposal_depth_weight] * len(self.proposals) + [chosen.depth_weight]
         for (edges, weight), of_depth in zip(rounds, depth_weights, strict=True):
             error = huber_loss((weight * middles(edges)).sum(1), about, reduction="none", delta=HUBER_DELTA)
             loss = loss + of_depth * torch.where(known, error, 0.0).sum() / known.sum().clamp(min=1)
