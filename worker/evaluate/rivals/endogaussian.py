@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 import torch
@@ -19,14 +20,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
+from worker.evaluate.rivals.density import Density
 from worker.evaluate.rivals.fields import rays
-from worker.evaluate.rivals.planes import Planes, Smoothness
+from worker.evaluate.rivals.planes import Planes, Smoothness, mean_squared_difference
 from worker.evaluate.rivals.rival import Rival, Seen, seeded, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
 from worker.model.loss import LossSettings, training_loss
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster import Camera, Rendered
+from worker.train.densify import DensifySettings
 from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 
@@ -50,6 +53,7 @@ class EndoGaussianSettings:
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
     hidden          width of each decoder's hidden layer
     resting         share of the training without motion
+    density         when and what to split and drop; not after the share splitting of the training
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
     smoothness      weights of how smooth the planes are
@@ -64,6 +68,8 @@ class EndoGaussianSettings:
     time_cells: int = 150
     hidden: int = 64
     resting: float = 0.06
+    density: DensifySettings = field(default=DensifySettings())
+    splitting: float = 0.9
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
     decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     plane_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
@@ -90,18 +96,18 @@ class EndoGaussian(Rival):
         self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
         moves = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
-        self._moves: list[Tensor] = [nn.Parameter(each.to(seen.rgb)) for each in moves]
         # copies, not views of one tensor: torch's fused Adam updates the wrong numbers of a view
-        self._colour, self._harmonics = (
-            nn.Parameter(each.to(seen.rgb).contiguous()) for each in (start.sh[:, :1], start.sh[:, 1:])
-        )
+        of_gaussians = [
+            nn.Parameter(each.to(seen.rgb).contiguous()) for each in (*moves, start.sh[:, :1], start.sh[:, 1:])
+        ]
+        *self._moves, self._colour, self._harmonics = of_gaussians
         with seeded(seed):
             self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)
         self.field.to(seen.rgb)
         of_field = [list(each.parameters()) for each in (self.field.decode, self.field.planes)]
-        groups = [[self._moves[0]], *of_field, *([each] for each in self._moves[1:])]
-        groups += [[self._colour], [self._harmonics]]
+        groups = [*([each] for each in of_gaussians), *of_field]
         self.optimizer = torch.optim.Adam([{"params": each} for each in groups], eps=1e-15, fused=True)
+        self._density = Density(self.settings.density, self.optimizer)
 
     @property
     def gaussians(self) -> int:
@@ -111,14 +117,17 @@ class EndoGaussian(Rival):
         chosen = self.settings
         moved = max(0.0, progress - chosen.resting) / (1 - chosen.resting)
         pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
-        falling = [first * (last / first) ** moved for first, last in pairs]
+        of_mean, *of_field = (first * (last / first) ** moved for first, last in pairs)
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
-        return [*falling, *of_shapes, chosen.colour_rate, chosen.harmonics_rate]
+        return [of_mean, *of_shapes, chosen.colour_rate, chosen.harmonics_rate, *of_field]
 
     def step(self, iteration: int, progress: float) -> float:
         # at rest the rasteriser's own threads do most of a step, while torch's would only spin
         with torch_threads(1) if self._rests(progress) else nullcontext():
-            return super().step(iteration, progress)
+            loss = super().step(iteration, progress)
+        if progress < self.settings.splitting and self.settings.density.due(iteration):
+            *self._moves, self._colour, self._harmonics = self._density.split(self.generator(iteration))
+        return loss
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
@@ -128,13 +137,15 @@ class EndoGaussian(Rival):
             drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
             frame = self._measured[int(drawn)]
         degree = min(self.settings.sh_degree, int((self.settings.sh_degree + 1) * progress))
-        moved = torch.cat(self._moves, 1) if rests else self._moved(float(seen.t[frame]))
+        moved = torch.cat([*self._moves], 1) if rests else self._moved(float(seen.t[frame]))
+        self._density.watch(moved, self._cameras[frame])
         shown = self._shown(moved, self._cameras[frame], degree)
         depth = seen.depth_mm[frame] * self._scale
         true = seen.rgb[frame], depth, seen.tissue[frame]
         loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
         evenness = self.settings.evenness * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
-        loss = loss + evenness * (variation(shown.rgb) + variation(shown.depth[..., None]))
+        for each, axis in product((shown.rgb, shown.depth), (0, 1)):
+            loss = loss + evenness * mean_squared_difference(each, axis, 1)
         return loss if rests else loss + self.field.planes.roughness(self.settings.smoothness)
 
     @torch.no_grad()
@@ -170,7 +181,7 @@ class EndoGaussian(Rival):
         if not bool(torch.isfinite(mean).all()):
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
         changed: Tensor = self.field(mean, t)
-        return torch.cat(self._moves, 1) + changed
+        return torch.cat([*self._moves], 1) + changed
 
     def _shown(self, moved: Tensor, camera: Camera, degree: int) -> Rendered:
         """The picture of Gaussians [N, MOVING], with harmonics up to the degree."""
@@ -196,11 +207,6 @@ def starting_gaussians(
     points = units_per_mm * (origin + seen.depth_mm[frame, row, column][:, None] * direction)
     place, rgb = points.cpu().numpy(), seen.rgb[frame, row, column].cpu().numpy()
     return initial_gaussians(place, rgb, sh_degree=settings.sh_degree, opacity=settings.opacity)
-
-
-def variation(image: Tensor) -> Tensor:
-    """Mean squared difference of neighbouring pixels of [H, W, C], down and across."""
-    return (image[1:] - image[:-1]).square().mean() + (image[:, 1:] - image[:, :-1]).square().mean()
 
 
 class _Field(nn.Module):

@@ -60,12 +60,12 @@ class Planes(nn.Module):
         """The weighted sum, of all resolutions. Second differences count where there are three cells of time."""
         total = torch.zeros((), dtype=self.time[0].dtype, device=self.time[0].device)
         for space, time in zip(self.space, self.time, strict=True):
-            total = total + weights.space * sum(_mean_squared_difference(space, axis, 1) for axis in (2, 3))
+            total = total + weights.space * sum(mean_squared_difference(space, axis, 1) for axis in (2, 3))
             total = total + weights.rest * (1 - time).abs().mean()
             if weights.time:
-                total = total + weights.time * sum(_mean_squared_difference(time, axis, 1) for axis in (2, 3))
+                total = total + weights.time * sum(mean_squared_difference(time, axis, 1) for axis in (2, 3))
             if time.shape[2] > 2:
-                total = total + weights.acceleration * _mean_squared_difference(time, 2, 2)
+                total = total + weights.acceleration * mean_squared_difference(time, 2, 2)
         return total
 
 
@@ -93,7 +93,7 @@ class _MeanSquaredDifference(Function):
         return found, None, None
 
 
-def _mean_squared_difference(values: Tensor, axis: int, order: int) -> Tensor:
+def mean_squared_difference(values: Tensor, axis: int, order: int) -> Tensor:
     """Of neighbours along an axis (order 1), or of their differences (order 2)."""
     found: Tensor = _MeanSquaredDifference.apply(values, axis, order)  # type: ignore[no-untyped-call]
     return found

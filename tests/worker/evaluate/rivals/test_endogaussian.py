@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, small_clip
+from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_step, check_what_counts, small_clip
 from worker.evaluate.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
 from worker.evaluate.rivals.rival import Seen
+from worker.train.densify import DensifySettings
 
 SMALL = EndoGaussianSettings(
     share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),
@@ -71,6 +74,17 @@ def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -
     assert len(losses(0.3)) == 3
     rival.loss(1, 0.3).backward()
     assert all(float(decode[-1].weight.grad.abs().max()) > 0 for decode in rival.field.decode)
+
+
+def test_gaussians_are_split_when_that_is_due_until_late_in_the_training() -> None:
+    often = DensifySettings(from_iteration=4, every=2, gradient_threshold=1e-7)
+    rival = EndoGaussian(Seen.of(small_clip(3), range(3)), 0, dataclasses.replace(TINY, density=often))
+    counts = []
+    for iteration, progress in enumerate((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.89, 0.9), 1):
+        assert np.isfinite(rival.step(iteration, progress))
+        counts.append(rival.gaussians)
+    assert counts[0] == counts[2] < counts[3] == counts[4] < counts[5] == counts[7]
+    check_step(rival)
 
 
 def test_its_motion_is_the_displacement_of_the_gaussians_that_a_pixel_shows() -> None:
