@@ -84,15 +84,14 @@ def score_held_out(
     held_out: Sequence[int],
     render_as: Callable[[Eye | None], FrameRenderer],
     hooks: TrainingHooks,
-    most: int = MAX_SCORED_FRAMES,
 ) -> HeldOutScore:
-    """The score over at most so many of the held-out frames, evenly spread.
+    """The score over at most MAX_SCORED_FRAMES of the held-out frames, evenly spread.
 
     Args:
         render_as: renders from the left eye for None, else from the clip's right eye.
         hooks: see the left eye's renders.
     """
-    scores, frames, render = [], sample_frames(held_out, most), render_as(None)
+    scores, frames, render = [], sample_frames(held_out, MAX_SCORED_FRAMES), render_as(None)
     for index in frames:
         frame = render(index)
         hooks.on_held_out(index, frame)

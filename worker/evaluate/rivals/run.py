@@ -34,12 +34,10 @@ from worker.report.quality import Training, first_report
 from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.loop import REPORT_EVERY_S
 from worker.train.run import CurvePoint
-from worker.train.scoring import MAX_SCORED_FRAMES, FrameRenderer, score_held_out
+from worker.train.scoring import FrameRenderer, score_held_out
 
 SCORED_SECONDS = (1, 3, 10, 30, 60, 120, 300, 600, 1200)
 """Training times at which held-out frames are scored, the clock paused."""
-SCORED_ON_THE_WAY = 4
-"""Held-out frames of such a score; the end is scored on as many as everybody's."""
 
 Make = Callable[[Seen, int], Rival]
 """A rival before its first step, from what it may see and a seed."""
@@ -166,8 +164,7 @@ def run_rival(
     def score(made: int) -> float:
         t_train_s = clock.elapsed_s
         renders.forget()
-        most = MAX_SCORED_FRAMES if length.progress(made, t_train_s) >= 1 else SCORED_ON_THE_WAY
-        found = score_held_out(scored, split.held_out, render_as, hooks, most)
+        found = score_held_out(scored, split.held_out, render_as, hooks)
         if not math.isnan(found.left_db):
             right_db = None if math.isnan(found.right_db) else found.right_db
             curve.append(CurvePoint(t_train_s, made, found.left_db, right_db, waited_s + t_train_s))
