@@ -102,17 +102,12 @@ class Densifier:
         if not np.isfinite(gradient).all():
             broken = int((~np.isfinite(gradient)).sum())
             raise TrainingDiverged(f"The gradients of {broken} Gaussians are not finite at iteration {iteration}.")
-        pruned = model.parameters()["opacity_logit"].cpu().numpy() < _logit(self.settings.min_opacity)
-        if pruned.all():
+        opacity_logit = model.parameters()["opacity_logit"].cpu().numpy()
+        columns, born = successors(self.settings, gradient, opacity_logit)
+        if len(columns) == 0:
             raise TrainingDiverged(f"All {model.count} Gaussians have become transparent by iteration {iteration}.")
-        asked = np.flatnonzero((gradient > self.settings.gradient_threshold) & ~pruned)
-        split = _hardest_pulled(asked, gradient, self._room(model.count - int(pruned.sum())))
-        _replace(model, pruned, split, self.settings.split_into, random)
+        _replace(model, columns, born, self.settings.split_into, random)
         self._forget(model.count)
-
-    def _room(self, count: int) -> int:
-        """How many of count Gaussians may be split."""
-        return max(0, self.settings.max_count - count) // (self.settings.split_into - 1)
 
     def arrays(self) -> dict[str, Tensor]:
         """The statistics, by name; views."""
@@ -132,35 +127,47 @@ class Densifier:
         self._steps_seen = steps_seen.to(torch.int64, copy=True)
 
 
-def _logit(opacity: float) -> float:
-    return math.log(opacity / (1 - opacity))
+def successors(
+    settings: DensifySettings, gradient: NDArray[np.floating], opacity_logit: NDArray[np.floating]
+) -> tuple[NDArray[np.int64], int]:
+    """Which Gaussians [M] the next ones are made of, parents split_into times; and how many, the last, are children.
+
+    The others keep their order. Empty if all are transparent.
+
+    Args:
+        gradient: [N], NDC; the mean gradient of each since the last densification.
+        opacity_logit: [N].
+    """
+    pruned = opacity_logit < math.log(settings.min_opacity / (1 - settings.min_opacity))
+    asked = np.flatnonzero((gradient > settings.gradient_threshold) & ~pruned)
+    room = max(0, settings.max_count - int((~pruned).sum())) // (settings.split_into - 1)
+    parents = _hardest_pulled(asked, gradient, room)
+    kept = ~pruned
+    kept[parents] = False
+    columns = np.concatenate([np.flatnonzero(kept), np.tile(parents, settings.split_into)])
+    return columns, len(parents) * settings.split_into
 
 
-def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.float64], room: int) -> NDArray[np.int64]:
+def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.floating], room: int) -> NDArray[np.int64]:
     """At most room of the candidates, those with the greatest gradients, ascending."""
     order = np.argsort(-gradient[candidates], kind="stable")
     return np.sort(candidates[order[:room]])
 
 
-def _replace(
-    model: Model, pruned: NDArray[np.bool_], split: NDArray[np.int64], children: int, random: np.random.Generator
-) -> None:
-    """Drop the pruned, replace each of split by children: smaller, at places drawn from the parent's own density.
+def _replace(model: Model, columns: NDArray[np.int64], born: int, children: int, random: np.random.Generator) -> None:
+    """Make the Gaussians of these columns, the last so many children: smaller, drawn from the parent's own density.
 
     Everything else is the parent's: rotation, opacity, colour, motion. Adam's moments of the children start at 0.
     """
-    kept = ~pruned
-    kept[split] = False
-    survivors = np.flatnonzero(kept)
-    columns = np.concatenate([survivors, np.tile(split, children)])
-    model.take(columns, np.arange(len(columns)) >= len(survivors))
+    survivors = len(columns) - born
+    model.take(columns, np.arange(len(columns)) >= survivors)
 
-    if len(split) == 0:
+    if born == 0:
         return
-    born = model.parameters()["canonical"][:, len(survivors) :]
-    state = np.array(born.cpu())
+    canonical = model.parameters()["canonical"][:, survivors:]
+    state = np.array(canonical.cpu())
     mean, quaternion, log_scale = (state[rows] for rows in (MEAN, QUATERNION, LOG_SCALE))
     along_axes = random.standard_normal(mean.T.shape) * np.exp(log_scale.T)
     mean += Rotation.from_quat(quaternion.T[:, [1, 2, 3, 0]]).apply(along_axes).T.astype(np.float32)
     log_scale -= np.float32(math.log(SPLIT_SHRINK * children))
-    born.copy_(torch.from_numpy(state))
+    canonical.copy_(torch.from_numpy(state))

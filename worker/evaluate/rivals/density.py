@@ -1,6 +1,6 @@
 """Splits and drops Gaussians while `endogaussian` trains, as in 3D Gaussian splatting (Kerbl et al., 2023, section 5).
 
-Symbols: N Gaussians. The rule and its numbers are those of worker/train/densify.py; here they edit torch's parameters.
+Symbols: N Gaussians. worker/train/densify.py says which are split and dropped; here that edits torch's parameters.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from contract.wire.errors import TrainingDiverged
 from worker.raster import Camera
 from worker.raster.reference import rotation
-from worker.train.densify import SPLIT_SHRINK, DensifySettings
+from worker.train.densify import SPLIT_SHRINK, DensifySettings, successors
 
 PARAMETERS = 6
 """Of Gaussians, each in a group of its own, and these the optimiser's first groups: mean [N, 3] in units,
@@ -73,28 +73,18 @@ class Density:
         Raises:
             TrainingDiverged: all are transparent.
         """
-        indices, born = self._chosen()
-        if len(indices) == 0:
+        opacity_logit = self._optimizer.param_groups[3]["params"][0]
+        found, born = successors(self.settings, self.pull.cpu().numpy(), opacity_logit[:, 0].cpu().numpy())
+        if len(found) == 0:
             raise TrainingDiverged("All Gaussians have become transparent.")
-        found = [self._taken(group, indices, born) for group in self._optimizer.param_groups[:PARAMETERS]]
-        mean, quaternion, log_scale = (each[len(indices) - born :] for each in found[:3])
+        indices = torch.from_numpy(found).to(opacity_logit.device)
+        made = [self._taken(group, indices, born) for group in self._optimizer.param_groups[:PARAMETERS]]
+        mean, quaternion, log_scale = (each[len(indices) - born :] for each in made[:3])
         along_axes = torch.randn(mean.shape, generator=random).to(mean) * log_scale.exp()
         mean += (rotation(quaternion) @ along_axes[..., None])[..., 0]
         log_scale -= math.log(SPLIT_SHRINK * self.settings.split_into)
         self._forget()
-        return found
-
-    def _chosen(self) -> tuple[Tensor, int]:
-        """Which Gaussians the next ones are made of, parents split_into times; the last so many are children."""
-        chosen, pull = self.settings, self.pull
-        opacity_logit = self._optimizer.param_groups[3]["params"][0][:, 0]
-        kept = opacity_logit >= math.log(chosen.min_opacity / (1 - chosen.min_opacity))
-        asked = torch.nonzero(kept & (pull > chosen.gradient_threshold))[:, 0]
-        room = max(0, chosen.max_count - int(kept.sum())) // (chosen.split_into - 1)
-        parents = asked[torch.argsort(pull[asked], descending=True, stable=True)[:room]]
-        kept[parents] = False
-        survivors = torch.nonzero(kept)[:, 0]
-        return torch.cat([survivors, parents.repeat(chosen.split_into)]), len(parents) * chosen.split_into
+        return made
 
     def _taken(self, group: dict[str, list[nn.Parameter]], indices: Tensor, born: int) -> nn.Parameter:
         """These rows of a group's parameter; of Adam's moments, those of the last born are 0."""
