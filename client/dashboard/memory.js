@@ -103,6 +103,7 @@ export class Memory extends EventTarget {
       totalMs: NaN,
       camera: { ...cameras.resized(size.width, size.height), world_from_camera: pose.slice(0, 3).flat() },
       way: "memory",
+      isMoving: how.isMoving,
     };
   }
 

@@ -11,10 +11,11 @@ import { connectionLost, Problem, wrongKeyWords } from "./problem.js";
 /**
  * What came: a file, or an image that this browser drew. way: how. isExtrapolated: it shows a guess, or a pose or time far
  * from the clip's. isRecorded: it is a frame of the clip, no render. Both are set by judged() of pictures.js.
- * depthRangeMm: of depth in false colours, of the brightest and of the darkest.
+ * depthRangeMm: of depth in false colours, of the brightest and of the darkest. isMoving: as of Shown in viewer.js.
  * @typedef {{blob?: Blob, image?: HTMLCanvasElement, scene: string, state: "running"|"done", t: number, iteration: number | null,
  *   unseen: number, warning: string, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
- *   camera: Camera | null, depthRangeMm?: [number, number] | null, isExtrapolated?: boolean, isRecorded?: boolean}} Picture
+ *   camera: Camera | null, depthRangeMm?: [number, number] | null, isExtrapolated?: boolean, isRecorded?: boolean,
+ *   isMoving?: boolean}} Picture
  */
 /**
  * Where a picture was taken from, and through which lens: pixels of the picture as it came, and world_from_camera as 12

@@ -23,10 +23,11 @@ const REST_MS = 150;
 const COARSE = "coarse";
 /**
  * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own, of the eye;
- * camera: null where it is not known, as of recorded frames; way: how the picture came.
+ * camera: null where it is not known, as of recorded frames; way: how the picture came; isMoving: it was drawn at once, perhaps
+ * with its Gaussians sorted for the view before, and an exact picture follows.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
  *   highlights: "on"|"off", state: "running"|"done", way: "stream"|"single"|"memory",
- *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null}} Shown
+ *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null, isMoving: boolean}} Shown
  */
 /** Not a layer of the model, but what the endoscope saw. */
 const RECORDED = "recorded";
@@ -266,6 +267,7 @@ export class Viewer extends EventTarget {
 }
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
-function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, { t, state, way, camera, depthRangeMm }) {
-  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera, depthRangeMm };
+function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, picture) {
+  const { t, state, way, camera, depthRangeMm, isMoving = false } = picture;
+  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera, depthRangeMm, isMoving };
 }

@@ -106,6 +106,7 @@ def render_of(url: str, shown: dict[str, Any]) -> NDArray[np.uint8]:
 def beside_the_service(site: Site, page: Drawn) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """What the page has drawn by itself, and by how many levels it differs from what the service draws of that view."""
     site.announce()  # else the worker counts as gone after a while
+    page.until(lambda: page.shown.get("isMoving") is False)  # else sorted for the view before
     drawn, rendered = picture_of(page), render_of(site.url, page.shown)
     assert page.shown.get("way") == "memory"
     assert drawn.shape == rendered.shape
