@@ -37,9 +37,9 @@ reach there, `hidden` the score behind the instrument; `moving` is the motion er
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
 are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are those of one to
 five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the measured depth of the training frames
-nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. Some rows
-of EndoNeRF and LerPlane are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`): their curves are scored
-on four held-out frames on the way and on up to 16 at their end, where they may jump.
+nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows
+of 1800 s of EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) have
+curves that are scored on four held-out frames on the way and on up to 16 at their end, where they may jump.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
