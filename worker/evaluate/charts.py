@@ -59,12 +59,9 @@ EYES = {
     "right eye": (RIGHT, "held-out psnr_right, dB"),
 }
 """By eye: its column in both files, and what it is called."""
-COPY_LINES = {
-    "copy_blend_db": ("copying: blend", (5, 3), 1, "right"),
-    "copy_flow_db": ("copying: flow", (2, 2), 0, "left"),
-}
-WARP_LINES = {"warp_db": ("warped left eye", (5, 3), 1, "right")}
-"""By column: what a dashed line is called, its dashes, the side where its name stands and how that is aligned."""
+COPY_LINES = {"copy_blend_db": ("copying: blend", (5, 3)), "copy_flow_db": ("copying: flow", (2, 2))}
+WARP_LINES = {"warp_db": ("warped left eye", (5, 3))}
+"""By column: what a dashed line is called, and its dashes."""
 
 Points = list[tuple[float, float]]
 DrawPanel = Callable[[Any, Sequence[Group], str], list[str]]
@@ -258,16 +255,17 @@ def _published(axis: Any, across: str) -> None:
         axis.annotate(each.method, (x, y), (0, (6, -12)[place % 2]), textcoords="offset points", **text)
 
 
-def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, tuple[int, int], int, str]]) -> None:
-    """Dashed: what copying or warping recorded pictures scores."""
-    for column, (what, dashes, side, aligned) in lines.items():
-        known = [score for group in groups if not math.isnan(score := group.median(column))]
-        if known:
-            axis.axhline(known[0], color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
-            text: dict[str, Any] = {"fontsize": 7, "color": GREY, "ha": aligned, "annotation_clip": True}
-            text["xycoords"] = ("axes fraction", "data")
-            inside = (0.995 * side + 0.0025, known[0])  # a label on the very edge would count as outside
-            axis.annotate(what, inside, (4 - 8 * side, 2), textcoords="offset points", **text)
+def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, tuple[int, int]]]) -> None:
+    """Dashed: what copying or warping recorded pictures scores; named right of the panel, where no mark lies."""
+    scores = {column: [group.median(column) for group in groups] for column in lines}
+    known = {column: next((each for each in found if not math.isnan(each)), None) for column, found in scores.items()}
+    rising = sorted((score, column) for column, score in known.items() if score is not None)
+    for place, (score, column) in enumerate(rising):
+        what, dashes = lines[column]
+        axis.axhline(score, color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
+        aligned = "center" if len(rising) == 1 else ("top", "bottom")[place]
+        text: dict[str, Any] = {"fontsize": 7, "color": GREY, "va": aligned, "xycoords": ("axes fraction", "data")}
+        axis.annotate(what, (1.0, score), (3, 0), textcoords="offset points", **text)
 
 
 def _missing(groups: Sequence[Group], more: Mapping[str, Sequence[str]]) -> str:
@@ -380,10 +378,10 @@ def _name(axis: Any, place: Place, groups: Sequence[Group], missing: str) -> Non
 
 
 def _finish(axis: Any) -> None:
-    """Room around what is drawn, and plain numbers on the logarithmic axis instead of powers of ten."""
+    """Room around what is drawn and the limits named beside it, and plain numbers on the logarithmic axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.margins(x=0.09, y=0.1)
+    axis.margins(x=0.14, y=0.1)
     low, high = axis.get_xlim()
     axis.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if high < MAX_FINE_TICKS * low else (1,)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -191,7 +191,10 @@ def _drawn(argument: str) -> Source:
         else:
             problem = f"{part!r} in {argument!r} is not known."
             raise InputError("CLIP", problem, f"Write {PHANTOM_SPELLING}.")
-    settings = PhantomSettings(motion=motion, camera=tuple(paths), **values)  # type: ignore[arg-type]  # it judges them
+    try:
+        settings = PhantomSettings(motion=motion, camera=tuple(paths), **values)  # type: ignore[arg-type]  # it judges
+    except InputError as error:  # it names an option of another command
+        raise InputError("CLIP", f"{argument!r} cannot be drawn: {error.problem}", error.remedy) from error
     stereo, masks = flags["stereo"], not flags["nomasks"]
     name = _phantom_name(settings) + "-nomasks" * (not masks) + "-stereo" * stereo
     return Source(name, argument, settings, stereo, masks)

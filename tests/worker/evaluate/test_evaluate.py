@@ -337,3 +337,11 @@ def test_a_curve_whose_run_has_no_row_is_forgotten(measured: Path, tmp_path: Pat
 def test_what_cannot_be_meant_is_refused_before_anything_is_measured(arguments: list[str], tmp_path: Path) -> None:
     assert main(["evaluate", *arguments, "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("clip", ["phantom:dancing", "phantom:pull+fly", "phantom:pull:9x9", "phantom:pull:spoon"])
+def test_a_clip_that_cannot_be_drawn_is_named_by_the_argument_that_spells_it(clip: str) -> None:
+    with pytest.raises(InputError) as refused:
+        source_of(clip)
+    assert refused.value.field == "CLIP"
+    assert clip in refused.value.problem
