@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 
+from benchmarks.pages.markdown import number
 from worker.evaluate.atlas import WORST_FIRST, count_outcomes, map_name, places_of, series_in
-from worker.evaluate.conditions import CONDITIONS, SEVERITIES
-from worker.evaluate.rows import read_rows
+from worker.evaluate.conditions import CLEAN, CONDITIONS, SEVERITIES
+from worker.evaluate.rows import Row, read_rows
 from worker.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, STABILITY
 
 _COMPARED = (3, 5)
@@ -21,13 +24,13 @@ ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the tr
 the report has no warning that the clean clip's has not. What the user is told of each stands in
 [stability.md](stability.md), how it is judged in [decision 016](../decisions/016-stability.md). Each method is compared
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
-and not which method is better: one that has hardly learnt loses little. The table counts severities
-{" and ".join(map(str, _COMPARED))}; methods with all {_PLACES} places measured can be compared by their counts. The
-report of a method from another paper has the checks of the clip that ours have: they are this program's,
-not its authors'.
+and not which method is better: one that has hardly learnt after these few steps loses little. The table counts
+severities {" and ".join(map(str, _COMPARED))}, beside the score on the clean clip. The
+report of a method from another paper has the checks of the clip that ours have: they are this program's, not its
+authors'.
 
-| | measured | {" | ".join(WORST_FIRST)} | map |
-|---|{"---|" * len(WORST_FIRST)}---|---|
+| | clean, dB | measured | {" | ".join(WORST_FIRST)} | map |
+|---|---|---|{"---|" * len(WORST_FIRST)}---|
 """
 _MAP = """
 ![Decibels lost of each condition at five severities, marked where the user was told and where not](stability-fast.png)
@@ -68,6 +71,12 @@ def stability_sections(results: Path) -> list[str]:
         counts = " | ".join(str(counted.get(outcome, 0)) for outcome in WORST_FIRST)
         name = f"{map_name(series)}.png"
         shown = f"[{name}]({name})" if (results / name).exists() else ""
-        lines.append(f"| {series} | {measured} | {counts} | {shown} |\n")
+        lines.append(f"| {series} | {_clean_db(rows, series)} | {measured} | {counts} | {shown} |\n")
     drawn = [_MAP] if (results / "stability-fast.png").exists() else []
     return [_INTRODUCTION, *lines, *drawn, *(why for names, why in _WHY_SILENT.items() if silent & {*names})]
+
+
+def _clean_db(rows: Sequence[Row], series: str) -> str:
+    """The mean of all seeds on the clean clip."""
+    found = [row["psnr_db"] for row in rows if (row["series"], row["condition"]) == (series, CLEAN)]
+    return number(fmean(map(float, found)) if found and all(found) else None, 1)

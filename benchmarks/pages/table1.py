@@ -38,13 +38,14 @@ reach there, `hidden` the score behind the instrument; `moving` is the motion er
 are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are those of one to
 five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the measured depth of the training frames
 nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows
-of 1800 s of EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) have
-curves that are scored on four held-out frames on the way and on up to 16 at their end, where they may jump.
+of 1800 s of EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) are of an
+older form of the two (decision 078), and their curves are scored on four held-out frames on the way and on up to 16 at
+their end, where they may jump.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
-Each column compares a system with the next, after the longest run of each (two rivals: the longest limit that both have
-had). A difference below 0, or a quotient below 1, contradicts the paper's order:
+Each column compares a system with the next: images a second after the longest run of each, dB too, but of two rivals
+after the longest limit that both have had. A difference below 0, or a quotient below 1, contradicts the paper's order:
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "ssim": ("SSIM", 3), "iterations": ("steps", 0),
@@ -53,6 +54,7 @@ _COLUMNS = {
     "moving_error_mm": ("moving, mm", 2), "moving_mm": ("moved by, mm", 2),
 }  # fmt: skip
 """By column of runs.csv: its name and digits."""
+_Pair = tuple[Published | Group | None, Published | Group | None]
 
 
 def table1_sections(folder: Path) -> list[str]:
@@ -85,38 +87,46 @@ def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
     measured = []
     for place in places:
         here = _in_order(groups, place)
-        measured.append([*place, *_compared([_longest(here, a, b) for a, b in pairs])])
+        in_db = [_longest(here, a, b) for a, b in pairs]
+        in_images = [(_last(here, a), _last(here, b)) for a, b in pairs]
+        measured.append([*place, *_compared(in_db, in_images)])
     if all(figure == "–" for row in measured for figure in row[2:]):
         return []
     published = []
     for data in dict.fromkeys(each.data for each in RESULTS):
         methods = {each.method: each for each in RESULTS if each.data == data}
         known = [(methods[SYSTEMS[a]], methods[SYSTEMS[b]]) for a, b in pairs]
-        published.append([f"published, {data} data", "", *_compared(known)])
+        published.append([f"published, {data} data", "", *_compared(known, known)])
     header = ["clip", "held out", *(f"{a} – {b}, dB" for a, b in pairs), *(f"{a} / {b}, images" for a, b in pairs)]
     return [_ORDERS.format(systems=", ".join(SYSTEMS.values())), table(header, published + measured)]
 
 
 def _longest(here: Sequence[Group], a: str, b: str) -> tuple[Group | None, Group | None]:
     """The longest runs of two systems at a place; of two rivals the longest of a length that both have had."""
-    of_a, of_b = ({group.limit: group for group in here if group.series == series} for series in (a, b))
     if a in RIVAL_SYSTEMS and b in RIVAL_SYSTEMS:
-        shared = of_a.keys() & of_b.keys()
-        of_a, of_b = ({limit: each[limit] for limit in each if limit in shared} for each in (of_a, of_b))
-    last_a, last_b = (next(reversed(each.values()), None) for each in (of_a, of_b))
-    return last_a, last_b
+        of_a, of_b = ({group.limit for group in here if group.series == series} for series in (a, b))
+        here = [group for group in here if group.limit in of_a & of_b]
+    return _last(here, a), _last(here, b)
 
 
-def _compared(pairs: Sequence[tuple[Published | Group | None, Published | Group | None]]) -> list[str]:
-    """Differences in dB of the pairs, then quotients of images a second; dashes where one of the two is missing."""
-    figures = [(_figures(a), _figures(b)) for a, b in pairs]
-    return [number(a[0] - b[0], 1) for a, b in figures] + [number(a[1] / b[1], 1) for a, b in figures]
+def _last(here: Sequence[Group], series: str) -> Group | None:
+    """The longest run of a system."""
+    return next((group for group in reversed(here) if group.series == series), None)
 
 
-def _figures(found: Published | Group | None) -> tuple[float, float]:
-    """dB and images a second."""
+def _compared(in_db: Sequence[_Pair], in_images: Sequence[_Pair]) -> list[str]:
+    """Differences in dB of pairs, then quotients of images a second; dashes where one of the two is missing."""
+    differences = [number(_db(a) - _db(b), 1) for a, b in in_db]
+    return differences + [number(_images_a_second(a) / _images_a_second(b), 1) for a, b in in_images]
+
+
+def _db(found: Published | Group | None) -> float:
     if found is None:
-        return math.nan, math.nan
-    if isinstance(found, Published):
-        return found.psnr_paper_db, found.fps or math.nan
-    return found.median("psnr_tissue_db"), found.median("render_fps")
+        return math.nan
+    return found.psnr_paper_db if isinstance(found, Published) else found.median("psnr_tissue_db")
+
+
+def _images_a_second(found: Published | Group | None) -> float:
+    if found is None:
+        return math.nan
+    return (found.fps or math.nan) if isinstance(found, Published) else found.median("render_fps")

@@ -141,7 +141,7 @@ def is_rival_system(series: str) -> bool:
     if preset_name_of(series) not in RIVAL_SYSTEMS:
         return False
     if _changes(series):
-        problem = f"{series!r} changes a system that is measured as it was published."
+        problem = f"{series!r} changes a system of others, which is measured as it is."
         raise InputError("--series", problem, f"Write {preset_name_of(series)!r}.")
     return True
 

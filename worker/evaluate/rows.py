@@ -147,14 +147,20 @@ def machine(device: str = "cpu") -> str:
 
 
 def commit() -> str:
-    """The commit measured, with + where the tree has changes; "unknown" outside a repository."""
-    command = ["git", "describe", "--always", "--dirty=+"]
-    folder = Path(__file__).parent
+    """The commit measured, with + where tracked files other than results differ from it; "unknown" outside a
+    repository."""
     try:
-        found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
+        found = _git("describe", "--always")
+        changed = _git("diff", "--name-only", "HEAD", "--", ":/", ":(top,exclude)docs/results")
     except OSError:
-        found = ""
-    return found or "unknown"
+        return "unknown"
+    return f"{found}{'+' * bool(changed)}" if found else "unknown"
+
+
+def _git(*arguments: str) -> str:
+    """What git prints about this file's repository; nothing if it fails."""
+    command, folder = ["git", *arguments], Path(__file__).parent
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def _is_of_left_eye(row: Row) -> bool:

@@ -45,7 +45,8 @@ PUBLISHED_WIDTH = 640
 
 @dataclass(frozen=True)
 class EndoGaussianSettings:
-    """As published, or as the methods say that it builds on: 3D and 4D Gaussian splatting.
+    """As published, or as the methods say that it builds on: 3D and 4D Gaussian splatting. cells, features, hidden,
+    resting, splitting and smoothness are ours (docs/decisions/078).
 
     share, most     share of each frame's measured pixels that become Gaussians, and how many they are at most
     opacity         at the start

@@ -43,7 +43,7 @@ CPU_RAYS = 128
 
 @dataclass(frozen=True)
 class EndoNerfSettings:
-    """As published, where the paper says.
+    """As published where docs/decisions/078 does not mark it as ours: spread, last_rate, and the unit s.
 
     spread         standard deviation of the samples about the depth, in s
     space_octaves, time_octaves, view_octaves  of the positional encodings

@@ -93,7 +93,7 @@ def rays(camera: Intrinsics, row: Tensor, column: Tensor, world_from_camera: Ten
 
 
 def weights_along(density: Tensor, length: Tensor) -> Tensor:
-    """[M, S] share of each sample in what a ray shows, from densities and the lengths in s that they hold for."""
+    """[M, S] share of each sample in what a ray shows, from densities and the lengths, in any unit, they hold for."""
     alpha = 1 - torch.exp(-density * length)
     through = torch.cumprod(1 - alpha + 1e-10, -1)
     return alpha * torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], -1)

@@ -41,7 +41,7 @@ CPU_RAYS = 512
 
 @dataclass(frozen=True)
 class LerPlaneSettings:
-    """As published, or as the authors' BSD-licensed configuration says.
+    """As published, or as the authors' BSD-licensed configuration says; warm_up, annealed, least and most are ours.
 
     cells, features     of the planes, by resolution; time_cells is their most cells of time
     proposal_*          of the fields that propose samples, one a round, and how many intervals each looks at

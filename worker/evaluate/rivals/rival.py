@@ -79,7 +79,8 @@ class Rival(ABC):
 
     @abstractmethod
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """The loss of an iteration (from 1); progress in [0, 1) says how much of the training is done."""
+        """The loss of an iteration (from 1); progress in [0, 1) says how much of the training is done. It may note what
+        the iteration has found for later ones."""
 
     @abstractmethod
     def rates(self, progress: float) -> Sequence[float]:

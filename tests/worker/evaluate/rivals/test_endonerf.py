@@ -39,7 +39,8 @@ def test_it_learns_from_the_start_whatever_the_seed() -> None:
     for seed in range(6):
         rival = EndoNerf(seen, seed, TINY)
         rival.loss(1, 0.0).backward()  # type: ignore[no-untyped-call]
-        assert all(bool((each.grad != 0).any()) for each in rival.field.density.parameters() if each.grad is not None)
+        of_density = [each.grad for each in rival.field.density.parameters()]
+        assert all(each is not None and bool((each != 0).any()) for each in of_density)
 
 
 def test_its_network_displaces_places_by_their_time() -> None:
