@@ -7,7 +7,14 @@ import dataclasses
 import numpy as np
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_step, check_what_counts, small_clip
+from tests.worker.evaluate.rivals.cases import (
+    check_gradient,
+    check_moving_camera,
+    check_overfit,
+    check_step,
+    check_what_counts,
+    small_clip,
+)
 from worker.evaluate.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
 from worker.evaluate.rivals.rival import Seen
 from worker.train.densify import DensifySettings
@@ -39,6 +46,10 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
 
 def test_it_overfits_one_frame_above_30_db() -> None:
     check_overfit(small, 300)
+
+
+def test_it_learns_from_a_camera_that_moves_and_from_depth_with_holes() -> None:
+    check_moving_camera(small, 60)
 
 
 def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, fitted, small_clip
+from tests.worker.evaluate.rivals.cases import (
+    check_gradient,
+    check_moving_camera,
+    check_overfit,
+    check_what_counts,
+    fitted,
+    small_clip,
+)
 from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings
 from worker.evaluate.rivals.rival import Seen
 
@@ -28,6 +35,10 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
 
 def test_it_overfits_one_frame_above_30_db() -> None:
     check_overfit(small, 400)
+
+
+def test_it_learns_from_a_camera_that_moves_and_from_depth_with_holes() -> None:
+    check_moving_camera(small, 100)
 
 
 def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:

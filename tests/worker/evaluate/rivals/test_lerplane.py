@@ -7,7 +7,14 @@ import dataclasses
 import numpy as np
 import torch
 
-from tests.worker.evaluate.rivals.cases import check_gradient, check_overfit, check_what_counts, fitted, small_clip
+from tests.worker.evaluate.rivals.cases import (
+    check_gradient,
+    check_moving_camera,
+    check_overfit,
+    check_what_counts,
+    fitted,
+    small_clip,
+)
 from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
 from worker.evaluate.rivals.planes import Planes, Smoothness
@@ -91,6 +98,10 @@ def test_the_proposals_learn_where_the_field_has_its_weight() -> None:
 
 def test_it_overfits_one_frame_above_30_db() -> None:
     check_overfit(small, 180)
+
+
+def test_it_learns_from_a_camera_that_moves_and_from_depth_with_holes() -> None:
+    check_moving_camera(small, 130)
 
 
 def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
