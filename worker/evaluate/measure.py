@@ -147,7 +147,7 @@ class Bench:
         device, timings, options = choose_device(self.device), Timings(), options_of(cell)
         with timings.measure("open_s"):
             clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, Timings(), device)
-        step_px = scored_step_px(cell.series, device)
+        step_px = scored_step_px(cell.series, device, clip.intrinsics.width)
         on_the_way = _OnTheWay(thinned(clip, step_px))
         fitted = run_rival(
             cell.series,

@@ -304,8 +304,8 @@ def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks:
 
 def _made_by_rival(request: ReconstructionRequest, cell: StabilityCell, hooks: TrainingHooks) -> _Made:
     options, device = request.options, choose_device(request.device)
-    step_px = scored_step_px(cell.series, device)
     clip = open_with_depth(request, hooks, Timings(), device)
+    step_px = scored_step_px(cell.series, device, clip.intrinsics.width)
     drawn_by = thinned_camera(clip.intrinsics, step_px)
     fitted = run_rival(
         cell.series,

@@ -24,10 +24,12 @@ RIVAL_SYSTEMS: Mapping[str, Make] = MappingProxyType(
 RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""
 RAY_BY_RAY = frozenset({"endonerf", "lerplane"})
-CPU_STEP_PX = 5
-"""A whole picture of 160x128 takes two cores 16 to 27 s with EndoNeRF."""
+CPU_STEP_PX, CPU_COLUMNS = 5, 64
+"""At least every so manyth pixel, and at most about so many columns: a whole picture of 160x128 takes two cores 16 to
+27 s with EndoNeRF."""
 
 
-def scored_step_px(series: str, device: Device) -> int:
-    """The lattice of pixels that a system is scored on (worker/evaluate/thinned.py): coarse where rays take long."""
-    return CPU_STEP_PX if series in RAY_BY_RAY and device.kind == "cpu" else 1
+def scored_step_px(series: str, device: Device, width: int) -> int:
+    """The lattice of pixels that a system is scored on (worker/evaluate/thinned.py), in a picture so many pixels wide:
+    coarse where rays take long."""
+    return max(CPU_STEP_PX, width // CPU_COLUMNS) if series in RAY_BY_RAY and device.kind == "cpu" else 1

@@ -18,7 +18,7 @@ from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, options_of, plan, preset_of
 from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
-from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
+from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
 from worker.evaluate.rivals.lerplane import LerPlane
@@ -142,7 +142,7 @@ def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
     assert cells[-1].budget_s == RIVAL_BUDGET_S
     assert not set(RIVAL_SYSTEMS) & set(PRESETS)
     for series in ("endonerf:bases=3", "endonerf:eyes=left"):
-        with pytest.raises(InputError, match="as it was published"):
+        with pytest.raises(InputError, match="changes a system of others"):
             plan(["clip"], [series], ["every8"], [0])
     with pytest.raises(InputError, match="no preset"):
         preset_of("endonerf")
@@ -167,6 +167,13 @@ def test_a_picture_is_rendered_once_until_the_rival_trains_further() -> None:
     assert renders(0.6, clip.world_from_camera[1], clip.intrinsics) is not first
     renders.forget()
     assert renders(0.5, clip.world_from_camera[1], clip.intrinsics) is not first
+
+
+def test_what_draws_ray_by_ray_is_scored_at_as_few_pixels_of_a_wide_clip_as_of_a_narrow_one() -> None:
+    cpu = choose_device("cpu")
+    steps_px = [scored_step_px("lerplane", cpu, width) for width in (64, 160, 320, 640, 1920)]
+    assert steps_px == [5, 5, 5, 10, 30]
+    assert scored_step_px("endogaussian", cpu, 1920) == 1
 
 
 def test_a_rival_has_cells_in_the_atlas_that_tell_of_the_clip(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
