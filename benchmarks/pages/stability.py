@@ -24,10 +24,9 @@ ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the tr
 the report has no warning that the clean clip's has not. What the user is told of each stands in
 [stability.md](stability.md), how it is judged in [decision 016](../decisions/016-stability.md). Each method is compared
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
-and not which method is better: one that has hardly learnt after these few steps loses little. The table counts
-severities {" and ".join(map(str, _COMPARED))}, beside the score on the clean clip. The
-report of a method from another paper has the checks of the clip that ours have: they are this program's, not its
-authors'.
+and not which method is better: one that has hardly learnt loses little. The table counts severities
+{" and ".join(map(str, _COMPARED))}, beside the score on the clean clip. The report of a method from another paper has
+the checks of the clip that ours have: they are this program's, not its authors'.
 
 | | clean, dB | measured | {" | ".join(WORST_FIRST)} | map |
 |---|---|---|{"---|" * len(WORST_FIRST)}---|

@@ -21,9 +21,9 @@ _INTRODUCTION = """
 ## The paper's table 1 under one clock
 
 `make table1` ([table1/runs.csv](table1/runs.csv), [curves.csv](table1/curves.csv)): EndoNeRF, LerPlane and EndoGaussian
-written anew from their papers, beside Deform3DGS (`paper`) and `fast`, on the same frames, by the same scores and clock
-([decision 078](../decisions/078-rivals.md) lists what had to differ and why). `d4d-a-320x256` is `d4d-a` at half its
-size. Hollow marks are published.
+written anew from descriptions of their methods, beside Deform3DGS (`paper`) and `fast`, on the same frames, by the same
+scores and clock ([decision 078](../decisions/078-rivals.md) lists what had to differ and why).
+`d4d-a-320x256` is `d4d-a` at half its size. Hollow marks are published.
 
 ![Held-out psnr_tissue against seconds of training, for each system](table1/curves.png)
 
@@ -37,10 +37,10 @@ reach there, `hidden` the score behind the instrument; `moving` is the motion er
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
 are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are those of one to
 five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the measured depth of the training frames
-nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows
-of 1800 s of EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) are of an
-older form of the two (decision 078), and their curves are scored on four held-out frames on the way and on up to 16 at
-their end, where they may jump.
+nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows of 1800 s of
+EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) are of an older form
+of the two (decision 078). Their curves are scored on four held-out frames on the way and on up to 16 at their end,
+where they may jump.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.

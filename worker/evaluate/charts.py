@@ -257,10 +257,11 @@ def _published(axis: Any, across: str) -> None:
 
 def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, tuple[int, int]]]) -> None:
     """Dashed: what copying or warping recorded pictures scores; named right of the panel, where no mark lies."""
-    scores = {column: [group.median(column) for group in groups] for column in lines}
-    known = {column: next((each for each in found if not math.isnan(each)), None) for column, found in scores.items()}
-    rising = sorted((score, column) for column, score in known.items() if score is not None)
-    for place, (score, column) in enumerate(rising):
+    rising = []
+    for column in lines:
+        known = [score for group in groups if not math.isnan(score := group.median(column))]
+        rising += [(known[0], column)] if known else []
+    for place, (score, column) in enumerate(sorted(rising)):
         what, dashes = lines[column]
         axis.axhline(score, color=GREY, linewidth=1.0, dashes=dashes, zorder=1)
         aligned = "center" if len(rising) == 1 else ("top", "bottom")[place]

@@ -25,8 +25,8 @@ RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""
 RAY_BY_RAY = frozenset({"endonerf", "lerplane"})
 CPU_STEP_PX, CPU_COLUMNS = 5, 64
-"""At least every so manyth pixel, and at most about so many columns: a whole picture of 160x128 takes two cores 16 to
-27 s with EndoNeRF."""
+"""On a processor every 5th pixel of a row is scored, and of rows wider than 320 pixels about 64: with EndoNeRF a whole
+picture of 160x128 takes two cores 16 to 27 s."""
 
 
 def scored_step_px(series: str, device: Device, width: int) -> int:
