@@ -21,8 +21,9 @@ from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
 from worker.evaluate.rivals.density import Density
+from worker.evaluate.rivals.displacement import LOG_SCALE, MEAN, OPACITY, QUATERNION, Displacement
 from worker.evaluate.rivals.fields import rays
-from worker.evaluate.rivals.planes import Planes, Smoothness, mean_squared_difference
+from worker.evaluate.rivals.planes import Smoothness, mean_squared_difference
 from worker.evaluate.rivals.rival import Rival, Seen, seeded, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
@@ -33,11 +34,6 @@ from worker.train.densify import DensifySettings
 from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 
-MEAN, QUATERNION, LOG_SCALE, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), 10
-"""Columns of what moves."""
-WIDTHS = (3, 4, 3, 1)
-"""Of these columns; each has a decoder of its own."""
-MOVING = sum(WIDTHS)
 PUBLISHED_LOSS = LossSettings(normalised_depth=False)
 PUBLISHED_WIDTH = 640
 """Pixels. In a picture half as wide neighbours differ twice as much."""
@@ -46,14 +42,15 @@ PUBLISHED_WIDTH = 640
 @dataclass(frozen=True)
 class EndoGaussianSettings:
     """As published, or as the methods say that it builds on: 3D and 4D Gaussian splatting. cells, features, hidden,
-    resting, splitting and smoothness are ours (docs/decisions/078).
+    resting_share, splitting and smoothness are ours (docs/decisions/078).
 
     share, most     share of each frame's measured pixels that become Gaussians, and how many they are at most
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
     hidden          width of each decoder's hidden layer
-    resting         share of the training without motion
+    resting         steps without motion, the first of a training that the published steps end
+    resting_share   of a shorter training; a step without motion takes less time than a later one
     density         when and what to split and drop; not after the share splitting of the training
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
@@ -68,7 +65,8 @@ class EndoGaussianSettings:
     features: int = 16
     time_cells: int = 150
     hidden: int = 64
-    resting: float = 0.06
+    resting: int = 1000
+    resting_share: float = 0.06
     density: DensifySettings = field(default=DensifySettings())
     splitting: float = 0.9
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
@@ -102,13 +100,15 @@ class EndoGaussian(Rival):
             nn.Parameter(each.to(seen.rgb).contiguous()) for each in (*moves, start.sh[:, :1], start.sh[:, 1:])
         ]
         *self._moves, self._colour, self._harmonics = of_gaussians
+        chosen, time_cells = self.settings, max(2, min(self.settings.time_cells, len(seen)))
         with seeded(seed):
-            self.field = _Field(self.settings, max(2, min(self.settings.time_cells, len(seen))), start.mean)
+            self.field = Displacement(chosen.cells, time_cells, chosen.features, chosen.hidden, start.mean)
         self.field.to(seen.rgb)
         of_field = [list(each.parameters()) for each in (self.field.decode, self.field.planes)]
         groups = [*([each] for each in of_gaussians), *of_field]
         self.optimizer = torch.optim.Adam([{"params": each} for each in groups], eps=1e-15, fused=True)
         self._density = Density(self.settings.density, self.optimizer)
+        self._rested = 0.0  # share of the training at the last step without motion
 
     @property
     def gaussians(self) -> int:
@@ -116,15 +116,18 @@ class EndoGaussian(Rival):
 
     def rates(self, progress: float) -> Sequence[float]:
         chosen = self.settings
-        moved = max(0.0, progress - chosen.resting) / (1 - chosen.resting)
+        moved = (progress - self._rested) / (1 - self._rested)
         pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
         of_mean, *of_field = (first * (last / first) ** moved for first, last in pairs)
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [of_mean, *of_shapes, chosen.colour_rate, chosen.harmonics_rate, *of_field]
 
     def step(self, iteration: int, progress: float) -> float:
+        rests = self._rests(iteration, progress)
+        if rests:
+            self._rested = progress
         # at rest the rasteriser's own threads do most of a step, while torch's would only spin
-        with torch_threads(1) if self._rests(progress) else nullcontext():
+        with torch_threads(1) if rests else nullcontext():
             loss = super().step(iteration, progress)
         if progress < self.settings.splitting and self.settings.density.due(iteration):
             *self._moves, self._colour, self._harmonics = self._density.split(self.generator(iteration))
@@ -133,7 +136,7 @@ class EndoGaussian(Rival):
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
         seen, frame = self._seen, self._measured[0]
-        rests = self._rests(progress)
+        rests = self._rests(iteration, progress)
         if not rests:
             drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
             frame = self._measured[int(drawn)]
@@ -169,8 +172,10 @@ class EndoGaussian(Rival):
         motion = torch.where(alpha >= COVERED_ALPHA, shown.rgb / alpha.clamp(min=COVERED_ALPHA), torch.nan)
         return motion.float().cpu().numpy()
 
-    def _rests(self, progress: float) -> bool:
-        return progress < self.settings.resting
+    def _rests(self, iteration: int, progress: float) -> bool:
+        """Whether a step is without motion. Where its steps end the training, progress is not ahead of them."""
+        chosen = self.settings
+        return iteration <= chosen.resting and progress < max(chosen.resting_share, iteration / self.published_steps)
 
     def _moved(self, t: float) -> Tensor:
         """What moves, at time t: [N, MOVING].
@@ -208,35 +213,6 @@ def starting_gaussians(
     points = units_per_mm * (origin + seen.depth_mm[frame, row, column][:, None] * direction)
     place, rgb = points.cpu().numpy(), seen.rgb[frame, row, column].cpu().numpy()
     return initial_gaussians(place, rgb, sh_degree=settings.sh_degree, opacity=settings.opacity)
-
-
-class _Field(nn.Module):
-    """By how much Gaussians at places [N, 3] have changed at a time: [N, MOVING], nothing at the start.
-
-    low, high [3]: the box of the places at the start, which is [-1, 1]^3 of the planes
-    """
-
-    low: Tensor
-    high: Tensor
-
-    def __init__(self, settings: EndoGaussianSettings, time_cells: int, places: Tensor) -> None:
-        super().__init__()
-        self.planes = Planes(settings.cells, time_cells, settings.features)
-        self.decode = nn.ModuleList(_decoder(self.planes.size, settings.hidden, width) for width in WIDTHS)
-        self.register_buffer("low", places.amin(0))
-        self.register_buffer("high", places.amax(0))
-
-    def forward(self, place: Tensor, t: float) -> Tensor:
-        inside = 2 * (place - self.low) / (self.high - self.low).clamp(min=1e-6) - 1
-        features = self.planes(inside, torch.full_like(inside[:, 0], t))
-        return torch.cat([decode(features) for decode in self.decode], 1)
-
-
-def _decoder(features: int, hidden: int, width: int) -> nn.Sequential:
-    last = nn.Linear(hidden, width)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(nn.Linear(features, hidden), nn.ReLU(), last)
 
 
 def _rasterized(moved: Tensor, colour: Tensor, camera: Camera) -> Rendered:

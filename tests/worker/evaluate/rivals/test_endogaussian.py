@@ -21,7 +21,7 @@ from worker.train.densify import DensifySettings
 
 SMALL = EndoGaussianSettings(
     share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),
-    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, resting=0.25,
+    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, resting_share=0.25,
 )  # fmt: skip
 """What learns 64x48 pixels in seconds."""
 TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=3, hidden=8)
@@ -87,6 +87,22 @@ def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -
     assert len(losses(0.3)) == 3
     rival.loss(1, 0.3).backward()
     assert all(float(decode[-1].weight.grad.abs().max()) > 0 for decode in rival.field.decode)
+
+
+def test_it_rests_as_many_steps_as_published_where_steps_end_the_training_and_its_rates_fall_afterwards() -> None:
+    rival = small(Seen.of(small_clip(3), range(3)), 0)
+
+    def moves(iteration: int, progress: float) -> bool:
+        rival.step(iteration, progress)
+        return all(each.grad is not None for each in rival.field.parameters())
+
+    assert not moves(1000, 999 / 4000)
+    at_rest = rival.rates(999 / 4000)
+    assert at_rest == [group["lr"] for group in rival.optimizer.param_groups]
+    assert at_rest[0] == SMALL.mean_rate[0]
+    assert moves(1001, 1000 / 4000)
+    np.testing.assert_allclose(rival.rates(1.0)[0], SMALL.mean_rate[1])
+    assert moves(1000, 0.26), "of a shorter training the share"
 
 
 def test_gaussians_are_split_when_that_is_due_until_late_in_the_training() -> None:
