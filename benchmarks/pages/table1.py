@@ -40,8 +40,8 @@ five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the 
 nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows of 1800 s of
 EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) are of an older form
 of the two (decision 078). Their curves are scored on four held-out frames on the way and on up to 16 at their end,
-where they may jump. Those of EndoGaussian of commit f3079b73 are without motion for 240 of 4000 steps, later ones for
-1000, as published.
+where they may jump. The rows of 1800 s of EndoGaussian that are of commit f3079b73 had 240 of 4000 steps without
+motion, later ones 1000, as published.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.

@@ -173,7 +173,7 @@ class EndoGaussian(Rival):
         return motion.float().cpu().numpy()
 
     def _rests(self, iteration: int, progress: float) -> bool:
-        """Whether a step is without motion. Where its steps end the training, progress is not ahead of them."""
+        """Whether a step is without motion. If time or fewer steps end the training, progress is ahead of iteration."""
         chosen = self.settings
         return iteration <= chosen.resting and progress < max(chosen.resting_share, iteration / self.published_steps)
 
