@@ -114,7 +114,7 @@ evaluate: setup ## every preset on every clip, and the charts; takes hours, and 
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
 	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --eyes left both --out docs/results)
-	@$(EVALUATE) $(CLIPS) --series rivals --out docs/results
+	@$(EVALUATE) $(CLIPS) --series ablation --out docs/results
 	@$(BIN)/python -m benchmarks.pages
 
 table1: setup ## the systems of the paper's table 1: presets as they are, the others for TABLE_SECONDS each; takes a day, and resumes (TABLE_CLIPS=...)

@@ -34,7 +34,7 @@ RIGHT_EYE_CHARTS = {
 
 The right eye of a stereo recording is a true view some degrees beside the left one. `psnr_right` scores it at held-out
 moments, over tissue that the left eye sees, too ([conventions](../conventions.md#scores)). Series with `eyes=left`,
-drawn hollow, trained on the left eye alone. So did the published method and its rivals. All others trained on both
+drawn hollow, trained on the left eye alone. So did the published method and its variants. All others trained on both
 eyes, never on a held-out moment of either. Dashed is what warping the left eye's picture of the same moment scores. No
 model has that picture.
 """,

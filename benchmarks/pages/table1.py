@@ -35,13 +35,13 @@ scores and clock ([decision 078](../decisions/078-rivals.md) lists what had to d
 `10°` is the score of a camera turned by 10 degrees, `bound` what colours that do not depend on the viewpoint can
 reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that have moved,
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
-are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are those of one to
-five whole pictures, as many as 30 s hold. EndoNeRF draws its samples about the measured depth of the training frames
-nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. The rows of 1800 s of
-EndoNeRF and LerPlane that are of commits before f3079b73 ([runs.csv](table1/runs.csv), `commit`) are of an older form
-of the two (decision 078). Their curves are scored on four held-out frames on the way and on up to 16 at their end,
-where they may jump. The rows of 1800 s of EndoGaussian that are of commit f3079b73 had 240 of 4000 steps without
-motion, later ones 1000, as published.
+are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are the median of
+the whole pictures that 30 s hold, without the first five where there are more. EndoNeRF draws its samples about the
+measured depth of the training frames nearest in time, which is exact on phantoms: its depth error is mostly the motion
+between frames. The two rows of 1800 s of EndoNeRF and LerPlane on `phantom-breathing`, every8, are of an older form of
+both (decision 078). Their curves are scored on four held-out frames on the way and on up to 16 at their end, where they
+may jump. Nine of the ten rows of 1800 s of EndoGaussian had 240 of 4000 steps without motion; that of `phantom-pull`,
+every8, has 1000, as published.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.

@@ -22,12 +22,12 @@ from worker.train.presets import PRESETS, Preset
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 PUBLISHED = "paper"
 """The published method, as printed."""
-RIVALS = (PUBLISHED, "paper-released", "without_mapf", "pfs", "hexplane")
-"""The published method, as printed and as released, and what it compares itself with."""
-DEFAULT_SERIES = (*OURS, *RIVALS)
+ABLATION = (PUBLISHED, "paper-released", "without_mapf", "pfs", "hexplane")
+"""The published method, as printed and as released, and the variants that its ablation compares it with."""
+DEFAULT_SERIES = (*OURS, *ABLATION)
 TABLE_1 = ("fast", "paper", *reversed(tuple(RIVAL_SYSTEMS)))
 """Our default and the systems that the paper's table 1 compares: those that are measured soonest come first."""
-SHORTHANDS = {"ours": OURS, "rivals": RIVALS, "table1": TABLE_1}
+SHORTHANDS = {"ours": OURS, "ablation": ABLATION, "table1": TABLE_1}
 DEFAULT_HOLDOUTS = ("every8", "blocks8")
 GRID_BASES = (3, 5, 9, 17, 33)
 GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
@@ -81,7 +81,7 @@ def plan(
     Cells have the series' canonical names: one series is one row, however it was spelt.
 
     Args:
-        series: also "ours", "rivals" and "table1".
+        series: also "ours", "ablation" and "table1".
         eyes: of the series that do not say themselves; a preset that trains on the left eye alone has one cell.
 
     Raises:

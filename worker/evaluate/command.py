@@ -47,8 +47,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--series",
         nargs="+",
         default=list(DEFAULT_SERIES),
-        help="presets, also ours or rivals, presets with changes such as fast:bases=9,tracks=false, systems of others "
-        f"({', '.join(RIVAL_SYSTEMS)}), or table1 (default: all presets)",
+        help="presets, also ours or ablation, presets with changes such as fast:bases=9,tracks=false, systems of "
+        f"others ({', '.join(RIVAL_SYSTEMS)}), or table1 (default: all presets)",
     )
     parser.add_argument("--holdout", nargs="+", default=list(DEFAULT_HOLDOUTS), help="(default: %(default)s)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N", help="(default: 0)")

@@ -1,4 +1,4 @@
-"""Every way of training, by name: ours `instant`, `fast`, `quality`, `small`; `paper`, its variants and its rivals.
+"""Every way of training, by name: ours `instant`, `fast`, `quality`, `small`; `paper` and its variants.
 
 A preset is data only. Rates are in optimiser units (median depth 60).
 """

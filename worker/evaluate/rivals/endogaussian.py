@@ -24,7 +24,7 @@ from worker.evaluate.rivals.density import Density
 from worker.evaluate.rivals.displacement import LOG_SCALE, MEAN, OPACITY, QUATERNION, Displacement
 from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.planes import Smoothness, mean_squared_difference
-from worker.evaluate.rivals.rival import Rival, Seen, seeded, torch_threads
+from worker.evaluate.rivals.rival import Rival, Seen, decayed, seeded, torch_threads
 from worker.input.camera import Intrinsics
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
 from worker.model.loss import LossSettings, training_loss
@@ -50,7 +50,7 @@ class EndoGaussianSettings:
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
     hidden          width of each decoder's hidden layer
     resting         steps without motion, the first of a training that the published steps end
-    resting_share   of a shorter training; a step without motion takes less time than a later one
+    resting_share   of a shorter training's time or steps; a step without motion takes less time than a later one
     density         when and what to split and drop; not after the share splitting of the training
     *_rate          of Adam; a pair falls exponentially from the end of rest
     evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
@@ -90,7 +90,7 @@ class EndoGaussian(Rival):
     def __init__(self, seen: Seen, seed: int, settings: EndoGaussianSettings | None = None) -> None:
         self.seed, self.settings, self._seen = seed, settings or EndoGaussianSettings(), seen
         self._scale = MEDIAN_DEPTH_UNITS / float(seen.depth_mm[seen.depth_mm > 0].median())
-        self._measured = seen.measured
+        self._with_tissue = seen.with_tissue
         poses = seen.world_from_camera.double().cpu().numpy()
         self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
@@ -118,7 +118,7 @@ class EndoGaussian(Rival):
         chosen = self.settings
         moved = (progress - self._rested) / (1 - self._rested)
         pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
-        of_mean, *of_field = (first * (last / first) ** moved for first, last in pairs)
+        of_mean, *of_field = (decayed(each, moved) for each in pairs)
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [of_mean, *of_shapes, chosen.colour_rate, chosen.harmonics_rate, *of_field]
 
@@ -135,11 +135,11 @@ class EndoGaussian(Rival):
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
-        seen, frame = self._seen, self._measured[0]
+        seen, frame = self._seen, self._with_tissue[0]
         rests = self._rests(iteration, progress)
         if not rests:
-            drawn = torch.randint(len(self._measured), (), generator=self.generator(iteration))
-            frame = self._measured[int(drawn)]
+            drawn = torch.randint(len(self._with_tissue), (), generator=self.generator(iteration))
+            frame = self._with_tissue[int(drawn)]
         degree = min(self.settings.sh_degree, int((self.settings.sh_degree + 1) * progress))
         moved = torch.cat([*self._moves], 1) if rests else self._moved(float(seen.t[frame]))
         self._density.watch(moved, self._cameras[frame])
@@ -173,9 +173,11 @@ class EndoGaussian(Rival):
         return motion.float().cpu().numpy()
 
     def _rests(self, iteration: int, progress: float) -> bool:
-        """Whether a step is without motion. If time or fewer steps end the training, progress is ahead of iteration."""
-        chosen = self.settings
-        return iteration <= chosen.resting and progress < max(chosen.resting_share, iteration / self.published_steps)
+        """Whether a step is without motion. Where fewer steps than published end the training, progress is ahead of the
+        iteration's share of those published."""
+        share = self.settings.resting_share
+        in_time = self.time_share < share and progress < max(share, iteration / self.published_steps)
+        return in_time and iteration <= self.settings.resting
 
     def _moved(self, t: float) -> Tensor:
         """What moves, at time t: [N, MOVING].

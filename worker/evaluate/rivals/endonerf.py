@@ -28,7 +28,7 @@ from worker.evaluate.rivals.fields import (
     rays,
     weights_along,
 )
-from worker.evaluate.rivals.rival import Rival, Seen, seeded
+from worker.evaluate.rivals.rival import Rival, Seen, decayed, seeded
 from worker.evaluate.thinned import dense_camera, lattice
 from worker.input.camera import Intrinsics
 from worker.stereo.right_eye import nearest_known
@@ -86,19 +86,18 @@ class EndoNerf(Rival):
         self._s = self._box.s_of(seen.depth_mm.clamp(min=1e-3))
         self._has_depth = seen.depth_mm > 0
         self._refinable = int(self.settings.refined_share * self._has_depth.sum())
-        self._measured = seen.measured
+        self._with_tissue = seen.with_tissue
         with seeded(seed):
             self.field = _Field(self.settings).to(seen.rgb)
         self.optimizer = torch.optim.Adam(self.field.parameters(), fused=True)
 
     def rates(self, progress: float) -> Sequence[float]:
-        first, last = self.settings.rate, self.settings.last_rate
-        return [first * (last / first) ** progress]
+        return [decayed((self.settings.rate, self.settings.last_rate), progress)]
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of rays of one frame: mean squared colour error and mean depth error where there is depth."""
         seen, random = self._seen, self.generator(iteration)
-        frame = self._measured[int(torch.randint(len(self._measured), (), generator=random))]
+        frame = self._with_tissue[int(torch.randint(len(self._with_tissue), (), generator=random))]
         drawn = drawn_pixels(cumulated(self._importance * seen.tissue[frame]), self.settings.rays, random)
         width = seen.intrinsics.width
         row, column = drawn // width, drawn % width
@@ -111,7 +110,7 @@ class EndoNerf(Rival):
         rgb, depth_s, _ = self._shown(origin, direction, s, float(seen.t[frame]))
         colour = (rgb - seen.rgb[frame, row, column]).square().mean()
         error = torch.where(known, (depth_s - about).abs(), 0.0)
-        if progress >= self.settings.refined_from:
+        if progress >= self.settings.refined_from and self._refinable:
             self._refine(frame, row, column, depth_s.detach(), error.detach())
         return colour + self.settings.depth_weight * error.sum() / known.sum().clamp(min=1)
 
@@ -138,7 +137,7 @@ class EndoNerf(Rival):
         return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
 
     def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
-        """Replace stereo depth by the field's where they differ most: as large a share of all pixels as of a batch."""
+        """Replace depth by the field's where they differ most, as often as a share of all pixels with depth has."""
         worst = torch.nonzero(error > torch.quantile(error, 1 - self.settings.refined_share))[: self._refinable, 0]
         self._refinable -= len(worst)
         self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
@@ -181,7 +180,7 @@ class _Trunk(nn.Module):
     def forward(self, given: Tensor) -> Tensor:
         value = given
         for k, layer in enumerate(self.layers):
-            value = torch.relu_(layer(torch.cat([value, given], 1) if k == self.again and k else value))
+            value = torch.relu_(layer(torch.cat([value, given], 1) if k == self.again else value))
         return value
 
 
@@ -201,7 +200,7 @@ class _Field(nn.Module):
 
     def forward(self, place: Tensor, t: float, view: Tensor) -> tuple[Tensor, Tensor]:
         octaves = self.settings.space_octaves
-        if t > 0:  # the moment t = 0 is the canonical one
+        if t > 0:  # the moment t = 0 is the canonical one, as in D-NeRF
             time = _encoded(torch.full_like(place[:, :1], 2 * t - 1), self.settings.time_octaves)
             place = place + self.displacement(self.displace(torch.cat([_encoded(place, octaves), time], 1)))
         known = self.trunk(_encoded(place, octaves))

@@ -53,9 +53,9 @@ class Box:
         depth_mm = seen.depth_mm[frame, row, column]
         place = _projected(origin + depth_mm[:, None] * direction)
         ends = place.new_tensor([OUTLIERS, 1 - OUTLIERS])
-        shallow, deep = torch.quantile(place[:, 2], ends).unbind()
-        low = torch.stack([*place[:, :2].amin(0).unbind(), shallow])
-        high = torch.stack([*place[:, :2].amax(0).unbind(), deep])
+        farthest, nearest = torch.quantile(place[:, 2], ends).unbind()
+        low = torch.stack([*place[:, :2].amin(0).unbind(), farthest])
+        high = torch.stack([*place[:, :2].amax(0).unbind(), nearest])
         room = MARGIN * (high - low).clamp(min=1e-6)
         far, near = torch.quantile(1 / depth_mm, ends).tolist()
         beyond = MARGIN * max(near - far, 0.01 * near)

@@ -41,14 +41,15 @@ CPU_RAYS = 512
 
 @dataclass(frozen=True)
 class LerPlaneSettings:
-    """As published, or as the authors' BSD-licensed configuration says; warm_up, annealed, least and most are ours.
+    """As published, or as the authors' BSD-licensed configuration says; warm_up, sharpened_by, least, most,
+    WINDOW and HUBER_DELTA are ours.
 
     cells, features     of the planes, by resolution; time_cells is their most cells of time
     proposal_*          of the fields that propose samples, one a round, and how many intervals each looks at
     bins                of the one-blob encoding of place and time
     rate                of Adam: it rises for the share warm_up of the training, then falls like a cosine
     least, most         limits of a pixel's change, for its importance
-    annealed            share of the training in which the proposals sharpen
+    sharpened_by        share of the training in which the proposals sharpen
     """
 
     rays: int = 2048
@@ -63,7 +64,7 @@ class LerPlaneSettings:
     bins: int = 4
     rate: float = 1e-2
     warm_up: float = 0.05
-    annealed: float = 0.1
+    sharpened_by: float = 0.1
     least: float = 0.01
     most: float = 0.1
     depth_weight: float = 1.0
@@ -109,7 +110,7 @@ class LerPlane(Rival):
         height, width = seen.tissue.shape[1:]
         frame, row, column = drawn // (height * width), drawn // width % height, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
-        sharpness = annealed(progress / chosen.annealed)
+        sharpness = annealed(progress / chosen.sharpened_by)
         (rgb, _, _), rounds = self._shown(origin, direction, seen.t[frame], sharpness, random)
         depth_mm = seen.depth_mm[frame, row, column]
         known, about = depth_mm > 0, self._box.s_of(depth_mm.clamp(min=1e-3))
@@ -171,7 +172,8 @@ class LerPlane(Rival):
 
 def importance(seen: Seen, least: float, most: float) -> Tensor:
     """[F, H, W] weight with which a pixel is drawn: how much its colour differs from the frames around, held between
-    least and most, over how often it shows tissue; 0 where it does not."""
+    least and most, over how often it shows tissue; 0 where it does not. Instruments are black, so that tissue
+    which they hide in a frame around has changed."""
     shown = seen.rgb * seen.tissue[..., None]
     weight = torch.empty_like(seen.depth_mm)
     often = seen.tissue.sum(0).clamp(min=1) / len(seen)

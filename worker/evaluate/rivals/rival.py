@@ -5,6 +5,7 @@ Symbols: F training frames, H W pixels. Lengths in mm of the clip's world.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -56,7 +57,7 @@ class Seen:
         )
 
     @property
-    def measured(self) -> list[int]:
+    def with_tissue(self) -> list[int]:
         """The frames that show tissue."""
         return [frame for frame in range(len(self)) if bool(self.tissue[frame].any())]
 
@@ -70,12 +71,14 @@ class Rival(ABC):
     not_measured     which figures of a row it cannot have, and why
     published_steps  iterations of its paper, at which a run ends if its budget does not end it before
     optimizer        has all that is trained; its groups' rates are set before every step
+    time_share       of a budget of seconds: how much is used when a step begins; 0 without one
     """
 
     not_measured: ClassVar[str]
     published_steps: ClassVar[int]
     optimizer: torch.optim.Optimizer
     seed: int
+    time_share: float = 0.0
 
     @abstractmethod
     def loss(self, iteration: int, progress: float) -> Tensor:
@@ -127,6 +130,12 @@ class Rival(ABC):
         They are drawn on the CPU, so that every device gets the same ones.
         """
         return torch.Generator().manual_seed(1_000_003 * self.seed + iteration)
+
+
+def decayed(first_and_last: tuple[float, float], share: float) -> float:
+    """What falls exponentially from the first to the last, after a share of its way."""
+    first, last = first_and_last
+    return first * math.exp(share * math.log(last / first))
 
 
 @contextmanager

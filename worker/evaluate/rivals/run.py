@@ -27,7 +27,8 @@ from worker.input.clip import DepthClip, Eye, FrameSplit
 from worker.machine.cores import cores
 from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
-from worker.raster.backend import Device
+from worker.raster.backend import CPU, Device
+from worker.raster.cpu import compile_kernels
 from worker.report.doubts import clip_warnings
 from worker.report.judge import judged
 from worker.report.quality import Training, first_report
@@ -50,10 +51,14 @@ class Length:
     iterations: int | None
     budget_s: float | None
 
+    def time_share(self, elapsed_s: float) -> float:
+        """How much of the budget of seconds is used; 0 without one."""
+        return 0.0 if self.budget_s is None else elapsed_s / self.budget_s
+
     def progress(self, made: int, elapsed_s: float) -> float:
         """The share that is done; 1 or more at the end."""
         of_iterations = 0.0 if self.iterations is None else made / self.iterations
-        return of_iterations if self.budget_s is None else max(of_iterations, elapsed_s / self.budget_s)
+        return max(of_iterations, self.time_share(elapsed_s))
 
 
 class Renders:
@@ -99,10 +104,11 @@ def train_rival(
     """
     marks = [mark for mark in SCORED_SECONDS if mark > clock.elapsed_s]
     made, reported, last_db = 0, -math.inf, math.nan
-    while (progress := length.progress(made, clock.elapsed_s)) < 1:
+    while (progress := length.progress(made, now := clock.elapsed_s)) < 1:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after {made} iterations.")
         made += 1
+        rival.time_share = length.time_share(now)
         if not math.isfinite(rival.step(made, progress)):
             raise TrainingDiverged(f"The loss is not finite at iteration {made}.")
         now = clock.elapsed_s
@@ -113,7 +119,7 @@ def train_rival(
         if now - reported >= REPORT_EVERY_S:
             reported = now
             known_db = None if math.isnan(last_db) else last_db
-            hooks.on_progress(Progress("train", min(progress, 1.0), made, length.iterations or 0, psnr_db=known_db))
+            hooks.on_progress(Progress("train", progress, made, length.iterations or 0, psnr_db=known_db))
     with clock.paused():
         score(made)
     return made
@@ -145,6 +151,8 @@ def run_rival(
         TrainingDiverged: the loss or a render is not finite.
     """
     scored = thinned(clip, step_px)
+    if device == CPU:
+        compile_kernels()  # as before the clock of a preset starts
     clock = Stopwatch()
     curve: list[CurvePoint] = []
     rival = make(Seen.of(clip, split.train, device.memory), seed)

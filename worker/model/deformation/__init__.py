@@ -1,4 +1,4 @@
-"""How the canonical Gaussians move: FDM and its rivals, one promise for all (base.Deformation).
+"""How the canonical Gaussians move: FDM and its alternatives, one promise for all (base.Deformation).
 
 | kind                       | numbers per Gaussian | bases                                                      |
 |----------------------------|----------------------|------------------------------------------------------------|

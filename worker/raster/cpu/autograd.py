@@ -1,4 +1,4 @@
-"""rasterize() with gradients by torch: what the rivals without a fused step, and the tests, use."""
+"""rasterize() with gradients by torch: what EndoGaussian (worker/evaluate/rivals) and the tests use."""
 
 from __future__ import annotations
 

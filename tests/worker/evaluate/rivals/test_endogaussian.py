@@ -102,7 +102,18 @@ def test_it_rests_as_many_steps_as_published_where_steps_end_the_training_and_it
     assert at_rest[0] == SMALL.mean_rate[0]
     assert moves(1001, 1000 / 4000)
     np.testing.assert_allclose(rival.rates(1.0)[0], SMALL.mean_rate[1])
-    assert moves(1000, 0.26), "of a shorter training the share"
+    assert moves(1000, 0.26), "of fewer steps the share"
+    rival.time_share = 0.24
+    assert not moves(300, 0.24)
+    rival.time_share = 0.25
+    assert moves(300, 0.25), "of less time the share, however many steps it holds"
+
+
+def test_a_degree_of_harmonics_is_learnt_every_quarter() -> None:
+    rival = EndoGaussian(Seen.of(small_clip(2), [1]), 0, TINY)
+    for progress, degree in ((0.2, 0), (0.3, 1), (0.6, 2), (0.8, 3)):
+        learnt = torch.autograd.grad(rival.loss(1, progress), rival._harmonics)[0].abs().amax((0, 2)) > 0
+        assert int(learnt.sum()) == len(learnt[: (degree + 1) ** 2 - 1]) == int(learnt[: (degree + 1) ** 2 - 1].sum())
 
 
 def test_gaussians_are_split_when_that_is_due_until_late_in_the_training() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from tests.worker.evaluate.rivals.cases import (
@@ -12,7 +13,7 @@ from tests.worker.evaluate.rivals.cases import (
     fitted,
     small_clip,
 )
-from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings
+from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings, _encoded
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = EndoNerfSettings(
@@ -31,6 +32,22 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     seen = Seen.of(small_clip(2), [1], dtype=torch.float64)
     rival = EndoNerf(seen, 3, TINY)
     check_gradient(rival, rival.parameters())
+
+
+def test_its_network_and_its_rates_are_those_published() -> None:
+    rival = EndoNerf(Seen.of(small_clip(2), [1]), 0)
+    sizes = [layer.in_features for layer in rival.field.trunk.layers]
+    assert sizes == [63, 256, 256, 256, 256, 63 + 256, 256, 256], "the place joins the fifth layer's output again"
+    assert [layer.in_features for layer in rival.field.displace.layers][::5] == [63 + 9, 63 + 9 + 256]
+    np.testing.assert_allclose([rival.rates(each)[0] for each in (0.0, 0.5, 1.0)], [5e-4, 5e-4 / 10**0.5, 5e-5])
+
+
+def test_encodings_are_sines_and_cosines_of_octaves() -> None:
+    x = 0.3
+    found = _encoded(torch.tensor([[x, 0.0]], dtype=torch.float64), 2)[0]
+    angles = np.pi * x * np.array([1.0, 2.0])
+    sines, cosines = (np.stack([of(angles), of(0 * angles)], 1).ravel() for of in (np.sin, np.cos))
+    np.testing.assert_allclose(found, [x, 0.0, *sines, *cosines], atol=1e-12)
 
 
 def test_it_overfits_one_frame_above_30_db() -> None:
@@ -63,7 +80,7 @@ def test_its_network_displaces_places_by_their_time() -> None:
     assert float((early - late).abs().max()) > 1e-3
 
 
-def test_rays_are_drawn_where_there_is_tissue_and_more_often_where_it_hides() -> None:
+def test_rays_are_drawn_more_often_where_instruments_hide_the_tissue_more_often() -> None:
     clip = small_clip(9)
     rival = small(Seen.of(clip, range(9)), 0)
     often = (~clip.tissue).sum(0)

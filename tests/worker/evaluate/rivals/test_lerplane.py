@@ -56,6 +56,30 @@ def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_w
     assert float(excess(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
 
 
+def test_the_proposals_loss_is_by_how_much_weights_exceed_what_they_allow() -> None:
+    edges, weight = torch.tensor([[0.25, 0.5, 1.0]]), torch.tensor([[0.4, 0.6]])
+    proposed_edges, proposed = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.2, 0.3]])
+    want = ((0.4 - 0.2) ** 2 / 0.4 + (0.6 - 0.3) ** 2 / 0.6) / 2
+    np.testing.assert_allclose(float(excess(edges, weight, proposed_edges, proposed)), want, rtol=1e-5)
+
+
+def test_its_rate_rises_then_falls_like_a_cosine() -> None:
+    rival = LerPlane(Seen.of(small_clip(2), [0, 1]), 0, dataclasses.replace(SMALL, rate=1e-2))
+    rates = [rival.rates(progress)[0] for progress in (0.0, 0.05, 0.525, 1.0)]
+    np.testing.assert_allclose(rates, [1e-4, 1e-2, 5e-3, 0.0], atol=1e-12)
+
+
+def test_its_decoder_is_told_place_and_time_as_blobs_on_their_axes() -> None:
+    field = LerPlane(Seen.of(small_clip(2), [0, 1]), 0, SMALL).field
+    given: list[torch.Tensor] = []
+    field.decode.register_forward_pre_hook(lambda _, args: given.append(args[0]))
+    with torch.no_grad():
+        field(torch.tensor([[-1.0, 0.0, 1.0]]), torch.tensor([0.25]))
+    bins = (np.arange(4) + 0.5) / 4
+    want = np.exp(-0.5 * ((np.array([0.0, 0.5, 1.0, 0.25])[:, None] - bins) * 4) ** 2)
+    np.testing.assert_allclose(given[0][0, field.planes.size :].reshape(4, 4), want, rtol=1e-5)
+
+
 def test_how_rough_planes_are_has_the_gradient_of_finite_differences() -> None:
     planes = Planes((3, 5), 4, 2).double()
     with torch.no_grad():

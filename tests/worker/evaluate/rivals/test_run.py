@@ -119,6 +119,24 @@ def test_a_budget_ends_at_the_published_iterations_if_these_come_first() -> None
     assert Length(4, 600.0).progress(1, 300.0) == 0.5, "the rates follow what is nearer its end"
 
 
+def test_a_rival_knows_how_much_of_its_time_is_used() -> None:
+    shares: list[float] = []
+
+    class Noting(EndoNerf):
+        def step(self, iteration: int, progress: float) -> float:
+            assert self.time_share <= progress
+            shares.append(self.time_share)
+            time.sleep(0.02)
+            return 0.0
+
+    seen = Seen.of(small_clip(2), [1])
+    train_rival(Noting(seen, 0, TINY), Length(10**6, 0.1), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+    assert 0 <= shares[0] < shares[1] <= shares[-1] < 1
+    shares.clear()
+    train_rival(Noting(seen, 0, TINY), Length(2, None), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+    assert shares == [0.0, 0.0]
+
+
 def test_a_rival_stops_when_it_is_asked_to_and_when_its_loss_is_no_number() -> None:
     rival = tiny(Seen.of(small_clip(2), [1]), 0)
     with pytest.raises(Cancelled):
