@@ -11,7 +11,9 @@ from worker.evaluate.rows import Row
 
 def number(value: float | None, digits: int) -> str:
     """The value with so many digits; a dash where there is none."""
-    return "–" if value is None or math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # no -0.0
+    if value is None or math.isnan(value):
+        return "–"
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # adding 0.0 turns -0.0 into 0.0
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

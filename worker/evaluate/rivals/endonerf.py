@@ -137,7 +137,7 @@ class EndoNerf(Rival):
         return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
 
     def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
-        """Replace depth by the field's where they differ most, as often as a share of all pixels with depth has."""
+        """Replace depth by the field's at the share of these rays that differ most, until _refinable is used up."""
         worst = torch.nonzero(error > torch.quantile(error, 1 - self.settings.refined_share))[: self._refinable, 0]
         self._refinable -= len(worst)
         self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
