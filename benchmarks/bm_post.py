@@ -7,7 +7,7 @@ Starts `intrasplat up` on a data directory of its own, trains once untimed, so t
 the clip again and again. Seconds from the POST, medians: first_view_s, the first answer to GET /render; good_view_s, a
 snapshot whose held-out score of the left eye is GOOD_DB or more, as the job's progress tells; done_s, the job is done;
 scored_s, its report has scores. eta_off is how far the job's eta_s was off at most, as a share of done_s, after the
-first tenth of it. psnr_db is the report's, stages the report's seconds. --shell measures `intrasplat
+first tenth of it. psnr_db and device are the report's, stages the report's seconds. --shell measures `intrasplat
 reconstruct` from the shell, too: done_s is the whole command.
 
 The recording is found through INTRASPLAT_DATA; without it a synthetic clip is drawn.
@@ -41,7 +41,7 @@ CLOCKS = ("first_view_s", "good_view_s", "done_s", "scored_s")
 EARLY = 0.1
 """Share of a job in which nobody can tell how long it takes."""
 FIELDS = ("clip", "preset", "budget_s", "way", "repeat", *CLOCKS, "eta_off", "psnr_db", "psnr_right_db", "stages",
-          "load_1min", "machine", "commit")  # fmt: skip
+          "load_1min", "device", "machine", "commit")  # fmt: skip
 
 Row = dict[str, Any]
 
@@ -106,7 +106,8 @@ def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, bu
     report = client.report(job.id)
     row |= {"scored_s": round(time.perf_counter() - start_s, 2), "psnr_db": report.psnr_tissue_db}
     client.delete(job.id)
-    return row | {"psnr_right_db": report.psnr_right_db, "stages": json.dumps(report.seconds)}
+    row |= {"psnr_right_db": report.psnr_right_db, "device": report.device}
+    return row | {"stages": json.dumps(report.seconds)}
 
 
 def _look(url: str, job_id: str, start_s: float, row: Row) -> None:
@@ -131,7 +132,7 @@ def _run(clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | N
     done_s = round(time.perf_counter() - start_s, 2)
     report = json.loads((out / "report.json").read_bytes())
     return {"preset": preset, "budget_s": budget_s or "", "way": "shell", "load_1min": round(load, 2), "done_s": done_s,
-            "psnr_db": report["psnr_tissue_db"], "psnr_right_db": report["psnr_right_db"],
+            "psnr_db": report["psnr_tissue_db"], "psnr_right_db": report["psnr_right_db"], "device": report["device"],
             "stages": json.dumps(report["seconds"])}  # fmt: skip
 
 

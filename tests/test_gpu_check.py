@@ -53,6 +53,16 @@ def test_its_checks_pass_in_the_interpreter(tmp_path: Path) -> None:
     assert {row["gpu"] for row in checks} == {"none: Triton's interpreter"}
 
 
+def test_training_leaves_a_row_of_each_run_and_its_curve(tmp_path: Path) -> None:
+    answer = run(str(GPU / "check.py"), "--interpret", "--out", str(tmp_path), "--only", "train", "--seed", "1")
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    runs = [(row["preset"], row["frames_a_step"], row["note"]) for row in rows(tmp_path / "gpu-train.csv")]
+    assert runs == [("paper", "1", ""), ("fast", "1", ""), ("fast", "2", "")]
+    points = [(row["preset"], row["frames_a_step"]) for row in rows(tmp_path / "gpu-curves.csv")]
+    assert set(points) == {("paper", "1"), ("fast", "1"), ("fast", "2")}
+    assert all(float(row["psnr_tissue_db"]) > 0 for row in rows(tmp_path / "gpu-curves.csv"))
+
+
 def test_figures_of_the_interpreter_do_not_pass_for_results() -> None:
     answer = run(str(GPU / "check.py"), "--interpret")
     assert answer.returncode == 2

@@ -41,7 +41,8 @@ FIELDS = (
     *THRESHOLDS_DB, "t_train_s", *STAGES, "step_ms", "note",
 )  # fmt: skip
 FRAMES_A_STEP = (1, 2, 4)
-CURVE_FIELDS = ("clip", "preset", "frames_a_step", "device", "seed", "t_train_s", "iteration", "psnr_tissue_db")
+POINT_FIELDS = ("t_train_s", "iteration", "psnr_tissue_db")
+CURVE_FIELDS = ("clip", "preset", "frames_a_step", "device", "seed", *POINT_FIELDS)
 MOMENTS_S = (*np.arange(0.1, 2.0, 0.1), *np.arange(2.0, 6.0, 0.25), *np.arange(6.0, 60.0, 2.0))
 """Of t_train_s, at which held-out frames are scored: closer than those of a report, for a run is over in seconds."""
 FAST_BUDGET_S, CPU_BUDGET_S = 15.0, 45.0
@@ -92,7 +93,7 @@ class Trials:
         self._part, self._name, self._clip = part, name, clip
         self._curves = dataclasses.replace(part, name="curves", fields=CURVE_FIELDS)
         self._paper_db: float | None = None
-        training.CURVE_SECONDS = MOMENTS_S
+        training.CURVE_SECONDS, training.UNSCORED_S = MOMENTS_S, 0.0
 
     def run(self, preset: Preset, device: Device, seed: int, **length: float | None) -> None:
         """One run, its row and its curve; one that breaks off has a row that says so."""
@@ -105,7 +106,8 @@ class Trials:
             self._part.add(**place, note=f"{type(error).__name__}: {error}"[:200])
             return
         for point in run.curve:
-            self._curves.add(**place, **dataclasses.asdict(point))
+            scored = dataclasses.asdict(point)
+            self._curves.add(**place, **{name: scored[name] for name in POINT_FIELDS})
         final_db = run.curve[-1].psnr_tissue_db if run.curve else None
         if preset.name == "paper" and not note:
             self._paper_db = final_db

@@ -11,6 +11,8 @@ from benchmarks.pages.markdown import origin, table
 from worker.evaluate.rows import Row, read_rows
 
 POST = "post.csv"
+CPU = "cpu"
+"""The device of a row that names none: it was measured before the rows had one."""
 _INTRODUCTION = """
 ## What a caller waits for
 
@@ -43,38 +45,43 @@ def post_sections(folder: Path) -> list[str]:
             [
                 *key[:2],
                 f"{key[2]} s" if key[2] else "",
+                key[4],
                 str(len(rows)),
                 *(_shown(rows, *each) for each in columns.items()),
             ]
             for key, rows in groups.items()
             if key[3] == way
         ]
-        header = ["clip", "preset", "given", "runs", *(name for name, _ in columns.values())]
+        header = ["clip", "preset", "given", "device", "runs", *(name for name, _ in columns.values())]
         if cells:
             parts += [*([_SHELL] if way == "shell" else []), table(header, cells)]
     return [*parts, origin([row for rows in groups.values() for row in rows])] if groups else []
 
 
 def post_claim(folder: Path) -> str:
-    """Both clocks of each preset that was sent as it is, in a sentence a clip; empty without such rows."""
-    said: dict[str, list[str]] = {}
-    for (clip, preset, budget_s, way), rows in _groups(folder).items():
+    """Both clocks of each preset that was sent as it is, in a sentence a clip and device; empty without such rows."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for (clip, preset, budget_s, way, device), rows in _groups(folder).items():
         if way == "http" and not budget_s:
-            said.setdefault(clip, []).append(
+            said.setdefault((clip, device), []).append(
                 f"`{preset}` shows a first view after {_median(rows, 'first_view_s'):.1f} s and has its scene after "
                 f"{_median(rows, 't_post_s'):.1f} s (`t_post_s`), {_median(rows, 't_train_s'):.1f} s of them training "
                 "(`t_train_s`)"
             )
-    clips = (f"Since the POST of `{clip}` to a warm worker: {'; '.join(each)}." for clip, each in said.items())
-    return " ".join(clips)
+    sentences = []
+    for (clip, device), each in said.items():
+        where = "" if device == CPU else f" on {device}"
+        sentences.append(f"Since the POST of `{clip}` to a warm worker{where}: {'; '.join(each)}.")
+    return " ".join(sentences)
 
 
-def _groups(folder: Path) -> dict[tuple[str, str, str, str], list[Row]]:
-    """Rows with the report's clocks as columns, by clip, preset, budget and way; of each the last commit's."""
-    found: dict[tuple[str, str, str, str], list[Row]] = {}
+def _groups(folder: Path) -> dict[tuple[str, str, str, str, str], list[Row]]:
+    """Rows with the report's clocks as columns, by clip, preset, budget, way and device; of each the last commit's."""
+    found: dict[tuple[str, str, str, str, str], list[Row]] = {}
     for row in read_rows(folder / POST):
         clocks = {name: str(value) for name, value in json.loads(row["stages"]).items() if name in _CLOCKS}
-        found.setdefault((row["clip"], row["preset"], row["budget_s"], row["way"]), []).append({**row, **clocks})
+        key = row["clip"], row["preset"], row["budget_s"], row["way"], row.get("device") or CPU
+        found.setdefault(key, []).append({**row, **clocks})
     return {key: [row for row in rows if row["commit"] == rows[-1]["commit"]] for key, rows in found.items()}
 
 

@@ -85,16 +85,20 @@ def test_the_page_tells_what_a_caller_waits_for_by_both_clocks(tmp_path: Path) -
     assert post_claim(tmp_path) == ""
     rows = [post_row(commit="old", first_view_s=9.0), post_row(good_view_s=12.1), post_row(first_view_s=2.4)]
     rows += [post_row(preset="fast", budget_s=20), post_row(way="shell", first_view_s="", done_s=20.0)]
+    rows += [post_row(device="cuda (a GPU)", first_view_s=0.5, commit="newer")]
     write_rows(tmp_path / POST, FIELDS, rows)
     page = "".join(post_sections(tmp_path))
-    assert "| d4d_stereo | instant |  | 2 | 2.2 | 12.1 (1 of 2) | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
-    assert "| d4d_stereo | fast | 20 s | 1 | 2.0 | – | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
+    assert "| d4d_stereo | instant |  | cpu | 2 | 2.2 | 12.1 (1 of 2) | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
+    assert "| d4d_stereo | fast | 20 s | cpu | 1 | 2.0 | – | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
+    assert "| d4d_stereo | instant |  | cuda (a GPU) | 1 | 0.5 | – | 6.2 | 14.5 | 15.0 | – | – | 32.0 | – |" in page
     assert "from the shell" in page
-    assert "| d4d_stereo | instant |  | 1 | 6.2 | 14.5 | 20.0 | 32.0 | – |" in page
-    assert "commits new " in page
+    assert "| d4d_stereo | instant |  | cpu | 1 | 6.2 | 14.5 | 20.0 | 32.0 | – |" in page
+    assert "commits new, newer " in page
     assert post_claim(tmp_path) == (
         "Since the POST of `d4d_stereo` to a warm worker: `instant` shows a first view after 2.2 s and has its scene "
-        "after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
+        "after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`). "
+        "Since the POST of `d4d_stereo` to a warm worker on cuda (a GPU): `instant` shows a first view after 0.5 s and has "
+        "its scene after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
     )
 
 
