@@ -52,25 +52,26 @@ def main() -> None:
         folder = Path(name)
         clip, files = _clip_of(options.clip, folder)
         rows: list[Row] = []
+
+        def keep(row: Row) -> None:
+            rows.append(row | {"clip": options.clip, "machine": machine(), "commit": commit()})
+            print(_line(rows[-1]), flush=True)
+            if options.csv:
+                with adding_alone(options.csv.parent):
+                    write_rows(options.csv, FIELDS, [*read_rows(options.csv), rows[-1]])
+
         with started_service(folder / "data", folder / "service.log") as client:
             warm = client.wait(client.reconstruct(clip, **files, iterations=3).id)
             client.report(warm.id)  # no scoring is left to do
             for repeat in range(options.repeats):
                 for preset in options.presets:
-                    rows.append(_sent(client, clip, files, preset, options.budget_s) | {"repeat": repeat})
-                    print(_line(rows[-1]), flush=True)
+                    keep(_sent(client, clip, files, preset, options.budget_s) | {"repeat": repeat})
         for repeat in range(options.repeats if options.shell else 0):
             for preset in options.presets:
                 out = folder / f"{preset}-{repeat}"
-                rows.append(_run(clip, files, preset, options.budget_s, out) | {"repeat": repeat})
-                print(_line(rows[-1]), flush=True)
-    for row in rows:
-        row |= {"clip": options.clip, "machine": machine(), "commit": commit()}
+                keep(_run(clip, files, preset, options.budget_s, out) | {"repeat": repeat})
     for preset, way in dict.fromkeys((row["preset"], row["way"]) for row in rows):
         print(_line(_medians([row for row in rows if (row["preset"], row["way"]) == (preset, way)])))
-    if options.csv:
-        with adding_alone(options.csv.parent):
-            write_rows(options.csv, FIELDS, [*read_rows(options.csv), *rows])
 
 
 def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Path]]:

@@ -49,7 +49,7 @@ from worker.input.decode import keep_decoder_ready
 from worker.instruments import load_segmenter
 from worker.machine.hooks import Progress
 from worker.pipeline import Made, judge, judge_again, make
-from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, gpu_is_lost
+from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, examine, gpu_is_lost
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import alone, cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
@@ -63,6 +63,9 @@ REPORT_PERIOD_S = 0.1
 
 MAX_WAIT_SHARE = 0.4
 """Of the time after which the service gives up a render: who would wait longer is told when to come back."""
+
+GPU_DEBT_S = 0.06
+"""A render beside training on a GPU is followed by a rest of half a second at most (worker/daemon/pace.py)."""
 
 LAST_SNAPSHOT_S = 10.0
 """How long the last snapshot of a finished job is still shown: until the service knows of the scene."""
@@ -96,12 +99,14 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     if settings.segmenter is not None:
         load_segmenter(settings.segmenter)  # says now what every job without masks would fail by
     store, snapshots = open_store(settings), Snapshots()
-    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace()
+    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace(most_owed_s=GPU_DEBT_S)
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
-    if device == CPU:  # kernels of a GPU are compiled when a job needs them
+    if device == CPU:
         compile_kernels()
+    else:  # those that only a job's model needs are compiled for it
+        examine(device)
     compile_coder()
     logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
@@ -121,7 +126,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         cost=views.cost,
         between=report_held_scenes,
         pace=pace,
-        spent_s=cpu_time_s if device == CPU else time.perf_counter,  # while a GPU renders, this thread waits for it
+        spent_s=cpu_time_s,  # with what this thread waits for a GPU: it asks again and again
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
         render_secret=settings.render_secret,
     )

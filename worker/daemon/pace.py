@@ -4,10 +4,14 @@ A token bucket of CPU seconds. While a job trains, the bucket gains SHARE of the
 MAX_SAVED_S: where other programs take the cores, training gets less, and so do renders. A render takes the CPU time
 that it used out of the bucket, into debt if need be; the next one begins when the debt is paid. Time in which a render
 only waits for a core costs nothing.
+
+A GPU makes a render in milliseconds, but the first of a scene may compile kernels for seconds, or have the scene copied
+to the device. That is no habit, so a debt there has a limit.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +34,7 @@ class Pace:
         cores: what a second can give, in CPU seconds.
         clock: monotonic seconds.
         used_s: CPU seconds that this process has used; None: all that the cores give.
+        most_owed_s: the debt, in CPU seconds, beyond which renders owe no more.
     """
 
     def __init__(
@@ -37,8 +42,10 @@ class Pace:
         cores: int = 1,
         clock: Callable[[], float] = time.monotonic,
         used_s: Callable[[], float] | None = None,
+        most_owed_s: float = math.inf,
     ) -> None:
         self._cores = cores
+        self._most_owed_s = most_owed_s
         self._clock = clock
         self._used_s = used_s or (lambda: cores * clock())
         self._used_before_s = self._used_s()
@@ -63,7 +70,7 @@ class Pace:
     def charge(self, cpu_s: float) -> None:
         """Count so many CPU seconds of a render."""
         with self._lock:
-            self._left_s -= cpu_s
+            self._left_s = max(self._left_s - cpu_s, -self._most_owed_s)
             self._fill()
 
     def rest_s(self) -> float:

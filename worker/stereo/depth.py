@@ -107,7 +107,9 @@ def estimate_depth(
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
         wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
         jobs = (
-            _match_on_device(work, wanted, pool, hooks) if device == "cuda" else _match_all(work, wanted, pool, first)
+            _match_on_device(work, wanted, pool, hooks, first)
+            if device == "cuda"
+            else _match_all(work, wanted, pool, first)
         )
         for done, (i, job) in enumerate(jobs, start=1):
             _check_stop(hooks)
@@ -223,18 +225,21 @@ def _match_all(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor,
     return [(i, pool.submit(work.match, i)) for i in order]
 
 
-def _match_on_device(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
-    """Match as many of the wanted pairs at once as their cost volumes fit into memory; the pool finishes each frame."""
+def _match_on_device(
+    work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks, first: int
+) -> Jobs:
+    """Match frame `first`, which may be shown at once, and then as many of the wanted pairs together as their cost
+    volumes fit into memory; the pool finishes each frame."""
     from worker.stereo.cuda import depth_of, frames_at_once
 
     clip, matched = work.clip, work.matched
     at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, work.plan)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     hooks.on_progress(Progress(COMPILATION, 0.5))
-    for first in range(0, len(wanted), at_once):
+    order = sorted(wanted, key=lambda i: i != first)
+    for some in (order[:1], *(order[k : k + at_once] for k in range(1, len(order), at_once))):
         _check_stop(hooks)
-        some = list(wanted[first : first + at_once])
-        left, other = (np.stack(eye) for eye in zip(*map(work.greys, some), strict=True))
+        left, other = (np.stack(eye) for eye in zip(*pool.map(work.greys, some), strict=True))
         tissue = np.stack(list(pool.map(work.tell_tissue, some, other)))
         matched.depth_mm[some], matched.depth_confidence[some] = depth_of(
             left, other, tissue, work.plan, focal_baseline, clip.disparity_offset_px

@@ -54,6 +54,16 @@ def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
             clock.now_s += (MAX_SAVED_S + VIEW_S) / SHARE
 
 
+def test_a_debt_with_a_limit_is_paid_within_that_limit_however_long_a_view_took() -> None:
+    clock = Clock()
+    pace = Pace(clock=clock, most_owed_s=0.06)
+    with pace.training():
+        pace.charge(13.0)
+        assert pace.rest_s() == pytest.approx(0.06 / SHARE)
+        clock.now_s += 0.06 / SHARE
+        assert pace.rest_s() == pytest.approx(0.0, abs=1e-9)
+
+
 def test_renders_are_not_rationed_while_nothing_trains() -> None:
     clock = Clock()
     pace = Pace(clock=clock)

@@ -97,8 +97,8 @@ def test_the_page_tells_what_a_caller_waits_for_by_both_clocks(tmp_path: Path) -
     assert post_claim(tmp_path) == (
         "Since the POST of `d4d_stereo` to a warm worker: `instant` shows a first view after 2.2 s and has its scene "
         "after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`). "
-        "Since the POST of `d4d_stereo` to a warm worker on cuda (a GPU): `instant` shows a first view after 0.5 s and has "
-        "its scene after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
+        "Since the POST of `d4d_stereo` to a warm worker on cuda (a GPU): `instant` shows a first view after 0.5 s "
+        "and has its scene after 14.5 s (`t_post_s`), 6.2 s of them training (`t_train_s`)."
     )
 
 
