@@ -59,7 +59,7 @@ class Part:
         return [out / f"gpu-{name}.csv" for name in names]
 
 
-PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 120))
+PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 160))
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from benchmarks.pages.markdown import table
 
 Row = dict[str, str]
+_OF_STEPS = ("step", "part: ", "peak memory", "instances")
 ORIGIN = ("machine", "gpu", "driver", "torch", "triton", "commit")
 
 _MEASURED = """
@@ -17,7 +18,8 @@ _MEASURED = """
 """
 _TITLES = {
     "correct": "Whether the kernels are right: worst errors over the largest values (gpu-correct.csv).",
-    "speed": "Durations, medians; the standard grid of 40,096 Gaussians at 640x512 (gpu-speed.csv).",
+    "speed": "Medians; the standard grid of 40,096 Gaussians at 640x512, by form of motion and frames a step "
+    "(gpu-speed.csv, which has single kernels, too).",
     "train": "How soon it is how good (gpu-train.csv; curves in gpu-curves.csv).",
 }
 
@@ -30,7 +32,8 @@ def gpu_sections(results: Path) -> list[str]:
         sections.append(_MEASURED)
     for name, rows in measured.items():
         if rows:
-            sections += [f"\n{_TITLES[name]}\n\n", _plain(rows), _origin(rows)]
+            shown = _speed(rows) if name == "speed" else [_plain(rows)]
+            sections += [f"\n{_TITLES[name]}\n", *shown, _origin(rows)]
     return sections
 
 
@@ -44,7 +47,29 @@ def _read(path: Path) -> list[Row]:
 def _plain(rows: list[Row]) -> str:
     hidden = (*ORIGIN, "believed", "detail")
     columns = [name for name in rows[0] if name not in hidden and any(row[name] for row in rows)]
-    return table(columns, [[row[name] or "–" for name in columns] for row in rows])
+    return table(columns, [[_shown(row[name]) for name in columns] for row in rows])
+
+
+def _speed(rows: list[Row]) -> list[str]:
+    """A column for each form of motion and number of frames a step; then the rest. Kernels stay in the file."""
+    of_steps = [row for row in rows if row["what"].startswith(_OF_STEPS)]
+    others = [row for row in rows if row not in of_steps and not row["what"].startswith("kernel: ")]
+    places = sorted({(row["scene"], row["frames"]) for row in of_steps}, key=lambda place: (place[0], int(place[1])))
+    found: dict[str, dict[tuple[str, str], str]] = {}
+    for row in of_steps:
+        found.setdefault(f"{row['what']}, {row['unit']}", {})[row["scene"], row["frames"]] = row["value"]
+    header = ["", *(f"{scene}, {frames}" for scene, frames in places)]
+    cells = [[name, *(_shown(values.get(place, "")) for place in places)] for name, values in found.items()]
+    return [table(header, cells), _plain(others)]
+
+
+def _shown(value: str) -> str:
+    """A number with three digits, or in full where it has more before the point; a dash where there is none."""
+    try:
+        number = float(value)
+    except ValueError:
+        return value or "–"
+    return value if value.isdecimal() else f"{number:.0f}" if abs(number) >= 1000 else f"{number:.3g}"
 
 
 def _origin(rows: list[Row]) -> str:
