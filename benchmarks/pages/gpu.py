@@ -18,8 +18,8 @@ _MEASURED = """
 """
 _TITLES = {
     "correct": "Whether the kernels are right: worst errors over the largest values (gpu-correct.csv).",
-    "speed": "Medians; the standard grid of 40,096 Gaussians at 640x512, by form of motion and frames a step "
-    "(gpu-speed.csv, which has single kernels, too).",
+    "speed": "Medians of durations; the standard grid of 40,096 Gaussians at 640x512, by form of motion and frames a "
+    "step (gpu-speed.csv, which has single kernels, too).",
     "train": "How soon it is how good (gpu-train.csv; curves in gpu-curves.csv).",
 }
 
@@ -60,7 +60,7 @@ def _speed(rows: list[Row]) -> list[str]:
         found.setdefault(f"{row['what']}, {row['unit']}", {})[row["scene"], row["frames"]] = row["value"]
     header = ["", *(f"{scene}, {frames}" for scene, frames in places)]
     cells = [[name, *(_shown(values.get(place, "")) for place in places)] for name, values in found.items()]
-    return [table(header, cells), _plain(others)]
+    return [table(header, cells), *([_plain(others)] if others else [])]
 
 
 def _shown(value: str) -> str:
@@ -69,7 +69,7 @@ def _shown(value: str) -> str:
         number = float(value)
     except ValueError:
         return value or "–"
-    return value if value.isdecimal() else f"{number:.0f}" if abs(number) >= 1000 else f"{number:.3g}"
+    return value if value.isdecimal() else f"{number:.0f}" if abs(number) >= 999.5 else f"{number:#.3g}"
 
 
 def _origin(rows: list[Row]) -> str:

@@ -41,7 +41,7 @@ from worker.daemon.orders import (
     Stopped,
     job_progress,
 )
-from worker.daemon.pace import Pace
+from worker.daemon.pace import SHARE, Pace
 from worker.daemon.serve import Reply, RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
@@ -49,7 +49,7 @@ from worker.input.decode import keep_decoder_ready
 from worker.instruments import load_segmenter
 from worker.machine.hooks import Progress
 from worker.pipeline import Made, judge, judge_again, make
-from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, examine, gpu_is_lost
+from worker.raster.backend import CPU, CPU_BY_VARIABLE, Device, choose_device, examine, gpu_is_lost
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import alone, cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
@@ -64,8 +64,8 @@ REPORT_PERIOD_S = 0.1
 MAX_WAIT_SHARE = 0.4
 """Of the time after which the service gives up a render: who would wait longer is told when to come back."""
 
-GPU_DEBT_S = 0.06
-"""A render beside training on a GPU is followed by a rest of half a second at most (worker/daemon/pace.py)."""
+MAX_GPU_REST_S = 0.5
+"""After a render beside training on a GPU (worker/daemon/pace.py)."""
 
 LAST_SNAPSHOT_S = 10.0
 """How long the last snapshot of a finished job is still shown: until the service knows of the scene."""
@@ -99,16 +99,16 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     if settings.segmenter is not None:
         load_segmenter(settings.segmenter)  # says now what every job without masks would fail by
     store, snapshots = open_store(settings), Snapshots()
-    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace(most_owed_s=GPU_DEBT_S)
+    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace(max_debt_s=MAX_GPU_REST_S * SHARE)
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
     if device == CPU:
         compile_kernels()
-    else:  # those that only a job's model needs are compiled for it
-        examine(device)
+    else:
+        check_gpu(device)
     compile_coder()
-    logger.info("kernels are compiled after %.1f s", time.monotonic() - started_s)
+    logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
     def answer(request: SceneRequest) -> Reply:
@@ -144,6 +144,23 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
             if isinstance(task.order, RunJob):
                 shown = task.order.record.job_id
             obey(task, settings, snapshots, pace, channel)
+
+
+def check_gpu(device: Device) -> None:
+    """Compile the GPU's splatting kernels and compare them with the reference; what a job's model needs beside them is
+    compiled for the job.
+
+    Raises:
+        UnavailableError: they are not to be trusted, or cannot be run.
+    """
+    try:
+        examine(device)
+    except UnavailableError:
+        raise
+    except Exception as error:  # whatever driver, compiler or memory raise
+        logger.error("%s cannot be used", device, exc_info=error)
+        remedy = f"See the log and free or mend the GPU, or train on the CPU: {CPU_BY_VARIABLE}."
+        raise UnavailableError(f"{device} cannot be used ({type(error).__name__}).", remedy) from error
 
 
 def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:

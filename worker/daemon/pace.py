@@ -5,8 +5,8 @@ MAX_SAVED_S: where other programs take the cores, training gets less, and so do 
 that it used out of the bucket, into debt if need be; the next one begins when the debt is paid. Time in which a render
 only waits for a core costs nothing.
 
-A GPU makes a render in milliseconds, but the first of a scene may compile kernels for seconds, or have the scene copied
-to the device. That is no habit, so a debt there has a limit.
+A GPU makes a render in milliseconds, but the first of a scene may compile kernels for seconds. So the debt may have a
+limit, whatever caused it: renders that take longer than that limit allows for get more than SHARE.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Pace:
         cores: what a second can give, in CPU seconds.
         clock: monotonic seconds.
         used_s: CPU seconds that this process has used; None: all that the cores give.
-        most_owed_s: the debt, in CPU seconds, beyond which renders owe no more.
+        max_debt_s: CPU seconds; a render never leaves more debt than that.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class Pace:
         cores: int = 1,
         clock: Callable[[], float] = time.monotonic,
         used_s: Callable[[], float] | None = None,
-        most_owed_s: float = math.inf,
+        max_debt_s: float = math.inf,
     ) -> None:
         self._cores = cores
-        self._most_owed_s = most_owed_s
+        self._max_debt_s = max_debt_s
         self._clock = clock
         self._used_s = used_s or (lambda: cores * clock())
         self._used_before_s = self._used_s()
@@ -70,8 +70,9 @@ class Pace:
     def charge(self, cpu_s: float) -> None:
         """Count so many CPU seconds of a render."""
         with self._lock:
-            self._left_s = max(self._left_s - cpu_s, -self._most_owed_s)
+            self._left_s -= cpu_s
             self._fill()
+            self._left_s = max(self._left_s, -self._max_debt_s)
 
     def rest_s(self) -> float:
         """Seconds until the next render may begin; 0 while no job trains."""

@@ -237,14 +237,14 @@ def _match_on_device(
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     hooks.on_progress(Progress(COMPILATION, 0.5))
     order = sorted(wanted, key=lambda i: i != first)
-    for some in (order[:1], *(order[k : k + at_once] for k in range(1, len(order), at_once))):
+    for batch in (order[:1], *(order[k : k + at_once] for k in range(1, len(order), at_once))):
         _check_stop(hooks)
-        left, other = (np.stack(eye) for eye in zip(*pool.map(work.greys, some), strict=True))
-        tissue = np.stack(list(pool.map(work.tell_tissue, some, other)))
-        matched.depth_mm[some], matched.depth_confidence[some] = depth_of(
+        left, other = (np.stack(eye) for eye in zip(*pool.map(work.greys, batch), strict=True))
+        tissue = np.stack(list(pool.map(work.tell_tissue, batch, other)))
+        matched.depth_mm[batch], matched.depth_confidence[batch] = depth_of(
             left, other, tissue, work.plan, focal_baseline, clip.disparity_offset_px
         )
-        yield from [(i, pool.submit(work.finish, i)) for i in some]
+        yield from [(i, pool.submit(work.finish, i)) for i in batch]
 
 
 def _check_depth(sure_share: float) -> None:

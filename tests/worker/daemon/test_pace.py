@@ -56,12 +56,20 @@ def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
 
 def test_a_debt_with_a_limit_is_paid_within_that_limit_however_long_a_view_took() -> None:
     clock = Clock()
-    pace = Pace(clock=clock, most_owed_s=0.06)
+    pace = Pace(clock=clock, max_debt_s=0.5 * SHARE)
     with pace.training():
+        clock.now_s += 13.0
         pace.charge(13.0)
-        assert pace.rest_s() == pytest.approx(0.06 / SHARE)
-        clock.now_s += 0.06 / SHARE
+        assert pace.rest_s() == pytest.approx(0.5)
+        clock.now_s += 0.5
         assert pace.rest_s() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_with_a_limited_debt_long_views_rest_as_long_as_it_allows() -> None:
+    clock = Clock()
+    pace = Pace(clock=clock, max_debt_s=0.5 * SHARE)
+    with pace.training():
+        assert views_within(100.0, 1.0, clock, pace) == pytest.approx(100 / 1.5, abs=2)
 
 
 def test_renders_are_not_rationed_while_nothing_trains() -> None:

@@ -204,22 +204,29 @@ def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_d
     assert not sampled.depth_mm[1::2].any()
 
 
-def test_the_first_frame_is_shown_before_the_others_are_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_frame_is_shown_before_the_others_are_matched_and_batches_change_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pairs = [draw_pair(slanted(10.0, 7.0, WIDTH, HEIGHT), seed=seed) for seed in range(4)]
+    together = estimate_depth(clip_of(pairs), device="cuda", measured_frames=[1, 2])
     matched: list[int] = []
+    at_first: list[tuple[list[int], NDArray[np.float32]]] = []
+    depth_of = cuda.depth_of
 
     def counted(left: NDArray[np.uint8], *others: Any) -> Any:
         matched.append(len(left))
         return depth_of(left, *others)
 
-    depth_of = cuda.depth_of
     monkeypatch.setattr(cuda, "depth_of", counted)
-    pairs, at_first = [draw_pair(slanted(10.0, 7.0, WIDTH, HEIGHT), seed=seed) for seed in range(3)], []
-    hooks = Hooks(on_first_moment=lambda moment: at_first.append((list(matched), moment)))
-    whole = estimate_depth(clip_of(pairs), hooks, device="cuda", measured_frames=[1, 2])
-    assert matched == [1, 2]
-    [(before, moment)] = at_first
+    monkeypatch.setattr(cuda, "frames_at_once", lambda *size: 2)
+    hooks = Hooks(on_first_moment=lambda moment: at_first.append((list(matched), moment.depth_mm.copy())))
+    batched = estimate_depth(clip_of(pairs), hooks, device="cuda", measured_frames=[1, 2])
+    assert matched == [1, 2, 1]
+    assert np.array_equal(batched.depth_mm, together.depth_mm)
+    assert np.array_equal(batched.depth_confidence, together.depth_confidence)
+    [(before, first_mm)] = at_first
     assert before == [1]
-    assert np.array_equal(moment.depth_mm[0], whole.depth_mm[1])
+    assert np.array_equal(first_mm[0], together.depth_mm[1])
 
 
 def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(triton_cache: Path) -> None:
