@@ -69,7 +69,7 @@ def _shown(value: str) -> str:
         number = float(value)
     except ValueError:
         return value or "–"
-    return value if value.isdecimal() else f"{number:.0f}" if abs(number) >= 999.5 else f"{number:#.3g}"
+    return value if value.isdecimal() else f"{number:.0f}" if abs(number) >= 999.5 else f"{number:#.3g}".rstrip(".")
 
 
 def _origin(rows: list[Row]) -> str:
