@@ -107,8 +107,9 @@ def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, bu
     report = client.report(job.id)
     row |= {"scored_s": round(time.perf_counter() - start_s, 2), "psnr_db": report.psnr_tissue_db}
     client.delete(job.id)
-    row |= {"psnr_right_db": report.psnr_right_db, "device": report.device}
-    return row | {"stages": json.dumps(report.seconds)}
+    return row | {
+        "psnr_right_db": report.psnr_right_db, "device": report.device, "stages": json.dumps(report.seconds),
+    }  # fmt: skip
 
 
 def _look(url: str, job_id: str, start_s: float, row: Row) -> None:

@@ -106,8 +106,7 @@ class Trials:
             self._part.add(**place, note=f"{type(error).__name__}: {error}"[:200])
             return
         for point in run.curve:
-            scored = dataclasses.asdict(point)
-            self._curves.add(**place, **{name: scored[name] for name in POINT_FIELDS})
+            self._curves.add(**place, **{name: getattr(point, name) for name in POINT_FIELDS})
         final_db = run.curve[-1].psnr_tissue_db if run.curve else None
         if preset.name == "paper" and not note:
             self._paper_db = final_db

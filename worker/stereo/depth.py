@@ -106,11 +106,8 @@ def estimate_depth(
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
         wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
-        jobs = (
-            _match_on_device(work, wanted, pool, hooks, first)
-            if device == "cuda"
-            else _match_all(work, wanted, pool, first)
-        )
+        order = sorted(wanted, key=lambda i: i != first)  # frame `first` may be shown at once
+        jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
         for done, (i, job) in enumerate(jobs, start=1):
             _check_stop(hooks)
             job.result()
@@ -219,24 +216,20 @@ Jobs = Iterable[tuple[int, Future[None]]]
 """Frames, each with the job after which it is finished."""
 
 
-def _match_all(work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, first: int) -> Jobs:
-    """Match the wanted pairs side by side, frame `first` before the others: it may be shown at once."""
-    order = sorted(wanted, key=lambda i: i != first)
+def _match_all(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor) -> Jobs:
+    """Match the pairs side by side, begun in this order."""
     return [(i, pool.submit(work.match, i)) for i in order]
 
 
-def _match_on_device(
-    work: FrameWork, wanted: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks, first: int
-) -> Jobs:
-    """Match frame `first`, which may be shown at once, and then as many of the wanted pairs together as their cost
-    volumes fit into memory; the pool finishes each frame."""
+def _match_on_device(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
+    """Match the first pair alone, then as many at once as their cost volumes fit into memory; the pool finishes each
+    frame."""
     from worker.stereo.cuda import depth_of, frames_at_once
 
     clip, matched = work.clip, work.matched
     at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, work.plan)
     focal_baseline = clip.intrinsics.fx * clip.baseline_mm
     hooks.on_progress(Progress(COMPILATION, 0.5))
-    order = sorted(wanted, key=lambda i: i != first)
     for batch in (order[:1], *(order[k : k + at_once] for k in range(1, len(order), at_once))):
         _check_stop(hooks)
         left, other = (np.stack(eye) for eye in zip(*pool.map(work.greys, batch), strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,8 @@ from tests.worker.probes import kernels_compiled_by
 
 SHARED_BYTES = 48 * 1024
 """What every GPU gives a program without being asked for more."""
-ALLOWED_STACK_BYTES = {"update_linear": 8}
-"""Two numbers, on two frames, by Triton 3.6; by 3.9 none."""
+SPILLED_BYTES = {"update_linear": 8} if version("triton").startswith("3.6.") else {}
+"""Triton 3.6 spills two numbers of it, on two frames; 3.9 spills none."""
 
 
 def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(triton_cache: Path) -> None:
@@ -24,6 +25,6 @@ def test_every_kernel_compiles_for_sm_90_and_keeps_its_numbers_in_registers(trit
         "colour_from_sh", "colour_from_sh_backward", "update_rest",
     }  # fmt: skip
     for each in kernels:
-        assert each["stack"] <= ALLOWED_STACK_BYTES.get(each["kernel"], 0), f"spills: {each}"
+        assert each["stack"] <= SPILLED_BYTES.get(each["kernel"], 0), f"spills: {each}"
         assert each["local"] == 0, f"spills: {each}"
         assert each["shared"] <= SHARED_BYTES, each
