@@ -49,7 +49,7 @@ from worker.input.decode import keep_decoder_ready
 from worker.instruments import load_segmenter
 from worker.machine.hooks import Progress
 from worker.pipeline import Made, judge, judge_again, make
-from worker.raster.backend import CPU, CPU_BY_VARIABLE, Device, choose_device, examine, gpu_is_lost
+from worker.raster.backend import CPU, CPU_BY_VARIABLE, choose_device, examine, gpu_is_lost
 from worker.raster.cpu import compile_kernels
 from worker.raster.cpu.threads import alone, cpu_time_s, thread_count
 from worker.scene.compact import compile_coder
@@ -106,7 +106,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     if device == CPU:
         compile_kernels()
     else:
-        check_gpu(device)
+        examine(device)  # what a job's model needs beside it is compiled for the job
     compile_coder()
     logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
@@ -144,23 +144,6 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
             if isinstance(task.order, RunJob):
                 shown = task.order.record.job_id
             obey(task, settings, snapshots, pace, channel)
-
-
-def check_gpu(device: Device) -> None:
-    """Compile the GPU's splatting kernels and compare them with the reference; what a job's model needs beside them is
-    compiled for the job.
-
-    Raises:
-        UnavailableError: they are not to be trusted, or cannot be run.
-    """
-    try:
-        examine(device)
-    except UnavailableError:
-        raise
-    except Exception as error:  # whatever driver, compiler or memory raise
-        logger.error("%s cannot be used", device, exc_info=error)
-        remedy = f"See the log and free or mend the GPU, or train on the CPU: {CPU_BY_VARIABLE}."
-        raise UnavailableError(f"{device} cannot be used ({type(error).__name__}).", remedy) from error
 
 
 def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:

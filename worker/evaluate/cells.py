@@ -102,7 +102,12 @@ def plan(
                     cells += [Cell(clip, name, holdout, seed, budget_s=each) for each in timed]
                     cells += [Cell(clip, name, holdout, seed, iterations=each) for each in fixed]
     for cell in cells:
-        options_of(cell)
+        try:
+            options_of(cell)
+        except InputError as error:
+            if error.field == "options.seed":  # a grid has several
+                raise InputError("options.seeds", error.problem, error.remedy) from error
+            raise
     return cells
 
 

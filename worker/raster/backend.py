@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -15,6 +16,8 @@ from worker.model.deformation import Deformation, motion_named
 from worker.model.gaussians import Gaussians
 from worker.raster.cpu.model import CpuModel
 from worker.raster.model import Model
+
+logger = logging.getLogger(__name__)
 
 CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
 """How the CPU is chosen for one reconstruction, and for a worker."""
@@ -65,16 +68,25 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
 
 
 def examine(device: Device) -> float:
-    """Check, once per process, that the GPU's renders and gradients match the reference; returns the seconds it took.
+    """Compile the GPU's splatting kernels and check, once per process, that their images and gradients match the
+    reference; returns the seconds it took.
 
     Raises:
-        UnavailableError: they differ by more than agreement.LIMIT.
+        UnavailableError: they differ by more than agreement.LIMIT, or cannot be run; the log has the error.
     """
     start = time.perf_counter()
     if device.kind == "cuda":
-        from worker.raster.cuda import agreement
+        try:
+            from worker.raster.cuda import agreement
 
-        agreement.check(device.memory, device.name)
+            agreement.check(device.memory, device.name)
+        except UnavailableError:
+            raise
+        except Exception as error:  # whatever driver, compiler or memory raise
+            logger.error("%s cannot be used", device, exc_info=error)
+            problem = f"{device} cannot be used ({type(error).__name__})."
+            remedy = f"Free or mend the GPU (see the log), or use the CPU ({CPU_BY_OPTION}, {CPU_BY_VARIABLE})."
+            raise UnavailableError(problem, remedy) from error
     return time.perf_counter() - start
 
 

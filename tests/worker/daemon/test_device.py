@@ -26,10 +26,9 @@ from contract.wire.report import Report
 from tests.reports import REPORT_OF_A_SCENE
 from worker.__main__ import main
 from worker.daemon.child import ChildKeeper, DeviceChild
-from worker.daemon.device import check_gpu, make_or_start_anew, request_of, scored
+from worker.daemon.device import make_or_start_anew, request_of, scored
 from worker.daemon.job_errors import describe
 from worker.daemon.orders import Advanced, Failed, Finished, RunJob, Scored, ScoreScene, StopJob, Stopped
-from worker.raster.backend import Device
 from worker.scene.checkpoint import load_scene
 from worker.scene.resume_file import RESUME_FILE, load_resume
 from worker.train.hooks import TrainingHooks
@@ -245,20 +244,6 @@ def test_a_lost_gpu_ends_the_process_that_scores_and_is_not_the_scenes_fault(mon
 
     with pytest.raises(SystemExit):
         scored(fails, REPORT_OF_A_SCENE)
-
-
-@pytest.mark.parametrize("error", [RuntimeError("no kernel image"), torch.OutOfMemoryError("none left")])
-def test_a_gpu_that_cannot_be_used_is_named_when_the_worker_starts(
-    error: Exception, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(device: Device) -> float:
-        raise error
-
-    monkeypatch.setattr("worker.daemon.device.examine", fail)
-    with pytest.raises(UnavailableError) as refused:
-        check_gpu(Device("cuda", "NVIDIA H100", "cuda"))
-    assert refused.value.problem == f"cuda (NVIDIA H100) cannot be used ({type(error).__name__})."
-    assert "INTRASPLAT_DEVICE=cpu" in refused.value.remedy
 
 
 def test_other_trouble_with_the_input_is_not_tried_twice(tmp_path: Path) -> None:

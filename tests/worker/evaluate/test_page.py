@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks.bm_post import FIELDS
 from benchmarks.pages.evaluation import CAPACITY, MARKS, sections, write_readme
+from benchmarks.pages.gpu import ORIGIN, gpu_sections
 from benchmarks.pages.post import POST, post_claim, post_sections
 from benchmarks.pages.table1 import TABLE_1, table1_sections
 from tests.worker.evaluate.made_up import curve_rows, failed_row, run_row
@@ -128,3 +129,25 @@ def test_each_system_of_table_1_stands_beside_the_next_and_the_papers_difference
     assert row in page, "the longest run of each, but dB of two rivals after equal limits"
     assert "| published, EndoNeRF data |  | 0.2 | 1.1 | 1.0 | 2.6 | 88.4 | 48.3 |" in page
     assert page.index("| endogaussian | 60 s") < page.index("| endogaussian | 300 s") < page.index("| endonerf |")
+
+
+def test_the_page_tells_what_a_gpu_was_measured_to_do_and_what_of_it_is_not_to_be_believed(tmp_path: Path) -> None:
+    assert gpu_sections(tmp_path) == []
+    where = {name: f"a {name}" for name in ORIGIN}
+    speeds: list[dict[str, object]] = [
+        {"what": what, "scene": "fdm", "frames": frames, "value": value, "unit": "ms", "clock": "host"}
+        for what, frames, value in [("step", 1, 0.50812), ("step", 2, 1023.4), ("kernel: sort", 1, 3), ("stereo", 1, 7)]
+    ]
+    checks: list[dict[str, object]] = [{"check": "the loss", "worst": 1.23456e-6, "detail": "d mean 1e-6"}]
+    for name, rows, believed in (("speed", speeds, "yes"), ("correct", checks, "another process ran")):
+        told = [{**row, **where, "believed": believed} for row in rows]
+        write_rows(tmp_path / f"gpu-{name}.csv", tuple(told[0]), told)
+    page = "".join(gpu_sections(tmp_path))
+    assert "|  | fdm, 1 | fdm, 2 |" in page
+    assert "| step, ms | 0.508 | 1023 |" in page
+    assert "| stereo | fdm | 1 | 7 | ms | host |" in page
+    assert "kernel: sort" not in page
+    assert "| the loss | 1.23e-06 |" in page
+    assert "d mean" not in page
+    assert "Measured on a machine, a gpu, driver a driver, torch a torch, triton a triton, commit a commit.\n" in page
+    assert "**Not to be believed: another process ran.**" in page

@@ -13,26 +13,25 @@ from worker.evaluate.rows import read_rows
 TINY = ["--clips", "phantom:breathing:160x128:12frames:stereo", "--holdout", "every8", "--iterations", "5"]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("two-eyes")
-
-
-def test_a_benchmark_of_both_eyes_goes_on_where_it_was_stopped(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+def test_a_benchmark_of_both_eyes_goes_on_where_it_was_stopped_and_the_page_has_a_section_of_its_rows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = [*TINY, "--seeds", "0", "--csv", str(folder / TWO_EYES)]
+    assert two_eyes_sections(tmp_path) == []
+    asked = [*TINY, "--seeds", "0", "--csv", str(tmp_path / TWO_EYES)]
     assert main([*asked, "--at-most", "1"]) == 0
-    (left,) = read_rows(folder / TWO_EYES)
+    (left,) = read_rows(tmp_path / TWO_EYES)
     assert left["series"] == "fast:eyes=left"
     assert main(asked) == 0
-    kept, both = read_rows(folder / TWO_EYES)
+    kept, both = read_rows(tmp_path / TWO_EYES)
     assert (kept, both["series"]) == (left, "fast")
     assert {name for name in FIELDS if not both[name]} == {"error", "not_measured"}
     table = capsys.readouterr().out.splitlines()[-2:]
     assert [line.split()[2] for line in table] == ["fast:eyes=left", "fast"]
     assert main([*asked, "--eyes", "both", "--again"]) == 0
-    assert [row["series"] for row in read_rows(folder / TWO_EYES)] == ["fast:eyes=left", "fast"]
+    assert [row["series"] for row in read_rows(tmp_path / TWO_EYES)] == ["fast:eyes=left", "fast"]
+    page = "".join(two_eyes_sections(tmp_path))
+    assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations | 1 |" in page
+    assert "| clip | held out | series | limit | seeds | 10 degrees | bound |" in page
 
 
 def test_a_run_that_fails_is_said_and_has_no_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,10 +39,3 @@ def test_a_run_that_fails_is_said_and_has_no_row(tmp_path: Path, capsys: pytest.
     assert main([*asked, "--seeds", "0", "--csv", str(tmp_path / TWO_EYES)]) == 1
     assert "has one eye" in capsys.readouterr().out
     assert not (tmp_path / TWO_EYES).exists()
-
-
-def test_the_page_has_a_section_of_these_rows(folder: Path, tmp_path: Path) -> None:
-    assert two_eyes_sections(tmp_path) == []
-    page = "".join(two_eyes_sections(folder))
-    assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations | 1 |" in page
-    assert "| clip | held out | series | limit | seeds | 10 degrees | bound |" in page

@@ -15,7 +15,7 @@ from worker.machine.timing import Timings
 from worker.phantom import PhantomSettings, make_phantom, write_stereomis
 from worker.pipeline import open_with_depth
 from worker.raster import Rendered
-from worker.raster.backend import Device
+from worker.raster.backend import Device, examine
 from worker.raster.cuda import agreement, rasterize
 from worker.train.request import ReconstructionRequest
 
@@ -46,6 +46,21 @@ def test_one_that_does_not_is_refused_by_its_name_with_a_remedy(
     ) as raised:
         agreement.check(device, f"GPU 9000 {factor}")
     assert "INTRASPLAT_DEVICE=cpu" in raised.value.remedy
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no kernel image"), torch.OutOfMemoryError("none left")])
+def test_one_that_cannot_be_used_is_refused_by_its_name_with_a_remedy(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> Rendered:
+        raise error
+
+    monkeypatch.setattr(agreement, "rasterize", fail)
+    with pytest.raises(UnavailableError) as refused:
+        examine(Device("cuda", "GPU 9002", "cpu"))
+    assert refused.value.problem == f"cuda (GPU 9002) cannot be used ({type(error).__name__})."
+    assert "--device cpu, INTRASPLAT_DEVICE=cpu" in refused.value.remedy
+    assert str(error) in caplog.text
 
 
 def test_one_that_does_not_matches_no_stereo_clip_either(
