@@ -38,8 +38,8 @@ reach there, `hidden` the score behind the instrument; `moving` is the motion er
 are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are the median of
 the whole pictures that 30 s hold, without the first five where there are more. EndoNeRF draws its samples about the
 measured depth of the training frames nearest in time, which is exact on phantoms: its depth error is mostly the motion
-between frames. Three of the ten rows of 1800 s of EndoGaussian, those of `d4d-a` and of `phantom:still`, blocks8, had
-240 of 4000 steps without motion; the others have 1000, as published.
+between frames. Two of the ten rows of 1800 s of EndoGaussian, those of `d4d-a`, had 240 of 4000 steps without
+motion; the others have 1000, as published.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
