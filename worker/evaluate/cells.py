@@ -102,12 +102,7 @@ def plan(
                     cells += [Cell(clip, name, holdout, seed, budget_s=each) for each in timed]
                     cells += [Cell(clip, name, holdout, seed, iterations=each) for each in fixed]
     for cell in cells:
-        try:
-            options_of(cell)
-        except InputError as error:
-            if error.field == "options.seed":  # a grid has several
-                raise InputError("options.seeds", error.problem, error.remedy) from error
-            raise
+        options_of(cell)
     return cells
 
 

@@ -85,7 +85,7 @@ def test_a_series_is_one_row_however_it_is_spelt() -> None:
 
 @pytest.mark.parametrize(("holdouts", "seeds", "field"), [
     (["every8", "every9"], [0], "options.holdout"), (["1,x"], [0], "options.holdout"),
-    (["every8"], [0, -1], "options.seeds"),
+    (["every8"], [0, -1], "options.seed"),
 ])  # fmt: skip
 def test_what_no_reconstruction_takes_is_refused_before_the_first_cell(
     holdouts: list[str], seeds: list[int], field: str
