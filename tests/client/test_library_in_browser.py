@@ -54,16 +54,19 @@ def many_done(site: Site, count: int, began_s: float = -10_000) -> None:
 
 
 def test_each_scene_has_its_picture_its_name_its_length_and_its_light(site: Site, page: Page) -> None:
-    scenes = [labelled(site, site.scene(mark), f"liver {mark}") for mark in ("20", "c0")]
+    ids = [site.queued_job(mark) for mark in ("20", "c0")]
+    scenes = [labelled(site, site.finish(site.claim(), scored=False), f"liver {job_id[:2]}") for job_id in ids]
+    assert scenes == ids
     slow = REPORT_OF_THE_PAGE.model_copy(
         update={"frame_times_s": (0.0, 1.5, 2.93), "warnings": (Notice.warning(NoticeCode.BLOOD, "GET /x"),)}
     )
-    site.store.add_scores("worker-1", scenes[0], 1, slow)
+    for scene, report in zip(scenes, (slow, REPORT_OF_THE_PAGE), strict=True):
+        site.store.add_scores("worker-1", scene, 1, report)
     for scene in scenes:
         page.until(lambda scene=scene: page.text(card(scene, ".trust")))
         page.until(lambda scene=scene: abs(page.script(SHADE_OF_THUMBNAIL, scene) - grey_of(scene)) <= 3)
     assert page.script(NAMES) == ["liver c0", "liver 20"]
-    assert say("job.long", seconds="2.9") in page.text(card(scenes[0]))
+    page.until_text(card(scenes[0]), say("job.long", seconds="2.9"))
     page.until_text(card(scenes[0], ".trust"), say("notice.blood"))
     assert say("light.care") in page.text(card(scenes[0], ".trust"))
     assert re.search(r"\d{4}, \d\d:\d\d", page.text(card(scenes[0])))
