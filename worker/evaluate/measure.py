@@ -162,8 +162,9 @@ class Bench:
             step_px=step_px,
         )
         report, rival = fitted.report, fitted.rival
-        curve = on_the_way.completed([dataclasses.asdict(point) for point in fitted.curve], in_t_post_s=False)
-        if curve:
+        curve: list[Values] = [dataclasses.asdict(point) for point in fitted.curve]
+        if curve:  # else there was no tissue to score
+            curve = on_the_way.completed(curve, in_t_post_s=False)
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         pose, camera = clip.world_from_camera[0], clip.intrinsics
         speed = _speed(lambda t: rival.render(t, pose, camera), report)
@@ -175,9 +176,9 @@ class Bench:
             values |= dict.fromkeys(OF_WHOLE_PICTURES)
             values["not_measured"] = f"{rival.not_measured}; whole pictures: {WHY_THINNED.format(step_px)}"
             curve = [{**point, "ssim": None} for point in curve]
-        if opened.phantom is None:
-            return values, curve
-        return values | self._true(cell, opened, RivalCandidate(fitted, clip, step_px), report, step_px), curve
+        if opened.phantom is not None:
+            values |= self._true(cell, opened, RivalCandidate(fitted, clip, step_px), report, step_px)
+        return values | dict.fromkeys(rival.always_one), curve
 
     def _true(self, cell: Cell, opened: OpenClip, candidate: Candidate, report: Report, step_px: int = 1) -> Values:
         """The scores of a phantom's candidate against the truth, on a lattice of pixels."""

@@ -2,8 +2,8 @@
 and that is all they are for: no scene of theirs is stored or served.
 
 Read in this order: rival (what a rival is), fields (what radiance fields share), endonerf, planes, proposals, lerplane,
-density, displacement, endogaussian, run (how one is trained and judged). docs/decisions/078 says which settings are
-published, which are ours, and why.
+adaptive_density, displacement, endogaussian, run (how one is trained and judged). docs/rivals.md says which settings
+are published, which are ours, and why.
 """
 
 from __future__ import annotations

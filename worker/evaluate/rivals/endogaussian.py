@@ -1,6 +1,6 @@
 """`endogaussian`: Gaussians from the depth of all frames, moved by factor planes (Liu et al., 2024; own text).
 
-Symbols: N Gaussians, M pixels, F training frames, H W pixels. docs/decisions/078 lists what differs from the paper,
+Symbols: N Gaussians, M pixels, F training frames, H W pixels. docs/rivals.md lists what differs from the paper,
 and why. Lengths are in optimiser units: the median depth is 60.
 
 Small networks decode the features of a Gaussian's place and time into how far it has moved, turned, grown and faded.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
-from worker.evaluate.rivals.density import Density
+from worker.evaluate.rivals.adaptive_density import AdaptiveDensity
 from worker.evaluate.rivals.displacement import LOG_SCALE, MEAN, OPACITY, QUATERNION, Displacement
 from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.planes import Smoothness, mean_squared_difference
@@ -41,34 +41,35 @@ PUBLISHED_WIDTH = 640
 
 @dataclass(frozen=True)
 class EndoGaussianSettings:
-    """As published, or as the methods say that it builds on: 3D and 4D Gaussian splatting. cells, features, hidden,
-    resting_share, splitting and smoothness are ours (docs/decisions/078).
+    """Published values; where none is given, those of 3D and 4D Gaussian splatting. cells, features, hidden,
+    static_share, splits_until and smoothness are ours (docs/rivals.md).
 
-    share, most     share of each frame's measured pixels that become Gaussians, and how many they are at most
+    start_share, start_most  share of each frame's measured pixels that become Gaussians, and how many they are at most
     opacity         at the start
     sh_degree       of the harmonics at the end; it rises evenly from 0
     cells, features, time_cells  of the planes, by resolution; time_cells is their most cells of time
     hidden          width of each decoder's hidden layer
-    resting         steps without motion, the first of a training that the published steps end
-    resting_share   of a shorter training's time or steps; a step without motion takes less time than a later one
-    density         when and what to split and drop; not after the share splitting of the training
-    *_rate          of Adam; a pair falls exponentially from the end of rest
-    evenness        weight of the total variation of rendered colour and depth, in pictures as wide as those published
+    static_steps    steps without motion, the first of a training that the published steps end
+    static_share    of a shorter training's time or steps; a step without motion takes less time than a later one
+    densify         when and what to split and drop
+    splits_until    share of the training after which nothing is split or dropped
+    *_rate          of Adam; a pair falls exponentially from the last step without motion on
+    tv_weight       of the total variation of rendered colour and depth, in pictures as wide as those published
     smoothness      weights of how smooth the planes are
     """
 
-    share: float = 0.01
-    most: int = 30_000
+    start_share: float = 0.01
+    start_most: int = 30_000
     opacity: float = 0.1
     sh_degree: int = 3
     cells: tuple[int, ...] = (64, 128, 256)
     features: int = 16
     time_cells: int = 150
     hidden: int = 64
-    resting: int = 1000
-    resting_share: float = 0.06
-    density: DensifySettings = field(default=DensifySettings())
-    splitting: float = 0.9
+    static_steps: int = 1000
+    static_share: float = 0.06
+    densify: DensifySettings = field(default=DensifySettings())
+    splits_until: float = 0.9
     mean_rate: tuple[float, float] = (1.6e-3, 1.6e-5)
     decoder_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
     plane_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
@@ -77,8 +78,8 @@ class EndoGaussianSettings:
     opacity_rate: float = 5e-2
     colour_rate: float = 2.5e-3
     harmonics_rate: float = 1.25e-4
-    evenness: float = 0.03
-    smoothness: Smoothness = field(default=Smoothness(space=1e-4, time=0.0, rest=1e-4, acceleration=1e-2))
+    tv_weight: float = 0.03
+    smoothness: Smoothness = field(default=Smoothness(space=1e-4, time=0.0, time_l1=1e-4, acceleration=1e-2))
 
 
 class EndoGaussian(Rival):
@@ -107,8 +108,8 @@ class EndoGaussian(Rival):
         of_field = [list(each.parameters()) for each in (self.field.decode, self.field.planes)]
         groups = [*([each] for each in of_gaussians), *of_field]
         self.optimizer = torch.optim.Adam([{"params": each} for each in groups], eps=1e-15, fused=True)
-        self._density = Density(self.settings.density, self.optimizer)
-        self._rested = 0.0  # share of the training at the last step without motion
+        self._adaptive_density = AdaptiveDensity(self.settings.densify, self.optimizer)
+        self._static_until = 0.0  # share of the training at the last step without motion
 
     @property
     def gaussians(self) -> int:
@@ -116,41 +117,41 @@ class EndoGaussian(Rival):
 
     def rates(self, progress: float) -> Sequence[float]:
         chosen = self.settings
-        moved = (progress - self._rested) / (1 - self._rested)
+        moved = (progress - self._static_until) / (1 - self._static_until)
         pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
         of_mean, *of_field = (decayed(each, moved) for each in pairs)
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [of_mean, *of_shapes, chosen.colour_rate, chosen.harmonics_rate, *of_field]
 
     def step(self, iteration: int, progress: float) -> float:
-        rests = self._rests(iteration, progress)
-        if rests:
-            self._rested = progress
-        # at rest the rasteriser's own threads do most of a step, while torch's would only spin
-        with torch_threads(1) if rests else nullcontext():
+        static = self._is_static(iteration, progress)
+        if static:
+            self._static_until = progress
+        # without motion the rasteriser's own threads do most of a step, while torch's would only spin
+        with torch_threads(1) if static else nullcontext():
             loss = super().step(iteration, progress)
-        if progress < self.settings.splitting and self.settings.density.due(iteration):
-            *self._moves, self._colour, self._harmonics = self._density.split(self.generator(iteration))
+        if progress < self.settings.splits_until and self.settings.densify.due(iteration):
+            *self._moves, self._colour, self._harmonics = self._adaptive_density.split(self.generator(iteration))
         return loss
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
         seen, frame = self._seen, self._with_tissue[0]
-        rests = self._rests(iteration, progress)
-        if not rests:
+        static = self._is_static(iteration, progress)
+        if not static:
             drawn = torch.randint(len(self._with_tissue), (), generator=self.generator(iteration))
             frame = self._with_tissue[int(drawn)]
         degree = min(self.settings.sh_degree, int((self.settings.sh_degree + 1) * progress))
-        moved = torch.cat([*self._moves], 1) if rests else self._moved(float(seen.t[frame]))
-        self._density.watch(moved, self._cameras[frame])
+        moved = torch.cat([*self._moves], 1) if static else self._moved(float(seen.t[frame]))
+        self._adaptive_density.watch(moved, self._cameras[frame])
         shown = self._shown(moved, self._cameras[frame], degree)
         depth = seen.depth_mm[frame] * self._scale
         true = seen.rgb[frame], depth, seen.tissue[frame]
         loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
-        evenness = self.settings.evenness * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
+        tv_weight = self.settings.tv_weight * (seen.intrinsics.width / PUBLISHED_WIDTH) ** 2
         for each, axis in product((shown.rgb, shown.depth), (0, 1)):
-            loss = loss + evenness * mean_squared_difference(each, axis, 1)
-        return loss if rests else loss + self.field.planes.roughness(self.settings.smoothness)
+            loss = loss + tv_weight * mean_squared_difference(each, axis, 1)
+        return loss if static else loss + self.field.planes.roughness(self.settings.smoothness)
 
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
@@ -172,12 +173,12 @@ class EndoGaussian(Rival):
         motion = torch.where(alpha >= COVERED_ALPHA, shown.rgb / alpha.clamp(min=COVERED_ALPHA), torch.nan)
         return motion.float().cpu().numpy()
 
-    def _rests(self, iteration: int, progress: float) -> bool:
-        """Whether a step is without motion. Where fewer steps than published end the training, progress is ahead of the
-        iteration's share of those published."""
-        share = self.settings.resting_share
+    def _is_static(self, iteration: int, progress: float) -> bool:
+        """Whether a step is without motion. progress > iteration / published_steps means that the training ends before
+        the published steps do; then static_share counts."""
+        share = self.settings.static_share
         in_time = self.time_share < share and progress < max(share, iteration / self.published_steps)
-        return in_time and iteration <= self.settings.resting
+        return in_time and iteration <= self.settings.static_steps
 
     def _moved(self, t: float) -> Tensor:
         """What moves, at time t: [N, MOVING].
@@ -205,11 +206,11 @@ def starting_gaussians(
     chosen = []
     for index in range(len(seen)):
         pixels = torch.nonzero(seen.depth_mm[index] > 0)
-        count = min(len(pixels), max(1, round(settings.share * len(pixels))))
+        count = min(len(pixels), max(1, round(settings.start_share * len(pixels))))
         drawn = pixels[torch.randperm(len(pixels), generator=random)[:count].to(pixels.device)]
         chosen.append(torch.cat([torch.full_like(drawn[:, :1], index), drawn], 1))
     every = torch.cat(chosen)
-    kept = every[torch.randperm(len(every), generator=random)[: settings.most].to(every.device)]
+    kept = every[torch.randperm(len(every), generator=random)[: settings.start_most].to(every.device)]
     frame, row, column = kept.unbind(1)
     origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
     points = units_per_mm * (origin + seen.depth_mm[frame, row, column][:, None] * direction)

@@ -1,6 +1,6 @@
 """`endonerf`: a canonical radiance field and a network that displaces into it (Wang et al., MICCAI 2022; own text).
 
-Symbols: M rays, S samples a ray, H W pixels. docs/decisions/078 lists what differs from the paper, and why.
+Symbols: M rays, S samples a ray, H W pixels. docs/rivals.md lists what differs from the paper, and why.
 
 A place x at time t looks up colour and density at x + G(x, t). Rays are drawn where there is tissue, more of them where
 instruments often hide it; samples of a ray lie about the measured depth.
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from worker.evaluate.rivals.fields import (
+    NOT_OF_RAYS,
+    OPAQUE,
     SOLID,
     Box,
     Shown,
@@ -38,12 +40,12 @@ GUIDES = 8
 """Training frames nearest in time whose depth guides the rays of a render."""
 
 CPU_RAYS = 128
-"""Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
+"""Of a step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
 
 
 @dataclass(frozen=True)
 class EndoNerfSettings:
-    """As published where docs/decisions/078 does not mark it as ours: spread, last_rate, and the unit s.
+    """As published where docs/rivals.md does not mark it as ours: spread, last_rate, and the unit s.
 
     spread         standard deviation of the samples about the depth, in s
     space_octaves, time_octaves, view_octaves  of the positional encodings
@@ -75,7 +77,8 @@ class EndoNerfSettings:
 class EndoNerf(Rival):
     """A training EndoNeRF."""
 
-    not_measured = "motion: it maps each moment to the canonical one, not back; confidence: it has none"
+    not_measured = "motion: it maps each moment to the canonical one, not back; " + NOT_OF_RAYS
+    always_one = OPAQUE
     published_steps = 100_000
 
     def __init__(self, seen: Seen, seed: int, settings: EndoNerfSettings | None = None) -> None:
@@ -193,6 +196,8 @@ class _Field(nn.Module):
         space, time = 3 * (1 + 2 * settings.space_octaves), 1 + 2 * settings.time_octaves
         self.displace = _Trunk(space + time, settings.layers, width)
         self.displacement = nn.Linear(width, 3)
+        nn.init.zeros_(self.displacement.weight)  # else the first displacements scramble the encoded places
+        nn.init.zeros_(self.displacement.bias)
         self.trunk = _Trunk(space, settings.layers, width)
         self.density, self.feature = nn.Linear(width, 1), nn.Linear(width, width)
         self.branch = nn.Linear(width + 3 * (1 + 2 * settings.view_octaves), width // 2)
@@ -209,6 +214,6 @@ class _Field(nn.Module):
 
 
 def _encoded(value: Tensor, octaves: int) -> Tensor:
-    """[M, D] with sines and cosines of so many octaves: [M, D (1 + 2 octaves)]."""
-    angle = torch.cat([value * (math.pi * 2**k) for k in range(octaves)], 1)
+    """[M, D] with sines and cosines of value 2^k, k < octaves: [M, D (1 + 2 octaves)]."""
+    angle = torch.cat([value * 2.0**k for k in range(octaves)], 1)
     return torch.cat([value, torch.sin(angle), torch.cos(angle)], 1)

@@ -4,7 +4,8 @@ Symbols: M points or rays, S samples a ray.
 
 A place in the box is [-1, 1]^3: x / z, y / z and 1 / z of the first camera, each from its least to its greatest.
 Pixels of an endoscope at rest are columns of it, as in the normalised device coordinates of the papers. A place on a
-ray is s in [0, 1], even in 1 / z of the ray's own camera, from the nearest depth to the farthest.
+ray is s in [0, 1], even in 1 / z of the ray's own camera, from the nearest depth of the training frames to the
+farthest.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ MARGIN = 0.05
 """Of the box's size, on each side."""
 SOLID = 1e10
 """Length of a ray's last sample: whatever is dense there ends the ray."""
+OPAQUE = ("coverage", "seen_ok")
+NOT_OF_RAYS = "confidence: it has none; coverage and seen_ok: the last sample of a ray is opaque"
+"""What a row does not have of a radiance field, and why; OPAQUE are columns that would be 1 whatever is learnt."""
 OUTLIERS = 0.001
 """Share of the depths beyond each end of the box."""
 RENDERED_SAMPLES = {"cpu": 1 << 16, "gpu": 1 << 20}

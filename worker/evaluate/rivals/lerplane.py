@@ -1,6 +1,6 @@
 """`lerplane`: a radiance field factored into planes of space and of time (Yang et al., MICCAI 2023; own text).
 
-Symbols: M rays, S samples a ray, K intervals a ray, F training frames, H W pixels. docs/decisions/078 lists what
+Symbols: M rays, S samples a ray, K intervals a ray, F training frames, H W pixels. docs/rivals.md lists what
 differs from the paper, and why.
 
 All moments share the planes of space; features of the planes of time multiply theirs. A small network decodes features,
@@ -21,9 +21,20 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from worker.evaluate.rivals.fields import Box, Shown, cumulated, drawn_pixels, picture, pose_tensor, rays, weights_along
+from worker.evaluate.rivals.fields import (
+    NOT_OF_RAYS,
+    OPAQUE,
+    Box,
+    Shown,
+    cumulated,
+    drawn_pixels,
+    picture,
+    pose_tensor,
+    rays,
+    weights_along,
+)
 from worker.evaluate.rivals.planes import Planes, Smoothness
-from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, lengths, middles
+from worker.evaluate.rivals.proposals import annealed, drawn_edges, interlevel_loss, lengths, middles
 from worker.evaluate.rivals.rival import Rival, Seen, seeded
 from worker.input.camera import Intrinsics
 from worker.train.hooks import RenderedFrame
@@ -36,7 +47,7 @@ HUBER_DELTA = 0.2
 """In s: the depth error from which its loss is linear."""
 
 CPU_RAYS = 512
-"""Of a step on a processor, where 2048 leave time for few steps (docs/decisions/078)."""
+"""Of a step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,8 @@ class LerPlaneSettings:
     WINDOW and HUBER_DELTA are ours.
 
     cells, features     of the planes, by resolution; time_cells is their most cells of time
-    proposal_*          of the fields that propose samples, one a round, and how many intervals each looks at
+    proposal_samples    intervals that each proposal network looks at, one network a round
+    proposal_cells, proposal_features  of the planes of each of these networks
     bins                of the one-blob encoding of place and time
     rate                of Adam: it rises for the share warm_up of the training, then falls like a cosine
     least, most         limits of a pixel's change, for its importance
@@ -70,8 +82,10 @@ class LerPlaneSettings:
     depth_weight: float = 1.0
     proposal_depth_weight: float = 1.0
     proposal_weight: float = 1.0
-    smoothness: Smoothness = field(default=Smoothness(space=1.2e-2, time=6e-3, rest=3e-3, acceleration=0.15))
-    proposal_smoothness: Smoothness = field(default=Smoothness(space=1.2e-3, time=6e-4, rest=3e-4, acceleration=3e-4))
+    smoothness: Smoothness = field(default=Smoothness(space=1.2e-2, time=6e-3, time_l1=3e-3, acceleration=0.15))
+    proposal_smoothness: Smoothness = field(
+        default=Smoothness(space=1.2e-3, time=6e-4, time_l1=3e-4, acceleration=3e-4)
+    )
 
     @classmethod
     def on(cls, device: torch.device) -> LerPlaneSettings:
@@ -82,7 +96,8 @@ class LerPlaneSettings:
 class LerPlane(Rival):
     """A training LerPlane."""
 
-    not_measured = "motion: it has a field for each moment and no points that move; confidence: it has none"
+    not_measured = "motion: it has a field for each moment and no points that move; " + NOT_OF_RAYS
+    always_one = OPAQUE
     published_steps = 32_000
 
     def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:
@@ -121,7 +136,7 @@ class LerPlane(Rival):
             loss = loss + of_depth * torch.where(known, error, 0.0).sum() / known.sum().clamp(min=1)
         *proposed, (edges, weight) = rounds
         for each in proposed:
-            loss = loss + chosen.proposal_weight * excess(edges, weight.detach(), *each)
+            loss = loss + chosen.proposal_weight * interlevel_loss(edges, weight.detach(), *each)
         return loss + self._roughness()
 
     @torch.no_grad()

@@ -23,13 +23,13 @@ class Smoothness:
     """Weights of what is to be small in the planes; each is the mean over the three planes of a resolution.
 
     space, time   squared differences of neighbouring cells of the planes of space and of those of time
-    rest          distance of the planes of time from 1, where they change nothing
+    time_l1       distance of the planes of time from 1, where they change nothing
     acceleration  squared second differences in time of the planes of time
     """
 
     space: float
     time: float
-    rest: float
+    time_l1: float
     acceleration: float
 
 
@@ -61,7 +61,7 @@ class Planes(nn.Module):
         total = torch.zeros((), dtype=self.time[0].dtype, device=self.time[0].device)
         for space, time in zip(self.space, self.time, strict=True):
             total = total + weights.space * sum(mean_squared_difference(space, axis, 1) for axis in (2, 3))
-            total = total + weights.rest * (1 - time).abs().mean()
+            total = total + weights.time_l1 * (1 - time).abs().mean()
             if weights.time:
                 total = total + weights.time * sum(mean_squared_difference(time, axis, 1) for axis in (2, 3))
             if time.shape[2] > 2:

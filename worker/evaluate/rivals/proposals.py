@@ -41,7 +41,7 @@ def middles(edges: Tensor) -> Tensor:
     return (edges[:, 1:] + edges[:, :-1]) / 2
 
 
-def excess(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
+def interlevel_loss(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
     """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap, as a mean over samples
     (Barron et al., 2022)."""
     total = torch.cat([torch.zeros_like(proposed[:, :1]), torch.cumsum(proposed, -1)], -1)

@@ -20,11 +20,11 @@ from worker.evaluate.rivals.rival import Seen
 from worker.train.densify import DensifySettings
 
 SMALL = EndoGaussianSettings(
-    share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),
-    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, resting_share=0.25,
+    start_share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),
+    decoder_rate=(5e-2, 5e-3), plane_rate=(5e-2, 5e-3), log_scale_rate=1e-2, static_share=0.25,
 )  # fmt: skip
 """What learns 64x48 pixels in seconds."""
-TINY = EndoGaussianSettings(share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=3, hidden=8)
+TINY = EndoGaussianSettings(start_share=0.01, opacity=0.5, cells=(3, 5), features=2, time_cells=3, hidden=8)
 
 
 def small(seen: Seen, seed: int) -> EndoGaussian:
@@ -61,7 +61,7 @@ def test_gaussians_start_at_the_measured_tissue_of_all_frames_up_to_a_limit() ->
     seen = Seen.of(clip, range(9))
     measured = (seen.depth_mm > 0).sum((1, 2)).tolist()
     assert EndoGaussian(seen, 0, TINY).gaussians == sum(round(0.01 * each) for each in measured)
-    few = EndoGaussianSettings(share=0.5, most=200, cells=(3,), features=2)
+    few = EndoGaussianSettings(start_share=0.5, start_most=200, cells=(3,), features=2)
     mean = EndoGaussian(seen, 0, few)._moves[0]
     assert len(mean) == 200
     camera, median_mm = clip.intrinsics, float(np.median(seen.depth_mm[seen.depth_mm > 0]))
@@ -89,7 +89,7 @@ def test_nothing_moves_in_the_first_quarter_which_sees_the_first_frame_alone() -
     assert all(float(decode[-1].weight.grad.abs().max()) > 0 for decode in rival.field.decode)
 
 
-def test_it_rests_as_many_steps_as_published_where_steps_end_the_training_and_its_rates_fall_afterwards() -> None:
+def test_nothing_moves_for_the_published_steps_where_steps_end_the_training_and_rates_fall_afterwards() -> None:
     rival = small(Seen.of(small_clip(3), range(3)), 0)
 
     def moves(iteration: int, progress: float) -> bool:
@@ -97,9 +97,9 @@ def test_it_rests_as_many_steps_as_published_where_steps_end_the_training_and_it
         return all(each.grad is not None for each in rival.field.parameters())
 
     assert not moves(1000, 999 / 4000)
-    at_rest = rival.rates(999 / 4000)
-    assert at_rest == [group["lr"] for group in rival.optimizer.param_groups]
-    assert at_rest[0] == SMALL.mean_rate[0]
+    static_rates = rival.rates(999 / 4000)
+    assert static_rates == [group["lr"] for group in rival.optimizer.param_groups]
+    assert static_rates[0] == SMALL.mean_rate[0]
     assert moves(1001, 1000 / 4000)
     np.testing.assert_allclose(rival.rates(1.0)[0], SMALL.mean_rate[1])
     assert moves(1000, 0.26), "of fewer steps the share"
@@ -118,7 +118,7 @@ def test_a_degree_of_harmonics_is_learnt_every_quarter() -> None:
 
 def test_gaussians_are_split_when_that_is_due_until_late_in_the_training() -> None:
     often = DensifySettings(from_iteration=4, every=2, gradient_threshold=1e-7)
-    rival = EndoGaussian(Seen.of(small_clip(3), range(3)), 0, dataclasses.replace(TINY, density=often))
+    rival = EndoGaussian(Seen.of(small_clip(3), range(3)), 0, dataclasses.replace(TINY, densify=often))
     counts = []
     for iteration, progress in enumerate((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.89, 0.9), 1):
         assert np.isfinite(rival.step(iteration, progress))

@@ -18,7 +18,7 @@ from tests.worker.evaluate.rivals.cases import (
 from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
 from worker.evaluate.rivals.planes import Planes, Smoothness
-from worker.evaluate.rivals.proposals import annealed, drawn_edges, excess, middles
+from worker.evaluate.rivals.proposals import annealed, drawn_edges, interlevel_loss, middles
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = LerPlaneSettings(
@@ -52,15 +52,15 @@ def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_w
     proposed_edges = torch.linspace(0, 1, 7, dtype=torch.float64).expand(5, 7)
     weight, proposed = (torch.rand(5, n, generator=random, dtype=torch.float64) / n for n in (3, 6))
     proposed.requires_grad_()
-    assert torch.autograd.gradcheck(lambda each: excess(edges, weight, proposed_edges, each), (proposed / 9,))
-    assert float(excess(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
+    assert torch.autograd.gradcheck(lambda each: interlevel_loss(edges, weight, proposed_edges, each), (proposed / 9,))
+    assert float(interlevel_loss(edges, weight, proposed_edges, torch.ones_like(proposed))) == 0.0
 
 
 def test_the_proposals_loss_is_by_how_much_weights_exceed_what_they_allow() -> None:
     edges, weight = torch.tensor([[0.25, 0.5, 1.0]]), torch.tensor([[0.4, 0.6]])
     proposed_edges, proposed = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.2, 0.3]])
     want = ((0.4 - 0.2) ** 2 / 0.4 + (0.6 - 0.3) ** 2 / 0.6) / 2
-    np.testing.assert_allclose(float(excess(edges, weight, proposed_edges, proposed)), want, rtol=1e-5)
+    np.testing.assert_allclose(float(interlevel_loss(edges, weight, proposed_edges, proposed)), want, rtol=1e-5)
 
 
 def test_its_rate_rises_then_falls_like_a_cosine() -> None:
@@ -87,10 +87,10 @@ def test_how_rough_planes_are_has_the_gradient_of_finite_differences() -> None:
             each.normal_(1.0, 0.2, generator=torch.Generator().manual_seed(2))
 
     def roughness(*_: torch.Tensor) -> torch.Tensor:
-        return planes.roughness(Smoothness(space=1.0, time=0.7, rest=0.3, acceleration=0.5))
+        return planes.roughness(Smoothness(space=1.0, time=0.7, time_l1=0.3, acceleration=0.5))
 
     assert torch.autograd.gradcheck(roughness, tuple(planes.parameters()))
-    of_acceleration = planes.roughness(Smoothness(space=0.0, time=0.0, rest=0.0, acceleration=2.0))
+    of_acceleration = planes.roughness(Smoothness(space=0.0, time=0.0, time_l1=0.0, acceleration=2.0))
     first, second = (each.diff(dim=2).diff(dim=2).square().mean() for each in planes.time)
     assert torch.isclose(of_acceleration, 2 * (first + second))
 

@@ -21,6 +21,7 @@ from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
+from worker.evaluate.rivals.fields import OPAQUE
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.rivals.run import Length, Make, Renders, run_rival, train_rival
@@ -46,7 +47,10 @@ def tiny_gaussians(seen: Seen, seed: int) -> EndoGaussian:
 
 @pytest.mark.parametrize(
     ("series", "make", "not_measured"),
-    [("endonerf", tiny, ("motion", "confidence", "whole pictures")), ("endogaussian", tiny_gaussians, ("confidence",))],
+    [
+        ("endonerf", tiny, ("motion", "confidence", "coverage and seen_ok", "whole pictures")),
+        ("endogaussian", tiny_gaussians, ("confidence",)),
+    ],
 )
 def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     series: str, make: Make, not_measured: tuple[str, ...]
@@ -65,9 +69,10 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     of_scenes = {"bases", "floats_a_gaussian", "stored_loss_held_out_db"}
     of_moving = {"moving_mm", "moving_error_mm"}  # nothing moves a millimetre in so short a clip
     of_gaussians: set[str] = set() if made[0].gaussians else {"gaussians"}
-    figures = {"motion": ("mo",), "confidence": ("rank_",), "whole pictures": OF_WHOLE_PICTURES}
+    figures = {"motion": ("mo",), "confidence": ("rank_",), "coverage and seen_ok": OPAQUE}
+    figures |= {"whole pictures": OF_WHOLE_PICTURES}
     starts = sum((figures[each] for each in not_measured), ())
-    cannot = {name for name in RUN_FIELDS if name in TRUTH + OF_WHOLE_PICTURES and name.startswith(starts)}
+    cannot = {name for name in RUN_FIELDS if name in TRUTH + OF_WHOLE_PICTURES + OPAQUE and name.startswith(starts)}
     assert empty == {"error", *of_the_right_eye, *of_scenes, *of_moving, *of_gaussians, *cannot}
     assert [each.partition(":")[0] for each in str(row["not_measured"]).split("; ")] == list(not_measured)
     assert row["scene_bytes"] == 4 * sum(each.numel() for each in made[0].parameters())

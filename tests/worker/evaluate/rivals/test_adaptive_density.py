@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
-from worker.evaluate.rivals.density import Density
+from worker.evaluate.rivals.adaptive_density import AdaptiveDensity
 from worker.raster import Camera
 from worker.raster.reference import project
 from worker.train.densify import DensifySettings
@@ -41,7 +41,7 @@ def trained(parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
 CAMERA = Camera(200.0, 180.0, 32.0, 24.0, 64, 48, np.eye(4))
 
 
-def pulled(density: Density, gradient: Tensor, mean: Tensor) -> None:
+def pulled(density: AdaptiveDensity, gradient: Tensor, mean: Tensor) -> None:
     density.observe(gradient, mean.detach(), CAMERA)
 
 
@@ -54,7 +54,7 @@ def test_the_pull_is_the_mean_gradient_of_the_projection_over_the_steps_that_saw
     projected = project(mean, quaternion, log_scale.exp(), torch.sigmoid(opacity_logit[:, 0]), camera)
     weight = torch.tensor([[1.0, 2], [0, 0], [3, -1], [0.5, 0], [0, 1]], dtype=torch.float64)
     gradient, of_mean2d = torch.autograd.grad((projected.mean2d * weight).sum(), [mean, projected.mean2d])
-    density = Density(SETTINGS, torch.optim.Adam([{"params": [each]} for each in parameters]))
+    density = AdaptiveDensity(SETTINGS, torch.optim.Adam([{"params": [each]} for each in parameters]))
     density.observe(gradient, mean.detach(), camera)
     density.observe(3 * gradient, mean.detach(), camera)
     density.observe(0 * gradient, mean.detach(), camera)
@@ -66,7 +66,7 @@ def test_the_pull_is_the_mean_gradient_of_the_projection_over_the_steps_that_saw
 def test_a_transparent_gaussian_goes_and_one_that_is_pulled_becomes_two_smaller_ones() -> None:
     parameters = five()
     optimizer = trained(parameters)
-    density, gradient = Density(SETTINGS, optimizer), torch.zeros(5, 3)
+    density, gradient = AdaptiveDensity(SETTINGS, optimizer), torch.zeros(5, 3)
     gradient[2, 0] = 1.0
     gradient[3, 0] = 1e-6
     pulled(density, gradient, parameters[0])
@@ -95,7 +95,7 @@ def test_children_lie_as_their_parent_s_density_says() -> None:
     parameters = [each.detach()[[0] * 4000] for each in five()]
     parameters[2][:] = torch.log(torch.tensor([0.5, 1e-6, 0.1]))
     parameters = [nn.Parameter(each) for each in parameters]
-    density = Density(DensifySettings(), trained_alike(parameters))
+    density = AdaptiveDensity(DensifySettings(), trained_alike(parameters))
     pulled(density, torch.ones(4000, 3), parameters[0])
     offset = density.split(torch.Generator().manual_seed(0))[0].detach() - torch.tensor([0.0, 0, 50])
     assert len(offset) == 8000
@@ -111,7 +111,7 @@ def trained_alike(parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
 
 def test_there_is_room_for_so_many_and_those_pulled_hardest_have_it() -> None:
     parameters = five()
-    density = Density(DensifySettings(max_count=5), trained(parameters))
+    density = AdaptiveDensity(DensifySettings(max_count=5), trained(parameters))
     pulled(density, torch.tensor([[1.0, 0, 0], [9, 0, 0], [3, 0, 0], [2, 0, 0], [0, 0, 0]]), parameters[0])
     colour = density.split(torch.Generator())[4].detach()[:, 0, 0]
     torch.testing.assert_close(colour, torch.tensor([0.0, 9, 12, 6, 6]))
@@ -121,6 +121,6 @@ def test_nothing_left_is_an_error() -> None:
     parameters = five()
     with torch.no_grad():
         parameters[3].fill_(-9.0)
-    density = Density(SETTINGS, trained(parameters))
+    density = AdaptiveDensity(SETTINGS, trained(parameters))
     with pytest.raises(TrainingDiverged, match="transparent"):
         density.split(torch.Generator())

@@ -20,7 +20,7 @@ PARAMETERS = 6
 quaternion [N, 4], log_scale [N, 3], opacity_logit [N, 1], then two of colours."""
 
 
-class Density:
+class AdaptiveDensity:
     """How hard the loss pulls each projected Gaussian, and what that makes of the Gaussians.
 
     The pull is the mean of |dL/dmean2d| in NDC over the steps that saw the Gaussian since the last split.
