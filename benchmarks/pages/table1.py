@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.pages.markdown import number, origin, table
+from benchmarks.pages.markdown import NONE, number, origin, table
 from worker.evaluate.published import RESULTS, Published
 from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Results
@@ -22,8 +22,9 @@ _INTRODUCTION = """
 
 `make table1` ([table1/runs.csv](table1/runs.csv), [curves.csv](table1/curves.csv)): EndoNeRF, LerPlane and EndoGaussian
 written anew from descriptions of their methods, beside Deform3DGS (`paper`) and `fast`, on the same frames, by the same
-scores and clock ([decision 078](../decisions/078-rivals.md) lists what had to differ and why).
-`d4d-a-320x256` is `d4d-a` at half its size. Hollow marks are published.
+scores and clock. [rivals.md](../rivals.md) lists what had to differ and why,
+[decision 078](../decisions/078-rivals.md#judgement) says what the rows tell of the paper's order. `d4d-a-320x256` is
+`d4d-a` at half its size. Hollow marks are published.
 
 ![Held-out psnr_tissue against seconds of training, for each system](table1/curves.png)
 
@@ -35,16 +36,19 @@ scores and clock ([decision 078](../decisions/078-rivals.md) lists what had to d
 `10°` is the score of a camera turned by 10 degrees, `bound` what colours that do not depend on the viewpoint can
 reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that have moved,
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
-are scored at every 5th pixel of every 5th row, so that their bound differs; their images a second are the median of
-the whole pictures that 30 s hold, without the first five where there are more. EndoNeRF draws its samples about the
-measured depth of the training frames nearest in time, which is exact on phantoms: its depth error is mostly the motion
-between frames. Two of the ten rows of 1800 s of EndoGaussian, those of `d4d-a`, had 240 of 4000 steps without
-motion; the others have 1000, as published.
+are scored at every 5th pixel of every 5th row, so that their bound differs, and they draw nothing beyond the
+depths of the training frames. Images a second are the median of whole pictures, rendered until 30 s have passed; the
+first five do not count, and of five or fewer only the last one counts.
+EndoNeRF draws its samples about the measured depth of the training frames nearest in time, which is exact on phantoms:
+its depth error is mostly the motion between frames. A dash: SSIM needs neighbouring pixels, which a lattice does not
+have; `d4d-a` has no ground truth; nothing moves on `phantom:still`; LerPlane and EndoNeRF do not tell where a point
+goes.
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
-Each column compares a system with the next: images a second after the longest run of each, dB too, but of two rivals
-after the longest limit that both have had. A difference below 0, or a quotient below 1, contradicts the paper's order:
+Each column compares a system with the next, by the paper's own score (`psnr_paper`), after the longest run of each; two
+rivals are compared after the longest limit that both have had. A difference below 0, or a quotient below 1, contradicts
+the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on different machines.
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "ssim": ("SSIM", 3), "iterations": ("steps", 0),
@@ -89,7 +93,7 @@ def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
         in_db = [_longest(here, a, b) for a, b in pairs]
         in_images = [(_last(here, a), _last(here, b)) for a, b in pairs]
         measured.append([*place, *_compared(in_db, in_images)])
-    if all(figure == "–" for row in measured for figure in row[2:]):
+    if all(figure == NONE for row in measured for figure in row[2:]):
         return []
     published = []
     for data in dict.fromkeys(each.data for each in RESULTS):
@@ -116,13 +120,22 @@ def _last(here: Sequence[Group], series: str) -> Group | None:
 def _compared(in_db: Sequence[_Pair], in_images: Sequence[_Pair]) -> list[str]:
     """Differences in dB of pairs, then quotients of images a second; dashes where one of the two is missing."""
     differences = [number(_db(a) - _db(b), 1) for a, b in in_db]
-    return differences + [number(_images_a_second(a) / _images_a_second(b), 1) for a, b in in_images]
+    quotients = [number(_images_a_second(a) / _images_a_second(b), 1) for a, b in in_images]
+    marks = ["" if _machines(a) == _machines(b) else " *" for a, b in in_images]
+    return differences + [each if each == NONE else each + mark for each, mark in zip(quotients, marks, strict=True)]
 
 
 def _db(found: Published | Group | None) -> float:
     if found is None:
         return math.nan
-    return found.psnr_paper_db if isinstance(found, Published) else found.median("psnr_tissue_db")
+    return found.psnr_paper_db if isinstance(found, Published) else found.median("psnr_paper_db")
+
+
+def _machines(found: Published | Group | None) -> set[str]:
+    """Without the day; published figures of one table are of one machine."""
+    if not isinstance(found, Group):
+        return set()
+    return {row["machine"].rpartition(", ")[0] for row in found.rows}
 
 
 def _images_a_second(found: Published | Group | None) -> float:
