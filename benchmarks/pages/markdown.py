@@ -8,14 +8,11 @@ from statistics import median
 
 from worker.evaluate.rows import Row
 
-NONE = "–"
-"""What stands for a figure that is not there."""
-
 
 def number(value: float | None, digits: int) -> str:
     """The value with so many digits; a dash where there is none."""
     if value is None or math.isnan(value):
-        return NONE
+        return "–"
     return f"{round(value, digits) + 0.0:.{digits}f}"  # adding 0.0 turns -0.0 into 0.0
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.pages.markdown import NONE, number, origin, table
+from benchmarks.pages.markdown import number, origin, table
 from worker.evaluate.published import RESULTS, Published
 from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Results
@@ -36,13 +36,13 @@ scores and clock. [rivals.md](../rivals.md) lists what had to differ and why,
 `10°` is the score of a camera turned by 10 degrees, `bound` what colours that do not depend on the viewpoint can
 reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that have moved,
 `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and LerPlane
-are scored at every 5th pixel of every 5th row, so that their bound differs, and they draw nothing beyond the
-depths of the training frames. Images a second are the median of whole pictures, rendered until 30 s have passed; the
-first five do not count, and of five or fewer only the last one counts.
-EndoNeRF draws its samples about the measured depth of the training frames nearest in time, which is exact on phantoms:
-its depth error is mostly the motion between frames. A dash: SSIM needs neighbouring pixels, which a lattice does not
-have; `d4d-a` has no ground truth; nothing moves on `phantom:still`; LerPlane and EndoNeRF do not tell where a point
-goes.
+are scored at every 5th pixel of every 5th row, so that their bound differs, and they draw nothing beyond the depths
+of the training frames. Images a second are the median of whole pictures, rendered until 30 s have passed; the first
+five do not count, and of five or fewer only the last one counts. EndoNeRF draws its samples about the measured depth of
+the training frames nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames.
+A dash: SSIM needs neighbouring pixels, which a lattice does not have; `d4d-a` has no ground truth; nothing moves on
+`phantom:still`; LerPlane and EndoNeRF do not tell where a point goes. EndoNeRF's rows of 1800 s are older than those of
+60 s, and of a version that learnt more slowly ([decision 078](../decisions/078-rivals.md#choices-that-were-measured)).
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
@@ -93,7 +93,7 @@ def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
         in_db = [_longest(here, a, b) for a, b in pairs]
         in_images = [(_last(here, a), _last(here, b)) for a, b in pairs]
         measured.append([*place, *_compared(in_db, in_images)])
-    if all(figure == NONE for row in measured for figure in row[2:]):
+    if all(figure == "–" for row in measured for figure in row[2:]):
         return []
     published = []
     for data in dict.fromkeys(each.data for each in RESULTS):
@@ -120,9 +120,14 @@ def _last(here: Sequence[Group], series: str) -> Group | None:
 def _compared(in_db: Sequence[_Pair], in_images: Sequence[_Pair]) -> list[str]:
     """Differences in dB of pairs, then quotients of images a second; dashes where one of the two is missing."""
     differences = [number(_db(a) - _db(b), 1) for a, b in in_db]
-    quotients = [number(_images_a_second(a) / _images_a_second(b), 1) for a, b in in_images]
-    marks = ["" if _machines(a) == _machines(b) else " *" for a, b in in_images]
-    return differences + [each if each == NONE else each + mark for each, mark in zip(quotients, marks, strict=True)]
+    return differences + [_quotient(a, b) for a, b in in_images]
+
+
+def _quotient(a: Published | Group | None, b: Published | Group | None) -> str:
+    """Of images a second, marked where the two ran on different machines."""
+    found = _images_a_second(a) / _images_a_second(b)
+    mark = "" if math.isnan(found) or _machines(a) == _machines(b) else " *"
+    return number(found, 1) + mark
 
 
 def _db(found: Published | Group | None) -> float:

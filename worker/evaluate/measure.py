@@ -26,7 +26,7 @@ from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
 from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, is_rival_system, options_of, preset_of
 from worker.evaluate.right_eye import right_eye_ranks
-from worker.evaluate.rivals import RIVAL_SYSTEMS, scored_step_px
+from worker.evaluate.rivals import RAY_BY_RAY, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.run import Length, Make, RivalCandidate, every_core, run_rival
 from worker.evaluate.rows import COPIES, KEY, NO_RESULT, SCORES, commit, machine
 from worker.evaluate.sources import OpenClip, Source, open_source
@@ -52,7 +52,12 @@ MAX_TIMING_S = 30.0
 MAX_ERROR_CHARACTERS = 300
 OF_WHOLE_PICTURES = ("ssim", "psnr_clear_db", "psnr_right_clear_db", *COPIES)
 """Figures in which a pixel's neighbours have a part: a lattice of pixels has none."""
-WHY_THINNED = "ssim, clear and the copies need neighbours, and scores are of every {0}th pixel of every {0}th row"
+OPAQUE = ("coverage", "seen_ok")
+"""Figures that would be 1 whatever a method that draws ray by ray has learnt."""
+WHY_OPAQUE = "coverage and seen_ok: the last sample of a ray is opaque"
+WHY_THINNED = (
+    "whole pictures: ssim, clear and the copies need neighbours, and scores are of every {0}th pixel of every {0}th row"
+)
 
 Values = dict[str, object]
 
@@ -170,15 +175,19 @@ class Bench:
         speed = _speed(lambda t: rival.render(t, pose, camera), report)
         values = _reported(report, {**opened.seconds, **report.seconds}) | speed
         values |= {"machine": machine(report.device), "scene_bytes": report.scene_bytes, "bases": None}
-        values |= {"gaussians": rival.gaussians or None, "not_measured": rival.not_measured}
-        values |= {"width": camera.width, "height": camera.height}
+        values |= {"gaussians": rival.gaussians or None, "width": camera.width, "height": camera.height}
+        cannot: list[str] = []
+        why = [rival.not_measured]
+        if cell.series in RAY_BY_RAY:
+            cannot.extend(OPAQUE)
+            why.append(WHY_OPAQUE)
         if step_px > 1:
-            values |= dict.fromkeys(OF_WHOLE_PICTURES)
-            values["not_measured"] = f"{rival.not_measured}; whole pictures: {WHY_THINNED.format(step_px)}"
+            cannot.extend(OF_WHOLE_PICTURES)
+            why.append(WHY_THINNED.format(step_px))
             curve = [{**point, "ssim": None} for point in curve]
         if opened.phantom is not None:
             values |= self._true(cell, opened, RivalCandidate(fitted, clip, step_px), report, step_px)
-        return values | dict.fromkeys(rival.always_one), curve
+        return values | dict.fromkeys(cannot) | {"not_measured": "; ".join(why)}, curve
 
     def _true(self, cell: Cell, opened: OpenClip, candidate: Candidate, report: Report, step_px: int = 1) -> Values:
         """The scores of a phantom's candidate against the truth, on a lattice of pixels."""

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from worker.evaluate.rivals.fields import (
-    NOT_OF_RAYS,
-    OPAQUE,
     SOLID,
     Box,
     Shown,
@@ -77,8 +75,7 @@ class EndoNerfSettings:
 class EndoNerf(Rival):
     """A training EndoNeRF."""
 
-    not_measured = "motion: it maps each moment to the canonical one, not back; " + NOT_OF_RAYS
-    always_one = OPAQUE
+    not_measured = "motion: it maps each moment to the canonical one, not back; confidence: it has none"
     published_steps = 100_000
 
     def __init__(self, seen: Seen, seed: int, settings: EndoNerfSettings | None = None) -> None:

@@ -27,9 +27,6 @@ MARGIN = 0.05
 """Of the box's size, on each side."""
 SOLID = 1e10
 """Length of a ray's last sample: whatever is dense there ends the ray."""
-OPAQUE = ("coverage", "seen_ok")
-NOT_OF_RAYS = "confidence: it has none; coverage and seen_ok: the last sample of a ray is opaque"
-"""What a row does not have of a radiance field, and why; OPAQUE are columns that would be 1 whatever is learnt."""
 OUTLIERS = 0.001
 """Share of the depths beyond each end of the box."""
 RENDERED_SAMPLES = {"cpu": 1 << 16, "gpu": 1 << 20}

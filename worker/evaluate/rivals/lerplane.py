@@ -21,18 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from worker.evaluate.rivals.fields import (
-    NOT_OF_RAYS,
-    OPAQUE,
-    Box,
-    Shown,
-    cumulated,
-    drawn_pixels,
-    picture,
-    pose_tensor,
-    rays,
-    weights_along,
-)
+from worker.evaluate.rivals.fields import Box, Shown, cumulated, drawn_pixels, picture, pose_tensor, rays, weights_along
 from worker.evaluate.rivals.planes import Planes, Smoothness
 from worker.evaluate.rivals.proposals import annealed, drawn_edges, interlevel_loss, lengths, middles
 from worker.evaluate.rivals.rival import Rival, Seen, seeded
@@ -96,8 +85,7 @@ class LerPlaneSettings:
 class LerPlane(Rival):
     """A training LerPlane."""
 
-    not_measured = "motion: it has a field for each moment and no points that move; " + NOT_OF_RAYS
-    always_one = OPAQUE
+    not_measured = "motion: it has a field for each moment and no points that move; confidence: it has none"
     published_steps = 32_000
 
     def __init__(self, seen: Seen, seed: int, settings: LerPlaneSettings | None = None) -> None:

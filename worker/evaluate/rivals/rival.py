@@ -69,14 +69,12 @@ class Rival(ABC):
     """A method in training. All that is random follows from its seed and the iteration.
 
     not_measured     which figures of a row it cannot have, and why
-    always_one       columns of a row that would be 1 whatever it has learnt, and are left empty
     published_steps  iterations of its paper, at which a run ends if its budget does not end it before
     optimizer        has all that is trained; its groups' rates are set before every step
     time_share       of a budget of seconds: how much is used when a step begins; 0 without one
     """
 
     not_measured: ClassVar[str]
-    always_one: ClassVar[tuple[str, ...]] = ()
     published_steps: ClassVar[int]
     optimizer: torch.optim.Optimizer
     seed: int

@@ -17,11 +17,10 @@ from tests.worker.evaluate.rivals.test_endonerf import TINY
 from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, options_of, plan, preset_of
-from worker.evaluate.measure import OF_WHOLE_PICTURES, Bench
+from worker.evaluate.measure import OF_WHOLE_PICTURES, OPAQUE, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.endogaussian import EndoGaussian
 from worker.evaluate.rivals.endonerf import EndoNerf
-from worker.evaluate.rivals.fields import OPAQUE
 from worker.evaluate.rivals.lerplane import LerPlane
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.rivals.run import Length, Make, Renders, run_rival, train_rival
@@ -69,8 +68,9 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
     of_scenes = {"bases", "floats_a_gaussian", "stored_loss_held_out_db"}
     of_moving = {"moving_mm", "moving_error_mm"}  # nothing moves a millimetre in so short a clip
     of_gaussians: set[str] = set() if made[0].gaussians else {"gaussians"}
-    figures = {"motion": ("mo",), "confidence": ("rank_",), "coverage and seen_ok": OPAQUE}
-    figures |= {"whole pictures": OF_WHOLE_PICTURES}
+    figures = {
+        "motion": ("mo",), "confidence": ("rank_",), "coverage and seen_ok": OPAQUE, "whole pictures": OF_WHOLE_PICTURES
+    }  # fmt: skip
     starts = sum((figures[each] for each in not_measured), ())
     cannot = {name for name in RUN_FIELDS if name in TRUTH + OF_WHOLE_PICTURES + OPAQUE and name.startswith(starts)}
     assert empty == {"error", *of_the_right_eye, *of_scenes, *of_moving, *of_gaussians, *cannot}
