@@ -66,7 +66,8 @@ Values = dict[str, object]
 class Bench:
     """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell.
 
-    What is trained on device is judged by renders of the CPU, so that all rows are judged alike.
+    A scene that is trained on device is judged by renders of the CPU, so that all rows are judged alike. A system of
+    others is judged on its device; on a CPU, one that draws ray by ray on fewer pixels (worker/evaluate/thinned.py).
     """
 
     sources: Mapping[str, Source]
@@ -150,8 +151,8 @@ class Bench:
     def _measured_rival(self, cell: Cell, opened: OpenClip, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
         """The same of a system that has no scene."""
         device, timings, options = choose_device(self.device), Timings(), options_of(cell)
-        with timings.measure("open_s"):
-            clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, Timings(), device)
+        timings.seconds.update(opened.seconds)
+        clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, timings, device)
         step_px = scored_step_px(cell.series, device, clip.intrinsics.width)
         on_the_way = _OnTheWay(thinned(clip, step_px))
         fitted = run_rival(
@@ -162,7 +163,7 @@ class Bench:
             Length(cell.iterations, cell.budget_s),
             seed=cell.seed,
             device=device,
-            waited_s=sum(opened.seconds.values()) + timings.seconds["open_s"],
+            waited_s=sum(timings.seconds.values()),
             hooks=dataclasses.replace(hooks, on_held_out=on_the_way.judge),
             step_px=step_px,
         )
@@ -173,7 +174,7 @@ class Bench:
             curve[-1] |= {"ssim": report.ssim, "depth_agreement_mm": report.depth_agreement_mm}
         pose, camera = clip.world_from_camera[0], clip.intrinsics
         speed = _speed(lambda t: rival.render(t, pose, camera), report)
-        values = _reported(report, {**opened.seconds, **report.seconds}) | speed
+        values = _reported(report, {**timings.seconds, **report.seconds}) | speed
         values |= {"machine": machine(report.device), "scene_bytes": report.scene_bytes, "bases": None}
         values |= {"gaussians": rival.gaussians or None, "width": camera.width, "height": camera.height}
         cannot: list[str] = []

@@ -14,7 +14,7 @@ from worker.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, write_r
 
 
 def results(folder: Path) -> Path:
-    """`fast` on two clips, `paper` on one of them, a rival that failed, and a grid of one capacity."""
+    """`fast` on two clips, `paper` on one of them, an ablation that failed, and a grid of one capacity."""
     paper = run_row("paper", 38.0, limit="3000 iterations")
     fast, other = run_row("fast", 39.0), run_row("fast", 30.0, clip="phantom-pull", psnr_view10_db=27.5, moving_mm=4.2)
     (folder / CAPACITY).mkdir(parents=True)

@@ -25,7 +25,7 @@ def test_a_curve_that_falls_again_counts_from_when_it_was_there_first() -> None:
     assert reach([*RISING, (40.0, 2000, 33.0)], 34.0) == pytest.approx((8.0, 400.0))
 
 
-def test_the_headline_compares_medians_over_seeds_at_the_rivals_final_score() -> None:
+def test_the_headline_compares_medians_over_seeds_at_the_papers_final_score() -> None:
     curves = []
     for seed, final_db in enumerate((33.9, 34.0, 35.0)):
         curves += curve_rows(run_row("paper", final_db, seed=seed), [(10.0, 100, 20.0), (240.0, 3000, final_db)])
@@ -47,7 +47,7 @@ def test_each_length_of_ours_is_a_comparison_of_its_own() -> None:
     assert (long.times_in_seconds or 0.0) < 12.0
 
 
-def test_a_rival_that_over_fits_is_also_compared_from_when_it_was_as_good_first() -> None:
+def test_a_paper_run_that_over_fits_is_also_compared_from_when_it_was_as_good_first() -> None:
     curves = curve_rows(run_row("paper", 33.0), [(10.0, 100, 30.0), (40.0, 500, 33.0), (240.0, 3000, 33.0)])
     curves += curve_rows(run_row("paper", 33.0, seed=1), [(10.0, 100, 30.0), (60.0, 500, 34.0), (240.0, 3000, 33.0)])
     (found,) = sooner(curves + curve_rows(run_row("fast", 36.0), [(8.0, 300, 33.0), (60.0, 2800, 36.0)]))
@@ -56,7 +56,7 @@ def test_a_rival_that_over_fits_is_also_compared_from_when_it_was_as_good_first(
     assert found.times_from_their_first == pytest.approx(found.their_first_s / 8.0)
 
 
-def test_the_rivals_longest_runs_are_what_counts_as_its_final_score() -> None:
+def test_the_papers_longest_runs_are_what_counts_as_its_final_score() -> None:
     curves = curve_rows(run_row("paper", 33.0, limit="3000 iterations"), [(240.0, 3000, 33.0)])
     curves += curve_rows(run_row("paper", 25.0, limit="6 s"), [(6.0, 70, 25.0)])
     (found,) = sooner(curves + curve_rows(run_row("fast", 36.0), RISING))
@@ -67,7 +67,7 @@ def test_what_never_gets_there_is_said_not_to() -> None:
     curves = curve_rows(run_row("paper", 39.0), [(240.0, 3000, 39.0)]) + curve_rows(run_row("fast", 36.0), RISING)
     (found,) = sooner(curves)
     assert (found.our_s, found.times_in_seconds, found.times_in_iterations) == (None, None, None)
-    assert sooner(curve_rows(run_row("fast", 36.0), RISING)) == [], "without the rival there is no headline"
+    assert sooner(curve_rows(run_row("fast", 36.0), RISING)) == [], "without the paper there is no headline"
 
 
 def test_a_summary_holds_medians_spread_and_what_failed() -> None:

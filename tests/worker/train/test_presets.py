@@ -44,7 +44,7 @@ def test_a_preset_has_a_length_of_its_own(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "fields"), VARIANTS.items())
-def test_a_rival_differs_from_the_paper_in_what_it_is_named_for_alone(name: str, fields: set[str]) -> None:
+def test_an_ablation_differs_from_the_paper_in_what_it_is_named_for_alone(name: str, fields: set[str]) -> None:
     assert differing(PRESETS[name], PRESETS["paper"]) == fields
 
 

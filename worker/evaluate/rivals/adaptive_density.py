@@ -39,22 +39,22 @@ class AdaptiveDensity:
         """[N]; 0 where no step saw the Gaussian."""
         return self._sum / self._seen.clamp(min=1)
 
-    def watch(self, moved: Tensor, camera: Camera) -> None:
-        """Observe the gradient by Gaussians [N, 3 or more], places first, that the camera sees, once it is there."""
-        places = moved.detach()[:, :3]
+    def watch(self, deformed: Tensor, camera: Camera) -> None:
+        """Observe the gradient by deformed [N, 3 or more], means in units first, in the next backward pass."""
+        places = deformed.detach()[:, :3]
 
         def observe(gradient: Tensor) -> None:
             self.observe(gradient[:, :3], places, camera)
 
-        if moved.requires_grad:
-            moved.register_hook(observe)  # type: ignore[no-untyped-call]
+        if deformed.requires_grad:
+            deformed.register_hook(observe)  # type: ignore[no-untyped-call]
 
     @torch.no_grad()
     def observe(self, gradient: Tensor, places: Tensor, camera: Camera) -> None:
         """Add a step's gradient [N, 3] by places [N, 3] (units, world), which the camera saw.
 
-        The gradient by a projected place is taken as that by the place, across the viewing axis, times z / f. It thus
-        has what a place does through its projected shape and its colour, too.
+        The gradient by a projected place is taken as that by the place, across the viewing axis, times z / f. So it
+        also contains what reaches the place through the projected covariance and the view-dependent colour.
         """
         pose = camera.pose(places)
         across = (gradient @ pose[:3, :3].T)[:, :2]

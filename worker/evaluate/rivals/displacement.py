@@ -1,6 +1,6 @@
 """The planes and small networks by which `endogaussian` moves its Gaussians.
 
-Symbols: N Gaussians. What moves has MOVING columns: MEAN, QUATERNION, LOG_SCALE, OPACITY.
+Symbols: N Gaussians. A deformed Gaussian has DEFORMED columns: MEAN, QUATERNION, LOG_SCALE, OPACITY.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from worker.evaluate.rivals.planes import Planes
 MEAN, QUATERNION, LOG_SCALE, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), 10
 WIDTHS = (3, 4, 3, 1)
 """Of these columns; each has a decoder of its own."""
-MOVING = sum(WIDTHS)
+DEFORMED = sum(WIDTHS)
 
 
 class Displacement(nn.Module):
-    """By how much Gaussians at places [N, 3] have changed at a time: [N, MOVING], nothing at the start.
+    """By how much Gaussians at places [N, 3] have changed at a time: [N, DEFORMED], nothing at the start.
 
     low, high [3]: the box of the places at the start, which is [-1, 1]^3 of the planes
     """

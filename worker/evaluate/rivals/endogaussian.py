@@ -41,7 +41,7 @@ PUBLISHED_WIDTH = 640
 
 @dataclass(frozen=True)
 class EndoGaussianSettings:
-    """Published values; where none is given, those of 3D and 4D Gaussian splatting. cells, features, hidden,
+    """Published values; where none is given, those of 3D and 4D Gaussian splatting. features, time_cells, hidden,
     static_share, splits_until and smoothness are ours (docs/rivals.md).
 
     start_share, start_most  share of each frame's measured pixels that become Gaussians, and how many they are at most
@@ -53,7 +53,7 @@ class EndoGaussianSettings:
     static_share    of a shorter training's time or steps; a step without motion takes less time than a later one
     densify         when and what to split and drop
     splits_until    share of the training after which nothing is split or dropped
-    *_rate          of Adam; a pair falls exponentially from the last step without motion on
+    *_rate          of Adam; a pair is (first, last): constant while nothing moves, then it falls exponentially
     tv_weight       of the total variation of rendered colour and depth, in pictures as wide as those published
     smoothness      weights of how smooth the planes are
     """
@@ -95,12 +95,12 @@ class EndoGaussian(Rival):
         poses = seen.world_from_camera.double().cpu().numpy()
         self._cameras = [camera_in_units(seen.intrinsics, pose, self._scale) for pose in poses]
         start = starting_gaussians(seen, self._scale, self.settings, self.generator(0))
-        moves = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
+        deformable = [start.mean, start.quaternion, start.log_scale, start.opacity_logit[:, None]]
         # copies, not views of one tensor: torch's fused Adam updates the wrong numbers of a view
         of_gaussians = [
-            nn.Parameter(each.to(seen.rgb).contiguous()) for each in (*moves, start.sh[:, :1], start.sh[:, 1:])
+            nn.Parameter(each.to(seen.rgb).contiguous()) for each in (*deformable, start.sh[:, :1], start.sh[:, 1:])
         ]
-        *self._moves, self._colour, self._harmonics = of_gaussians
+        *self._deformable, self._colour, self._harmonics = of_gaussians
         chosen, time_cells = self.settings, max(2, min(self.settings.time_cells, len(seen)))
         with seeded(seed):
             self.field = Displacement(chosen.cells, time_cells, chosen.features, chosen.hidden, start.mean)
@@ -117,9 +117,9 @@ class EndoGaussian(Rival):
 
     def rates(self, progress: float) -> Sequence[float]:
         chosen = self.settings
-        moved = (progress - self._static_until) / (1 - self._static_until)
+        share_since_static = (progress - self._static_until) / (1 - self._static_until)
         pairs = (chosen.mean_rate, chosen.decoder_rate, chosen.plane_rate)
-        of_mean, *of_field = (decayed(each, moved) for each in pairs)
+        of_mean, *of_field = (decayed(each, share_since_static) for each in pairs)
         of_shapes = [chosen.quaternion_rate, chosen.log_scale_rate, chosen.opacity_rate]
         return [of_mean, *of_shapes, chosen.colour_rate, chosen.harmonics_rate, *of_field]
 
@@ -131,7 +131,7 @@ class EndoGaussian(Rival):
         with torch_threads(1) if static else nullcontext():
             loss = super().step(iteration, progress)
         if progress < self.settings.splits_until and self.settings.densify.due(iteration):
-            *self._moves, self._colour, self._harmonics = self._adaptive_density.split(self.generator(iteration))
+            *self._deformable, self._colour, self._harmonics = self._adaptive_density.split(self.generator(iteration))
         return loss
 
     def loss(self, iteration: int, progress: float) -> Tensor:
@@ -142,9 +142,9 @@ class EndoGaussian(Rival):
             drawn = torch.randint(len(self._with_tissue), (), generator=self.generator(iteration))
             frame = self._with_tissue[int(drawn)]
         degree = min(self.settings.sh_degree, int((self.settings.sh_degree + 1) * progress))
-        moved = torch.cat([*self._moves], 1) if static else self._moved(float(seen.t[frame]))
-        self._adaptive_density.watch(moved, self._cameras[frame])
-        shown = self._shown(moved, self._cameras[frame], degree)
+        deformed = torch.cat([*self._deformable], 1) if static else self._deformed(float(seen.t[frame]))
+        self._adaptive_density.watch(deformed, self._cameras[frame])
+        shown = self._shown(deformed, self._cameras[frame], degree)
         depth = seen.depth_mm[frame] * self._scale
         true = seen.rgb[frame], depth, seen.tissue[frame]
         loss = training_loss(shown.rgb, shown.depth, shown.alpha, *true, PUBLISHED_LOSS).total
@@ -156,7 +156,7 @@ class EndoGaussian(Rival):
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
         camera = camera_in_units(intrinsics, world_from_camera, self._scale)
-        shown = self._shown(self._moved(t), camera, self.settings.sh_degree)
+        shown = self._shown(self._deformed(t), camera, self.settings.sh_degree)
         rgb, depth, alpha = (each.float().cpu().numpy() for each in (shown.rgb, shown.depth, shown.alpha))
         return RenderedFrame(rgb, solid_depth_mm(depth, alpha, self._scale), alpha)
 
@@ -165,8 +165,8 @@ class EndoGaussian(Rival):
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
     ) -> NDArray[np.float32]:
         """The displacements of the Gaussians that a pixel is blended of, blended with the same weights."""
-        first, moved = self._moved(0.0), self._moved(t)
-        distance_mm = (moved[:, MEAN] - first[:, MEAN]) / self._scale
+        first, deformed = self._deformed(0.0), self._deformed(t)
+        distance_mm = (deformed[:, MEAN] - first[:, MEAN]) / self._scale
         camera = camera_in_units(intrinsics, world_from_camera, self._scale)
         shown = _rasterized(first, distance_mm, camera)
         alpha = shown.alpha[..., None]
@@ -174,29 +174,29 @@ class EndoGaussian(Rival):
         return motion.float().cpu().numpy()
 
     def _is_static(self, iteration: int, progress: float) -> bool:
-        """Whether a step is without motion. progress > iteration / published_steps means that the training ends before
-        the published steps do; then static_share counts."""
-        share = self.settings.static_share
-        in_time = self.time_share < share and progress < max(share, iteration / self.published_steps)
+        """Whether a step is without motion. More progress than steps made of those published means that the training
+        ends before these do; then static_share counts."""
+        share, made = self.settings.static_share, iteration - 1
+        in_time = self.time_share < share and (progress < share or progress <= made / self.published_steps)
         return in_time and iteration <= self.settings.static_steps
 
-    def _moved(self, t: float) -> Tensor:
-        """What moves, at time t: [N, MOVING].
+    def _deformed(self, t: float) -> Tensor:
+        """Deformed Gaussians at time t: [N, DEFORMED].
 
         Raises:
             TrainingDiverged: a place is not finite. Torch would look it up outside the planes' memory and crash.
         """
-        mean = self._moves[0]
+        mean = self._deformable[0]
         if not bool(torch.isfinite(mean).all()):
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
         changed: Tensor = self.field(mean, t)
-        return torch.cat([*self._moves], 1) + changed
+        return torch.cat([*self._deformable], 1) + changed
 
-    def _shown(self, moved: Tensor, camera: Camera, degree: int) -> Rendered:
-        """The picture of Gaussians [N, MOVING], with harmonics up to the degree."""
+    def _shown(self, deformed: Tensor, camera: Camera, degree: int) -> Rendered:
+        """The picture of Gaussians [N, DEFORMED], with harmonics up to the degree."""
         sh = torch.cat([self._colour, self._harmonics[:, : (degree + 1) ** 2 - 1]], 1)
-        direction = nn.functional.normalize(moved[:, MEAN] - camera.centre(moved), dim=-1)
-        return _rasterized(moved, sh_colour(sh, direction), camera)
+        direction = nn.functional.normalize(deformed[:, MEAN] - camera.centre(deformed), dim=-1)
+        return _rasterized(deformed, sh_colour(sh, direction), camera)
 
 
 def starting_gaussians(
@@ -218,13 +218,13 @@ def starting_gaussians(
     return initial_gaussians(place, rgb, sh_degree=settings.sh_degree, opacity=settings.opacity)
 
 
-def _rasterized(moved: Tensor, colour: Tensor, camera: Camera) -> Rendered:
-    """Gaussians [N, MOVING] of colours [N, 3], by the rasteriser of their device; that of float64 is the reference."""
-    if moved.is_cuda:
+def _rasterized(deformed: Tensor, colour: Tensor, camera: Camera) -> Rendered:
+    """Gaussians [N, DEFORMED] of colours [N, 3], by their device's rasteriser; float64 by the reference."""
+    if deformed.is_cuda:
         from worker.raster.cuda import rasterize
-    elif moved.dtype == torch.float64:
+    elif deformed.dtype == torch.float64:
         from worker.raster.reference import rasterize
     else:
         from worker.raster.cpu import rasterize
-    opacity = torch.sigmoid(moved[:, OPACITY])
-    return rasterize(moved[:, MEAN], moved[:, QUATERNION], moved[:, LOG_SCALE].exp(), opacity, colour, camera)
+    opacity = torch.sigmoid(deformed[:, OPACITY])
+    return rasterize(deformed[:, MEAN], deformed[:, QUATERNION], deformed[:, LOG_SCALE].exp(), opacity, colour, camera)

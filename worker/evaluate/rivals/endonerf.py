@@ -43,7 +43,7 @@ CPU_RAYS = 128
 
 @dataclass(frozen=True)
 class EndoNerfSettings:
-    """As published where docs/rivals.md does not mark it as ours: spread, last_rate, and the unit s.
+    """Published values, except that spread, last_rate and the unit s are ours (docs/rivals.md).
 
     spread         standard deviation of the samples about the depth, in s
     space_octaves, time_octaves, view_octaves  of the positional encodings
@@ -83,12 +83,12 @@ class EndoNerf(Rival):
         self._seen, self._box = seen, Box.of(seen)
         hidden = (~seen.tissue).sum(0).to(seen.rgb)
         self._importance = 1 + hidden / hidden.norm().clamp(min=1e-9)
-        self._s = self._box.s_of(seen.depth_mm.clamp(min=1e-3))
+        self._guide_share = self._box.share_of(seen.depth_mm.clamp(min=1e-3))
         self._has_depth = seen.depth_mm > 0
         self._refinable = int(self.settings.refined_share * self._has_depth.sum())
         self._with_tissue = seen.with_tissue
         with seeded(seed):
-            self.field = _Field(self.settings).to(seen.rgb)
+            self.field = _CanonicalField(self.settings).to(seen.rgb)
         self.optimizer = torch.optim.Adam(self.field.parameters(), fused=True)
 
     def rates(self, progress: float) -> Sequence[float]:
@@ -103,27 +103,28 @@ class EndoNerf(Rival):
         row, column = drawn // width, drawn % width
         origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
         known = self._has_depth[frame, row, column]
-        about, evenly = self._s[frame, row, column], torch.rand(len(row), self.settings.samples, generator=random)
-        noise = torch.randn(evenly.shape, generator=random).to(about)
-        guided = (about[:, None] + self.settings.spread * noise).clamp(0, 1)
-        s = torch.where(known[:, None], guided, evenly.to(about)).sort(-1).values
-        rgb, depth_s, _ = self._shown(origin, direction, s, float(seen.t[frame]))
+        guide_share = self._guide_share[frame, row, column]
+        evenly = torch.rand(len(row), self.settings.samples, generator=random)
+        noise = torch.randn(evenly.shape, generator=random).to(guide_share)
+        guided = (guide_share[:, None] + self.settings.spread * noise).clamp(0, 1)
+        s = torch.where(known[:, None], guided, evenly.to(guide_share)).sort(-1).values
+        rgb, depth_share, _ = self._shown(origin, direction, s, float(seen.t[frame]))
         colour = (rgb - seen.rgb[frame, row, column]).square().mean()
-        error = torch.where(known, (depth_s - about).abs(), 0.0)
+        error = torch.where(known, (depth_share - guide_share).abs(), 0.0)
         if progress >= self.settings.refined_from and self._refinable:
-            self._refine(frame, row, column, depth_s.detach(), error.detach())
+            self._refine(frame, row, column, depth_share.detach(), error.detach())
         return colour + self.settings.depth_weight * error.sum() / known.sum().clamp(min=1)
 
     @torch.no_grad()
     def render(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
         """As worker/evaluate/rivals/rival.py says. Samples lie about the depth of the frames nearest in time."""
         pose = pose_tensor(world_from_camera, self._seen.rgb)
-        about = self._box.s_of(self._guide_mm(t, pose, intrinsics)).flatten()
-        quantiles = (torch.arange(self.settings.samples).to(about) + 0.5) / self.settings.samples
+        guide_share = self._box.share_of(self._guide_mm(t, pose, intrinsics)).flatten()
+        quantiles = (torch.arange(self.settings.samples).to(guide_share) + 0.5) / self.settings.samples
         offsets = self.settings.spread * math.sqrt(2) * torch.erfinv(2 * quantiles - 1)
 
         def show(part: slice, origin: Tensor, direction: Tensor) -> Shown:
-            return self._shown(origin, direction, (about[part, None] + offsets).clamp(0, 1), t)
+            return self._shown(origin, direction, (guide_share[part, None] + offsets).clamp(0, 1), t)
 
         return picture(self._box, intrinsics, pose, show, self.settings.samples)
 
@@ -136,11 +137,11 @@ class EndoNerf(Rival):
         weight = weights_along(density.reshape(s.shape), length / self.settings.spread)
         return (weight[..., None] * rgb.reshape(*s.shape, 3)).sum(1), (weight * s).sum(1), weight.sum(1)
 
-    def _refine(self, frame: int, row: Tensor, column: Tensor, depth_s: Tensor, error: Tensor) -> None:
+    def _refine(self, frame: int, row: Tensor, column: Tensor, depth_share: Tensor, error: Tensor) -> None:
         """Replace depth by the field's at the share of these rays that differ most, until _refinable is used up."""
         worst = torch.nonzero(error > torch.quantile(error, 1 - self.settings.refined_share))[: self._refinable, 0]
         self._refinable -= len(worst)
-        self._s[frame, row[worst], column[worst]] = depth_s[worst].clamp(0, 1)
+        self._guide_share[frame, row[worst], column[worst]] = depth_share[worst].clamp(0, 1)
 
     def _guide_mm(self, t: float, pose: Tensor, camera: Intrinsics) -> Tensor:
         """[H, W] depth of the training frames nearest in time, seen from the pose; gaps take a neighbour's. A camera
@@ -154,7 +155,7 @@ class EndoNerf(Rival):
         for frame in order[:GUIDES]:
             row, column = torch.nonzero(self._has_depth[frame], as_tuple=True)
             origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
-            depth_mm = self._box.depth_mm(self._s[frame, row, column])
+            depth_mm = self._box.depth_mm(self._guide_share[frame, row, column])
             points_mm = (origin + depth_mm[:, None] * direction).double()
             x, y, z = (points_mm @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).cpu().numpy().T
             ahead = z > 1.0
@@ -184,7 +185,7 @@ class _Trunk(nn.Module):
         return value
 
 
-class _Field(nn.Module):
+class _CanonicalField(nn.Module):
     """Places [M, 3] at a time, seen along view [M, 3]: densities [M], colours [M, 3]."""
 
     def __init__(self, settings: EndoNerfSettings) -> None:

@@ -4,8 +4,8 @@ Symbols: M points or rays, S samples a ray.
 
 A place in the box is [-1, 1]^3: x / z, y / z and 1 / z of the first camera, each from its least to its greatest.
 Pixels of an endoscope at rest are columns of it, as in the normalised device coordinates of the papers. A place on a
-ray is s in [0, 1], even in 1 / z of the ray's own camera, from the nearest depth of the training frames to the
-farthest.
+ray is its share s in [0, 1] of the ray, even in 1 / z of the ray's own camera: from the nearest depth of the training
+frames to the farthest, without the outermost 0.1 % at either end and with 5 % of that range beyond it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Box:
 
     @classmethod
     def of(cls, seen: Seen) -> Box:
-        """The box of everything measured in the training frames."""
+        """The box of what is measured in the training frames, without OUTLIERS in depth, with a MARGIN."""
         frame, row, column = torch.nonzero(seen.depth_mm > 0, as_tuple=True)
         some = torch.arange(0, len(frame), 1 + len(frame) // MAX_SAMPLED, device=frame.device)
         frame, row, column = frame[some], row[some], column[some]
@@ -70,7 +70,7 @@ class Box:
         """Camera z at s."""
         return 1 / (1 / self.near_mm + s * (1 / self.far_mm - 1 / self.near_mm))
 
-    def s_of(self, depth_mm: Tensor) -> Tensor:
+    def share_of(self, depth_mm: Tensor) -> Tensor:
         """s in [0, 1] of a camera z."""
         return ((1 / depth_mm - 1 / self.near_mm) / (1 / self.far_mm - 1 / self.near_mm)).clamp(0, 1)
 
@@ -129,8 +129,8 @@ def picture(
     parts = []
     for first in range(0, len(pixel), at_a_time):
         part = slice(first, first + at_a_time)
-        rgb, depth_s, alpha = show(part, origin[part], direction[part])
-        depth_mm = box.depth_mm(depth_s / alpha.clamp(min=1e-6)) * alpha
+        rgb, depth_share, alpha = show(part, origin[part], direction[part])
+        depth_mm = box.depth_mm(depth_share / alpha.clamp(min=1e-6)) * alpha
         parts.append(torch.cat([rgb, depth_mm[:, None], alpha[:, None]], 1))
     image = torch.cat(parts).float().cpu().numpy().reshape(camera.height, camera.width, 5)
     return RenderedFrame(image[..., :3], solid_depth_mm(image[..., 3], image[..., 4], 1.0), image[..., 4])

@@ -41,8 +41,8 @@ CPU_RAYS = 512
 
 @dataclass(frozen=True)
 class LerPlaneSettings:
-    """As published, or as the authors' BSD-licensed configuration says; warm_up, sharpened_by, least, most,
-    WINDOW and HUBER_DELTA are ours.
+    """As published, or as the authors' BSD-licensed configuration says. warm_up, sharpened_by, least, most, WINDOW and
+    HUBER_DELTA are ours; so is what the weights of smoothness are multiplied by (docs/rivals.md).
 
     cells, features     of the planes, by resolution; time_cells is their most cells of time
     proposal_samples    intervals that each proposal network looks at, one network a round
@@ -94,7 +94,7 @@ class LerPlane(Rival):
         self._cumulated = cumulated(importance(seen, self.settings.least, self.settings.most))
         with seeded(seed):
             time_cells = max(2, min(self.settings.time_cells, len(seen)))
-            self.field = _Field(self.settings, time_cells).to(seen.rgb)
+            self.field = _PlaneField(self.settings, time_cells).to(seen.rgb)
             rounds = self.settings.proposal_samples
             self.proposals = [_Proposal(self.settings, time_cells).to(seen.rgb) for _ in rounds]
         every = [each for net in (self.field, *self.proposals) for each in net.parameters()]
@@ -116,11 +116,11 @@ class LerPlane(Rival):
         sharpness = annealed(progress / chosen.sharpened_by)
         (rgb, _, _), rounds = self._shown(origin, direction, seen.t[frame], sharpness, random)
         depth_mm = seen.depth_mm[frame, row, column]
-        known, about = depth_mm > 0, self._box.s_of(depth_mm.clamp(min=1e-3))
+        known, true_share = depth_mm > 0, self._box.share_of(depth_mm.clamp(min=1e-3))
         loss = (rgb - seen.rgb[frame, row, column]).square().mean()
         depth_weights = [chosen.proposal_depth_weight] * len(self.proposals) + [chosen.depth_weight]
         for (edges, weight), of_depth in zip(rounds, depth_weights, strict=True):
-            error = huber_loss((weight * middles(edges)).sum(1), about, reduction="none", delta=HUBER_DELTA)
+            error = huber_loss((weight * middles(edges)).sum(1), true_share, reduction="none", delta=HUBER_DELTA)
             loss = loss + of_depth * torch.where(known, error, 0.0).sum() / known.sum().clamp(min=1)
         *proposed, (edges, weight) = rounds
         for each in proposed:
@@ -201,7 +201,7 @@ class _Proposal(nn.Module):
         return _density(self.decode(self.planes(place, t))[:, 0])
 
 
-class _Field(nn.Module):
+class _PlaneField(nn.Module):
     """Densities [M] and colours [M, 3] at places [M, 3] and times [M]."""
 
     def __init__(self, settings: LerPlaneSettings, time_cells: int) -> None:

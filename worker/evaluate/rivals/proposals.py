@@ -12,7 +12,7 @@ from torch import Tensor
 from worker.evaluate.rivals.fields import SOLID
 
 PADDING = 0.01
-"""Weight that each interval has besides its own when the next samples are placed, as where the proposals come from."""
+"""Weight that each interval has besides its own when the next samples are placed, as in Nerfacto."""
 
 
 def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generator | None) -> Tensor:

@@ -120,8 +120,8 @@ class Rival(ABC):
         return [each for group in self.optimizer.param_groups for each in group["params"]]
 
     @property
-    def numbers(self) -> int:
-        """How many numbers are trained; the size of a model on disk is four bytes each."""
+    def parameter_count(self) -> int:
+        """How many numbers are trained."""
         return sum(each.numel() for each in self.parameters())
 
     def generator(self, iteration: int) -> torch.Generator:

@@ -219,7 +219,7 @@ def _training(name: str, rival: Rival, made: int, seed: int, device: Device, sec
         frames_seen=0,
         gaussians=rival.gaussians,
         bases=0,
-        scene_bytes=4 * rival.numbers,
+        scene_bytes=4 * rival.parameter_count,  # float32
         units_per_mm=1.0,
         seconds=dict(seconds),
         versions={"python": platform.python_version(), "torch": version("torch")},

@@ -1,4 +1,4 @@
-"""`pfs`: polynomial plus Fourier series, the rival without local bases (Deform3DGS's ablation; Gaussian-Flow's form).
+"""`pfs`: polynomial plus Fourier series, without local bases (an ablation of Deform3DGS; the form of Gaussian-Flow).
 
 Symbols: N Gaussians, C = 10 channels, B weights per channel, P of them polynomial, 2 H of H harmonics.
 """

@@ -24,6 +24,21 @@ def small_clip(frames: int) -> DepthClip:
     return phantom_clip("breathing", frames=frames, width=64, height=48, noise=False)
 
 
+def plain() -> Seen:
+    """Two frames of colour 0.5, all of them tissue 50 mm away, of which every other column is measured: each pixel that
+    has a depth has the same loss."""
+    depth_mm = torch.full((2, 48, 64), 50.0)
+    depth_mm[..., ::2] = 0
+    return Seen(
+        rgb=torch.full((2, 48, 64, 3), 0.5),
+        tissue=torch.ones(2, 48, 64, dtype=torch.bool),
+        depth_mm=depth_mm,
+        t=torch.tensor([0.0, 1.0]),
+        world_from_camera=torch.eye(4).expand(2, 4, 4),
+        intrinsics=small_clip(2).intrinsics,
+    )
+
+
 def fitted(make: Make, clip: DepthClip, train: Sequence[int], iterations: int, seed: int = 0) -> Rival:
     """A rival after so many iterations on these frames."""
     rival = make(Seen.of(clip, train), seed)

@@ -63,6 +63,18 @@ def test_the_pull_is_the_mean_gradient_of_the_projection_over_the_steps_that_saw
     assert density.pull[1] == 0
 
 
+def test_it_watches_the_gradient_by_what_the_camera_sees() -> None:
+    deformed = torch.cat([each.detach() for each in five()[:4]], 1).requires_grad_()
+    optimizer = trained(five())
+    watching, told = AdaptiveDensity(SETTINGS, optimizer), AdaptiveDensity(SETTINGS, optimizer)
+    watching.watch(deformed, CAMERA)
+    weight = torch.arange(55.0).reshape(5, 11).sin()
+    (deformed * weight).sum().backward()  # type: ignore[no-untyped-call]
+    told.observe(weight[:, :3], deformed.detach()[:, :3], CAMERA)
+    torch.testing.assert_close(watching.pull, told.pull)
+    assert bool((told.pull > 0).all())
+
+
 def test_a_transparent_gaussian_goes_and_one_that_is_pulled_becomes_two_smaller_ones() -> None:
     parameters = five()
     optimizer = trained(parameters)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
 from tests.worker.evaluate.rivals.cases import (
@@ -13,10 +14,13 @@ from tests.worker.evaluate.rivals.cases import (
     check_overfit,
     check_step,
     check_what_counts,
+    plain,
     small_clip,
 )
 from worker.evaluate.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
+from worker.evaluate.rivals.planes import Smoothness
 from worker.evaluate.rivals.rival import Seen
+from worker.raster import Rendered
 from worker.train.densify import DensifySettings
 
 SMALL = EndoGaussianSettings(
@@ -44,6 +48,22 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     check_gradient(rival, rival.parameters(), step=1e-7, progress=0.9)
 
 
+def test_its_loss_is_the_sum_of_its_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = plain()
+    smoothness = Smoothness(space=1.0, time=0.0, time_l1=0.0, acceleration=0.0)
+    rival = EndoGaussian(seen, 0, dataclasses.replace(SMALL, tv_weight=1e4, smoothness=smoothness))
+    columns, rows = torch.linspace(0.5, 0.8, 64), torch.linspace(30, 31, 48)
+    rgb, depth = columns[None, :, None].expand(48, 64, 3), rows[:, None].expand(48, 64)
+    monkeypatch.setattr(rival, "_shown", lambda *_: Rendered(rgb, depth, torch.full((48, 64), 0.9)))
+    colour, inverse_depth = 0.15, float((1 / rows - 1 / 60).mean())  # the median depth is 60 units
+    variation = 1e4 * (64 / 640) ** 2 * ((0.3 / 63) ** 2 + (1 / 47) ** 2)
+    rough = float(rival.field.planes.roughness(smoothness).detach())
+    assert rough > 0.01
+    still, moving = (float(rival.loss(1, progress).detach()) for progress in (0.1, 0.9))
+    np.testing.assert_allclose(still, colour + inverse_depth + variation, rtol=1e-5)
+    np.testing.assert_allclose(moving, colour + inverse_depth + variation + rough, rtol=1e-5)
+
+
 def test_it_overfits_one_frame_above_30_db() -> None:
     check_overfit(small, 300)
 
@@ -62,7 +82,7 @@ def test_gaussians_start_at_the_measured_tissue_of_all_frames_up_to_a_limit() ->
     measured = (seen.depth_mm > 0).sum((1, 2)).tolist()
     assert EndoGaussian(seen, 0, TINY).gaussians == sum(round(0.01 * each) for each in measured)
     few = EndoGaussianSettings(start_share=0.5, start_most=200, cells=(3,), features=2)
-    mean = EndoGaussian(seen, 0, few)._moves[0]
+    mean = EndoGaussian(seen, 0, few)._deformable[0]
     assert len(mean) == 200
     camera, median_mm = clip.intrinsics, float(np.median(seen.depth_mm[seen.depth_mm > 0]))
     x, y, z_mm = (mean.detach() * median_mm / 60).numpy().T
@@ -103,6 +123,10 @@ def test_nothing_moves_for_the_published_steps_where_steps_end_the_training_and_
     assert moves(1001, 1000 / 4000)
     np.testing.assert_allclose(rival.rates(1.0)[0], SMALL.mean_rate[1])
     assert moves(1000, 0.26), "of fewer steps the share"
+    rival.settings = dataclasses.replace(SMALL, static_share=0.06)
+    assert not moves(300, 299 / 4000)
+    assert moves(300, 299 / 3999), "even of one fewer"
+    rival.settings = SMALL
     rival.time_share = 0.24
     assert not moves(300, 0.24)
     rival.time_share = 0.25
@@ -139,7 +163,7 @@ def test_its_motion_is_the_displacement_of_the_gaussians_that_a_pixel_shows() ->
         of_place[0].weight.fill_(1.0 / rival.field.planes.size)
         of_place[0].bias.zero_()
         of_place[-1].weight[0] = 2.0 / len(of_place[0].bias)
-        rival._moves[3].fill_(5.0)  # nearly opaque
+        rival._deformable[3].fill_(5.0)  # nearly opaque
     pose, camera = clip.world_from_camera[0], clip.intrinsics
     moved_mm = rival.motion_mm(0.5, pose, camera)
     covered = np.isfinite(moved_mm[..., 0])

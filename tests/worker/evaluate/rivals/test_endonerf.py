@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pytest
 import torch
+from torch import Tensor
 
 from tests.worker.evaluate.rivals.cases import (
     check_gradient,
@@ -11,9 +15,12 @@ from tests.worker.evaluate.rivals.cases import (
     check_overfit,
     check_what_counts,
     fitted,
+    plain,
     small_clip,
 )
+from worker.evaluate.rivals import endonerf
 from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings, _encoded
+from worker.evaluate.rivals.fields import drawn_pixels
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = EndoNerfSettings(
@@ -34,6 +41,19 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     with torch.no_grad():  # at 0 the network before it has no part in the loss
         rival.field.displacement.weight.normal_(generator=torch.Generator().manual_seed(0)).div_(10)
     check_gradient(rival, rival.parameters())
+
+
+def test_its_loss_is_the_squared_colour_error_and_the_absolute_depth_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = plain()
+    rival = EndoNerf(seen, 0, dataclasses.replace(SMALL, depth_weight=0.3))
+    true_share = rival._box.share_of(seen.depth_mm.max())
+
+    def shown(origin: Tensor, *_: object) -> tuple[Tensor, Tensor, Tensor]:
+        one = torch.ones_like(origin[:, 0])
+        return 0.7 * torch.ones_like(origin), (true_share - 0.2) * one, one
+
+    monkeypatch.setattr(rival, "_shown", shown)
+    np.testing.assert_allclose(float(rival.loss(1, 0.0).detach()), 0.2**2 + 0.3 * 0.2, rtol=1e-5)
 
 
 def test_its_network_and_its_rates_are_those_published() -> None:
@@ -82,24 +102,38 @@ def test_its_network_displaces_places_by_their_time() -> None:
     assert float((early - late).abs().max()) > 1e-3
 
 
-def test_rays_are_drawn_more_often_where_instruments_hide_the_tissue_more_often() -> None:
+def test_rays_are_drawn_more_often_where_instruments_hide_the_tissue_more_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     clip = small_clip(9)
-    rival = small(Seen.of(clip, range(9)), 0)
+    seen = Seen.of(clip, range(9))
+    rival = small(seen, 0)
     often = (~clip.tissue).sum(0)
     importance = rival._importance.numpy()
     assert importance[often > 0].min() > importance[often == 0].max() == 1
+    totals: list[Tensor] = []
+
+    def drawn(total: Tensor, count: int, random: torch.Generator) -> Tensor:
+        totals.append(total)
+        return drawn_pixels(total, count, random)
+
+    monkeypatch.setattr(endonerf, "drawn_pixels", drawn)
+    rival.loss(1, 0.0)
+    weight = totals[0].diff(prepend=torch.zeros(1)).reshape(48, 64)
+    of_frames = [torch.allclose(weight, (rival._importance * tissue).double()) for tissue in seen.tissue]
+    assert sum(of_frames) == 1, "those of one frame, where it shows tissue"
 
 
 def test_depth_that_the_field_contradicts_gives_way_late() -> None:
     clip = small_clip(2)
     rival = small(Seen.of(clip, [1]), 0)
-    before = rival._s.clone()
+    before = rival._guide_share.clone()
     rival.loss(1, 0.0)
-    assert torch.equal(rival._s, before)
+    assert torch.equal(rival._guide_share, before)
     rival.loss(1, 0.5)
-    changed = int((rival._s != before).sum())
+    changed = int((rival._guide_share != before).sum())
     assert 0 < changed <= 6, "a hundredth of 512 rays"
     for iteration in range(2, 40):
         rival.loss(iteration, 0.5)
     most = int(0.01 * rival._has_depth.sum())
-    assert 0 < most // 2 < int((rival._s != before).sum()) <= most, "and of all pixels"
+    assert 0 < most // 2 < int((rival._guide_share != before).sum()) <= most, "and of all pixels"

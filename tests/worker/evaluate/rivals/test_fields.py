@@ -32,9 +32,14 @@ def test_the_box_holds_what_is_measured_and_s_is_even_in_inverse_depth() -> None
     frame, row, column = torch.nonzero(seen.depth_mm > 0, as_tuple=True)
     depth_mm = seen.depth_mm[frame, row, column]
     origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[frame])
-    inside = box.place(origin + depth_mm[:, None] * direction).abs() <= 1
-    assert float(inside.all(1).double().mean()) > 0.99
-    torch.testing.assert_close(box.depth_mm(box.s_of(depth_mm)), depth_mm, rtol=1e-6, atol=1e-6)
+    place = box.place(origin + depth_mm[:, None] * direction)
+    assert float((place.abs() <= 1).all(1).double().mean()) > 0.99
+    assert bool((place.amax(0) > 0.85).all())
+    assert bool((place.amin(0) < -0.85).all()), "and little else"
+    share = box.share_of(depth_mm)
+    assert float(share.min()) < 0.06
+    assert float(share.max()) > 0.94
+    torch.testing.assert_close(box.depth_mm(box.share_of(depth_mm)), depth_mm, rtol=1e-6, atol=1e-6)
     s = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
     near, middle, far = (1 / box.depth_mm(s)).tolist()
     assert near > middle > far > 0

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
+from torch import Tensor
 
 from tests.worker.evaluate.rivals.cases import (
     check_gradient,
@@ -13,9 +15,11 @@ from tests.worker.evaluate.rivals.cases import (
     check_overfit,
     check_what_counts,
     fitted,
+    plain,
     small_clip,
 )
-from worker.evaluate.rivals.fields import rays
+from worker.evaluate.rivals import lerplane
+from worker.evaluate.rivals.fields import Shown, drawn_pixels, rays
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
 from worker.evaluate.rivals.planes import Planes, Smoothness
 from worker.evaluate.rivals.proposals import annealed, drawn_edges, interlevel_loss, middles
@@ -43,7 +47,28 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     with torch.no_grad():
         for each in (*rival.field.planes.time, *rival.proposals[0].planes.time):
             each.add_(0.1)  # away from 1, where the distance from it has a kink
-    check_gradient(rival, rival.field.parameters())
+    check_gradient(rival, rival.parameters())
+
+
+def test_its_loss_is_the_sum_of_its_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = dataclasses.replace(SMALL, depth_weight=0.5, proposal_depth_weight=0.25, proposal_weight=2.0)
+    rival = LerPlane(plain(), 0, chosen)  # of which each measured pixel lies at s = 0.5
+
+    def shown(origin: Tensor, *_: object) -> tuple[Shown, list[tuple[Tensor, Tensor]]]:
+        edges = torch.tensor([0.0, 0.5, 1.0]).expand(len(origin), 3)
+        proposed, weight = (torch.tensor(each).expand(len(origin), 2) for each in ([0.2, 0.8], [0.4, 0.6]))
+        one = torch.ones_like(origin[:, 0])
+        return (0.7 * torch.ones_like(origin), one, one), [(edges, proposed)] * 2 + [(edges, weight)]
+
+    monkeypatch.setattr(rival, "_shown", shown)
+    depth = 2 * 0.25 * (0.65 - 0.5) ** 2 / 2 + 0.5 * (0.55 - 0.5) ** 2 / 2
+    exceeding = 2 * 2.0 * ((0.4 - 0.2) ** 2 / 0.4 + 0) / 2
+    roughness = rival.field.planes.roughness(chosen.smoothness)
+    for proposal in rival.proposals:
+        roughness = roughness + proposal.planes.roughness(chosen.proposal_smoothness)
+    rough = float(roughness.detach())
+    assert rough > 1e-3
+    np.testing.assert_allclose(float(rival.loss(1, 0.0).detach()), 0.2**2 + depth + exceeding + rough, rtol=1e-4)
 
 
 def test_the_proposals_loss_has_the_gradient_of_finite_differences_and_is_zero_where_they_allow_the_weights() -> None:
@@ -114,9 +139,9 @@ def test_the_proposals_learn_where_the_field_has_its_weight() -> None:
     origin, direction = rays(seen.intrinsics, row, column, seen.world_from_camera[0])
     with torch.no_grad():
         _, rounds = rival._shown(origin, direction, seen.t.expand(len(row)), 1.0, None)
-    *proposed, field_s = ((weight * middles(edges)).sum(1) for edges, weight in rounds)
+    *proposed, field_share = ((weight * middles(edges)).sum(1) for edges, weight in rounds)
     for each in proposed:
-        assert float((each - field_s).abs().median()) < 0.1, "of 1, the length of a ray"
+        assert float((each - field_share).abs().median()) < 0.1, "of 1, the length of a ray"
     assert (annealed(0.0), annealed(1.0), annealed(2.0)) == (0.0, 1.0, 1.0)
 
 
@@ -132,12 +157,24 @@ def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers()
     check_what_counts(small)
 
 
-def test_pixels_that_change_and_tissue_that_hides_are_drawn_more_often() -> None:
+def test_pixels_that_change_and_tissue_that_hides_are_drawn_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
     clip = small_clip(3)
     still = dataclasses.replace(clip, rgb=clip.rgb[[0, 0, 0]].copy(), tissue=np.ones_like(clip.tissue))
     still.rgb[1, 10, 20] ^= 128
     still.tissue[0, 30:, :] = False
-    weight = importance(Seen.of(still, range(3)), 0.01, 0.1)
+    seen = Seen.of(still, range(3))
+    weight = importance(seen, 0.01, 0.1)
     assert float(weight[1, 10, 20]) > 5 * float(weight[1, 11, 20])
     assert bool((weight[0, 30:] == 0).all())
-    assert float(weight[1, 40, 5]) > float(weight[1, 5, 5])
+    of_equal_change = importance(seen, 0.05, 0.05)
+    np.testing.assert_allclose(of_equal_change[1, 40, 5] / of_equal_change[1, 5, 5], 3 / 2, rtol=1e-6)
+    totals: list[Tensor] = []
+
+    def drawn(total: Tensor, count: int, random: torch.Generator) -> Tensor:
+        totals.append(total)
+        return drawn_pixels(total, count, random)
+
+    monkeypatch.setattr(lerplane, "drawn_pixels", drawn)
+    small(seen, 0).loss(1, 0.0)
+    drawn_by = totals[0].diff(prepend=torch.zeros(1)).reshape(weight.shape)
+    torch.testing.assert_close(drawn_by, weight.double(), rtol=1e-6, atol=1e-9)
