@@ -89,13 +89,14 @@ def _in_order(groups: Sequence[Group], place: Place) -> list[Group]:
 def _orders(groups: Sequence[Group], places: Sequence[Place]) -> list[str]:
     """Each system beside the next; nothing where no two ran at one place."""
     pairs = list(itertools.pairwise(SYSTEMS))
-    measured = []
+    measured, comparable = [], False
     for place in places:
         here = _in_order(groups, place)
         in_db = [_longest(here, a, b) for a, b in pairs]
         in_images = [(_last(here, a), _last(here, b)) for a, b in pairs]
+        comparable |= any(None not in pair for pair in in_images)
         measured.append([*place, *_compared(in_db, in_images)])
-    if all(figure == "–" for row in measured for figure in row[2:]):
+    if not comparable:
         return []
     published = []
     for data in dict.fromkeys(each.data for each in RESULTS):

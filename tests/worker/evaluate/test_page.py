@@ -132,6 +132,19 @@ def test_each_system_of_table_1_stands_beside_the_next_and_the_papers_difference
     assert page.index("| endogaussian | 60 s") < page.index("| endogaussian | 300 s") < page.index("| endonerf |")
 
 
+def test_two_rivals_are_compared_at_the_limit_at_which_the_first_ran_longest(tmp_path: Path) -> None:
+    folder = tmp_path / TABLE_1
+    folder.mkdir()
+    runs = [
+        run_row("lerplane", 28.0),
+        run_row("lerplane", 29.0, limit="100 iterations", t_train_s=90),
+        run_row("endonerf", 25.0),
+        run_row("endonerf", 24.0, limit="100 iterations", t_train_s=30),
+    ]
+    write_rows(folder / RUNS, RUN_FIELDS, [{**each, "psnr_paper_db": each["psnr_tissue_db"]} for each in runs])
+    assert "| d4d-a | every8 | – | – | 5.0 |" in "".join(table1_sections(tmp_path))
+
+
 def test_the_page_tells_what_a_gpu_was_measured_to_do_and_what_of_it_is_not_to_be_believed(tmp_path: Path) -> None:
     assert gpu_sections(tmp_path) == []
     where = {name: f"a {name}" for name in ORIGIN}

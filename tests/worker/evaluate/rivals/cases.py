@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
+from types import ModuleType
 
 import numpy as np
+import pytest
 import torch
 
 from tests.worker.phantoms import phantom_clip
+from worker.evaluate.rivals.fields import drawn_pixels
 from worker.evaluate.rivals.rival import Rival, Seen
 from worker.evaluate.rivals.run import Length, Make, run_rival, train_rival
 from worker.input.clip import DepthClip, FrameSplit
@@ -37,6 +40,19 @@ def plain() -> Seen:
         world_from_camera=torch.eye(4).expand(2, 4, 4),
         intrinsics=small_clip(2).intrinsics,
     )
+
+
+def weights_drawn_by(monkeypatch: pytest.MonkeyPatch, module: ModuleType, rival: Rival) -> torch.Tensor:
+    """The flat weights by which the rival of a module draws the pixels of a step."""
+    totals: list[torch.Tensor] = []
+
+    def drawn(total: torch.Tensor, count: int, random: torch.Generator) -> torch.Tensor:
+        totals.append(total)
+        return drawn_pixels(total, count, random)
+
+    monkeypatch.setattr(module, "drawn_pixels", drawn)
+    rival.loss(1, 0.0)
+    return totals[0].diff(prepend=torch.zeros(1))
 
 
 def fitted(make: Make, clip: DepthClip, train: Sequence[int], iterations: int, seed: int = 0) -> Rival:

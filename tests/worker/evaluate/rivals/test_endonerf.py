@@ -17,10 +17,10 @@ from tests.worker.evaluate.rivals.cases import (
     fitted,
     plain,
     small_clip,
+    weights_drawn_by,
 )
 from worker.evaluate.rivals import endonerf
 from worker.evaluate.rivals.endonerf import EndoNerf, EndoNerfSettings, _encoded
-from worker.evaluate.rivals.fields import drawn_pixels
 from worker.evaluate.rivals.rival import Seen
 
 SMALL = EndoNerfSettings(
@@ -111,15 +111,7 @@ def test_rays_are_drawn_more_often_where_instruments_hide_the_tissue_more_often(
     often = (~clip.tissue).sum(0)
     importance = rival._importance.numpy()
     assert importance[often > 0].min() > importance[often == 0].max() == 1
-    totals: list[Tensor] = []
-
-    def drawn(total: Tensor, count: int, random: torch.Generator) -> Tensor:
-        totals.append(total)
-        return drawn_pixels(total, count, random)
-
-    monkeypatch.setattr(endonerf, "drawn_pixels", drawn)
-    rival.loss(1, 0.0)
-    weight = totals[0].diff(prepend=torch.zeros(1)).reshape(48, 64)
+    weight = weights_drawn_by(monkeypatch, endonerf, rival).reshape(48, 64)
     of_frames = [torch.allclose(weight, (rival._importance * tissue).double()) for tissue in seen.tissue]
     assert sum(of_frames) == 1, "those of one frame, where it shows tissue"
 

@@ -39,7 +39,7 @@ def test_the_box_holds_what_is_measured_and_s_is_even_in_inverse_depth() -> None
     share = box.share_of(depth_mm)
     assert float(share.min()) < 0.06
     assert float(share.max()) > 0.94
-    torch.testing.assert_close(box.depth_mm(box.share_of(depth_mm)), depth_mm, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(box.depth_mm(share), depth_mm, rtol=1e-6, atol=1e-6)
     s = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
     near, middle, far = (1 / box.depth_mm(s)).tolist()
     assert near > middle > far > 0

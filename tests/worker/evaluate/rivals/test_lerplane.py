@@ -17,9 +17,10 @@ from tests.worker.evaluate.rivals.cases import (
     fitted,
     plain,
     small_clip,
+    weights_drawn_by,
 )
 from worker.evaluate.rivals import lerplane
-from worker.evaluate.rivals.fields import Shown, drawn_pixels, rays
+from worker.evaluate.rivals.fields import Shown, rays
 from worker.evaluate.rivals.lerplane import LerPlane, LerPlaneSettings, importance
 from worker.evaluate.rivals.planes import Planes, Smoothness
 from worker.evaluate.rivals.proposals import annealed, drawn_edges, interlevel_loss, middles
@@ -166,15 +167,8 @@ def test_pixels_that_change_and_tissue_that_hides_are_drawn_more_often(monkeypat
     weight = importance(seen, 0.01, 0.1)
     assert float(weight[1, 10, 20]) > 5 * float(weight[1, 11, 20])
     assert bool((weight[0, 30:] == 0).all())
+    assert float(weight[1, 40, 5]) > float(weight[1, 5, 5])
     of_equal_change = importance(seen, 0.05, 0.05)
     np.testing.assert_allclose(of_equal_change[1, 40, 5] / of_equal_change[1, 5, 5], 3 / 2, rtol=1e-6)
-    totals: list[Tensor] = []
-
-    def drawn(total: Tensor, count: int, random: torch.Generator) -> Tensor:
-        totals.append(total)
-        return drawn_pixels(total, count, random)
-
-    monkeypatch.setattr(lerplane, "drawn_pixels", drawn)
-    small(seen, 0).loss(1, 0.0)
-    drawn_by = totals[0].diff(prepend=torch.zeros(1)).reshape(weight.shape)
+    drawn_by = weights_drawn_by(monkeypatch, lerplane, small(seen, 0)).reshape(weight.shape)
     torch.testing.assert_close(drawn_by, weight.double(), rtol=1e-6, atol=1e-9)

@@ -102,6 +102,7 @@ def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
     reports: list[float] = []
     hooks = TrainingHooks(on_progress=lambda now: reports.append(now.fraction))
     made = train_rival(rival, Length(None, 1.3), clock, hooks, score)
+    assert clock.elapsed_s >= 1.3, "all of the budget is used"
     assert scored == sorted({*scored, made}), "a second of scoring at the mark of 1 s would have ended it"
     assert reports == sorted(reports)
 
