@@ -43,8 +43,8 @@ fewer if 30 s pass first; the first five do not count, and of five or fewer only
 samples about the measured depth of the training frames nearest in time, which is exact on phantoms: its depth error is
 mostly the motion between frames. A dash: SSIM needs neighbouring pixels, which a lattice does not have; `d4d-a` has no
 ground truth; nothing moves on `phantom:still`; LerPlane and EndoNeRF do not tell where a point goes. EndoNeRF's rows of
-1800 s on `d4d-a` and with blocks8 are older than its others, and of a version that learnt more slowly
-([decision 078](../decisions/078-rivals.md#choices-that-were-measured)).
+1800 s on `d4d-a` with every8 and on `phantom:cut` with blocks8 are older than its others, and of a version that learnt
+more slowly ([decision 078](../decisions/078-rivals.md#choices-that-were-measured)).
 """
 _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.

@@ -26,7 +26,7 @@ RIVAL_BUDGET_S = 1800.0
 RAY_BY_RAY = frozenset({"endonerf", "lerplane"})
 CPU_STEP_PX, CPU_COLUMNS = 5, 64
 """On a processor every 5th pixel of a row is scored, and of rows wider than 320 pixels about 64: with EndoNeRF a whole
-picture of 160x128 takes two cores 17 to 24 s."""
+picture of 160x128 takes two cores 22 to 24 s."""
 
 
 def scored_step_px(series: str, device: Device, width: int) -> int:
