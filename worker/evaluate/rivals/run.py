@@ -92,7 +92,7 @@ class Fitted:
 def train_rival(
     rival: Rival, length: Length, clock: Stopwatch, hooks: TrainingHooks, score: Callable[[int], float]
 ) -> int:
-    """Train to the end of its length; returns the iterations made.
+    """Train to the end of its length, at least one iteration; returns the iterations made.
 
     Args:
         clock: t_train_s so far; paused while score is called.
@@ -102,9 +102,12 @@ def train_rival(
         Cancelled: hooks.should_stop said so.
         TrainingDiverged: a loss is not finite.
     """
-    marks = [mark for mark in SCORED_SECONDS if mark > clock.elapsed_s]
-    made, reported, last_db = 0, -math.inf, math.nan
-    while (progress := length.progress(made, now := clock.elapsed_s)) < 1:
+    now = clock.elapsed_s
+    marks = [mark for mark in SCORED_SECONDS if mark > now]
+    made, reported, last_db, progress = 0, -math.inf, math.nan, length.progress(0, now)
+    if progress >= 1:
+        progress = 0.0  # the start took the whole budget: one iteration all the same
+    while progress < 1:
         if hooks.should_stop():
             raise Cancelled(f"Stopped after {made} iterations.")
         made += 1
@@ -112,14 +115,15 @@ def train_rival(
         if not math.isfinite(rival.step(made, progress)):
             raise TrainingDiverged(f"The loss is not finite at iteration {made}.")
         now = clock.elapsed_s
-        if marks and now >= marks[0] and length.progress(made, now) < 1:
+        progress = length.progress(made, now)
+        if marks and now >= marks[0] and progress < 1:
             marks = [mark for mark in marks if mark > now]
             with clock.paused():
                 last_db = score(made)
         if now - reported >= REPORT_EVERY_S:
             reported = now
             known_db = None if math.isnan(last_db) else last_db
-            hooks.on_progress(Progress("train", progress, made, length.iterations or 0, psnr_db=known_db))
+            hooks.on_progress(Progress("train", min(progress, 1.0), made, length.iterations or 0, psnr_db=known_db))
     with clock.paused():
         score(made)
     return made

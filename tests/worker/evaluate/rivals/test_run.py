@@ -107,6 +107,21 @@ def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
     assert reports == sorted(reports)
 
 
+@pytest.mark.parametrize("make", [tiny, tiny_gaussians, lambda seen, seed: LerPlane(seen, seed, TINY_PLANES)])
+def test_a_budget_that_the_start_uses_up_leaves_one_iteration(make: Make) -> None:
+    rival = make(Seen.of(small_clip(2), [0, 1]), 0)
+    before = [each.detach().clone() for each in rival.parameters()]
+    scored: list[int] = []
+
+    def score(made: int) -> float:
+        scored.append(made)
+        return 20.0
+
+    assert train_rival(rival, Length(None, 1e-9), Stopwatch(), TrainingHooks(), score) == 1
+    assert scored == [1]
+    assert any(not torch.equal(was, now) for was, now in zip(before, rival.parameters(), strict=True))
+
+
 def test_a_budget_ends_at_the_published_iterations_if_these_come_first() -> None:
     clip = small_clip(2)
 
