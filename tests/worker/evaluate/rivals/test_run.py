@@ -44,6 +44,13 @@ def tiny_gaussians(seen: Seen, seed: int) -> EndoGaussian:
     return EndoGaussian(seen, seed, TINY_GAUSSIANS)
 
 
+def tiny_planes(seen: Seen, seed: int) -> LerPlane:
+    return LerPlane(seen, seed, TINY_PLANES)
+
+
+OF_EACH_RIVAL = pytest.mark.parametrize("make", [tiny, tiny_gaussians, tiny_planes])
+
+
 @pytest.mark.parametrize(
     ("series", "make", "not_measured"),
     [
@@ -85,7 +92,7 @@ def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
         assert end[name] == pytest.approx(row[name], abs=1e-3)
 
 
-@pytest.mark.parametrize("make", [tiny, tiny_gaussians, lambda seen, seed: LerPlane(seen, seed, TINY_PLANES)])
+@OF_EACH_RIVAL
 def test_a_step_changes_the_numbers_that_have_a_gradient(make: Make) -> None:
     check_step(make(Seen.of(small_clip(2), [0, 1]), 0))
 
@@ -107,7 +114,7 @@ def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
     assert reports == sorted(reports)
 
 
-@pytest.mark.parametrize("make", [tiny, tiny_gaussians, lambda seen, seed: LerPlane(seen, seed, TINY_PLANES)])
+@OF_EACH_RIVAL
 def test_a_budget_that_the_start_uses_up_leaves_one_iteration(make: Make) -> None:
     rival = make(Seen.of(small_clip(2), [0, 1]), 0)
     before = [each.detach().clone() for each in rival.parameters()]
