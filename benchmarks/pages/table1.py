@@ -51,7 +51,8 @@ _ORDERS = """
 The paper's table has each system ahead of the next in dB and in images a second: {systems}.
 Each column compares a system with the next, by the paper's own score (`psnr_paper`), after the longest run of each; two
 rivals are compared after the longest limit that both have had. A difference below 0, or a quotient below 1, contradicts
-the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on different machines.
+the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on different machines, one of
+which renders more images a second, and makes more steps in a limit of time.
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "ssim": ("SSIM", 3), "iterations": ("steps", 0),
@@ -124,13 +125,12 @@ def _last(here: Sequence[Group], series: str) -> Group | None:
 
 def _compared(in_db: Sequence[_Pair], in_images: Sequence[_Pair]) -> list[str]:
     """Differences in dB of pairs, then quotients of images a second; dashes where one of the two is missing."""
-    differences = [number(_db(a) - _db(b), 1) for a, b in in_db]
-    return differences + [_quotient(a, b) for a, b in in_images]
+    differences = [_cell(_db(a) - _db(b), a, b) for a, b in in_db]
+    return differences + [_cell(_images_a_second(a) / _images_a_second(b), a, b) for a, b in in_images]
 
 
-def _quotient(a: Published | Group | None, b: Published | Group | None) -> str:
-    """Of images a second, marked where the two ran on different machines."""
-    found = _images_a_second(a) / _images_a_second(b)
+def _cell(found: float, a: Published | Group | None, b: Published | Group | None) -> str:
+    """A comparison of the two, marked where they ran on different machines."""
     mark = "" if math.isnan(found) or _machines(a) == _machines(b) else " *"
     return number(found, 1) + mark
 

@@ -176,8 +176,14 @@ def is_changed(series: str) -> bool:
 
 
 def capacity_grid(series: str) -> list[str]:
-    """The series, whose capacity is chosen for the scene, and its variants with fixed capacities."""
+    """The series, whose capacity is chosen for the scene, and its variants with fixed capacities.
+
+    Raises:
+        InputError: it is one of RIVAL_SYSTEMS.
+    """
     name, own = preset_name_of(series), _changes(series)
+    if name in RIVAL_SYSTEMS:
+        raise InputError("--grid", f"{name!r} is measured as published.", "Name presets alone with --series.")
     grid = ([f"bases={bases}", f"points_per_image={points}"] for bases in GRID_BASES for points in GRID_POINTS)
     return [series, *(_named(name, [*fixed, *own]) for fixed in grid)]
 

@@ -16,7 +16,7 @@ from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIAN
 from tests.worker.evaluate.rivals.test_endonerf import TINY
 from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
-from worker.evaluate.cells import Cell, options_of, plan, preset_of
+from worker.evaluate.cells import Cell, capacity_grid, options_of, plan, preset_of
 from worker.evaluate.measure import OF_WHOLE_PICTURES, OPAQUE, Bench
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.endogaussian import EndoGaussian
@@ -191,6 +191,9 @@ def test_a_rival_is_a_series_without_changes_and_no_preset() -> None:
             plan(["clip"], [series], ["every8"], [0])
     with pytest.raises(InputError, match="no preset"):
         preset_of("endonerf")
+    with pytest.raises(InputError, match="'endonerf' is measured as published") as refused:
+        capacity_grid("endonerf")
+    assert refused.value.field == "--grid"
     with pytest.raises(InputError, match="no series 'nerfies'") as unknown:
         plan(["clip"], ["nerfies"], ["every8"], [0])
     assert unknown.value.field == "--series"
