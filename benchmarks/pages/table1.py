@@ -34,25 +34,24 @@ scores and clock. [rivals.md](../rivals.md) lists what had to differ and why,
 
 `dB` is psnr_tissue of held-out frames, `s` the seconds of training; dashed lines in the charts are what copying the
 neighbouring frames scores. `limit` is the most that a run may take: `fast` stops when it gains no more, and a rival at
-its published iterations. `10°` is the score of a camera turned by 10 degrees, `bound` what colours that do not depend
-on the viewpoint can reach there, `hidden` the score behind the instrument; `moving` is the motion error of points that
-have moved, `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor EndoNeRF and
-LerPlane are scored at every 5th pixel of every 5th row, so that their bound differs. On any device they draw nothing
-beyond the depths of the training frames. `MB` is what is stored of a scene; of a rival four bytes for each number that
-it learns, although EndoNeRF also needs the training frames' depth to render. Images a second are the median of at most
-45 whole pictures, fewer if 30 s pass first; the first five do not count, and of five or fewer only the last one counts.
-EndoNeRF draws its samples about the measured depth of the training frames nearest in time, which is exact on phantoms:
-its depth error is mostly the motion between frames. A dash: SSIM needs neighbouring pixels, which a lattice does not
-have; `d4d-a` has no ground truth; nothing moves on `phantom:still`; LerPlane and EndoNeRF do not tell where a point
-goes. EndoNeRF's rows of 1800 s on `d4d-a` with every8 and on `phantom:cut` with blocks8 are older than its others, and
-of a version that learnt more slowly ([decision 078](../decisions/078-rivals.md#choices-that-were-measured)).
+its published iterations. `10°` is the score of a camera moved 10 degrees about the tissue, `bound` what colours that do
+not depend on the viewpoint can reach there, `hidden` the score behind the instrument; `moving` is the motion error of
+points that have moved, `moved by` how far ([worker/evaluate/truth.py](../../worker/evaluate/truth.py)). On a processor
+EndoNeRF and LerPlane are scored at every 5th pixel of every 5th row, so that their bound differs. On any device they
+draw nothing nearer or farther than the training frames' depths and 5 % of their range. `MB` is what is stored of a
+scene; of a rival four bytes for each number that it learns, although EndoNeRF also needs the training frames' depth to
+render. At most 45 whole pictures are rendered, fewer if 30 s pass first; images a second are the median without the
+first five, or of five or fewer the last one's. EndoNeRF draws its samples about the measured depth of the training
+frames nearest in time, which is exact on phantoms: its depth error is mostly the motion between frames. A dash: SSIM
+needs neighbouring pixels, which a lattice does not have; `d4d-a` has no ground truth; nothing moves on `phantom:still`;
+LerPlane and EndoNeRF do not tell where a point goes.
 """
 _ORDERS = """
-The paper's table has each system ahead of the next in dB and in images a second: {systems}.
-Each column compares a system with the next, by the paper's own score (`psnr_paper`), after the longest run of each; two
-rivals are compared after the longest limit that both have had. A difference below 0, or a quotient below 1, contradicts
-the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on different machines, one of
-which renders more images a second, and makes more steps in a limit of time.
+The paper's table has each system ahead of the next in dB and in images a second: {systems}. The first three columns
+subtract the next system's `psnr_paper`, the paper's own score, after the longest run of each; two rivals are compared
+after the longest limit that both have had. The last three divide images a second. A difference below 0, or a quotient
+below 1, contradicts the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on
+different machines, one of which renders more images a second, and makes more steps in a limit of time.
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "ssim": ("SSIM", 3), "iterations": ("steps", 0),

@@ -25,11 +25,11 @@ RIVAL_BUDGET_S = 1800.0
 """Seconds of training if nothing else is asked for; what was published takes a GPU up to six hours."""
 RAY_BY_RAY = frozenset({"endonerf", "lerplane"})
 CPU_STEP_PX, CPU_COLUMNS = 5, 64
-"""On a processor every 5th pixel of a row is scored, and of rows wider than 320 pixels about 64: with EndoNeRF a whole
-picture of 160x128 takes two cores 22 to 24 s."""
+"""On a processor every 5th pixel of every 5th row is scored, and of rows wider than 320 pixels about 64: with EndoNeRF
+a whole picture of 160x128 takes two cores 22 to 24 s."""
 
 
 def scored_step_px(series: str, device: Device, width: int) -> int:
-    """The lattice of pixels that a system is scored on (worker/evaluate/thinned.py), in a picture so many pixels wide:
-    coarse where rays take long."""
+    """Of how many pixels, across and down, a system is scored on one (worker/evaluate/thinned.py), in a picture so many
+    pixels wide: more where rays take long."""
     return max(CPU_STEP_PX, width // CPU_COLUMNS) if series in RAY_BY_RAY and device.kind == "cpu" else 1

@@ -174,8 +174,9 @@ class EndoGaussian(Rival):
         return motion.float().cpu().numpy()
 
     def _is_static(self, iteration: int, progress: float) -> bool:
-        """Whether a step is without motion. More progress than steps made of those published means that the training
-        ends before these do; then static_share counts."""
+        """Whether a step is without motion: one of the first static_steps of a training that makes all published steps;
+        of one that ends sooner, only in its first static_share. More progress than the steps made are of those
+        published means that it ends sooner."""
         share, made = self.settings.static_share, iteration - 1
         in_time = self.time_share < share and (progress < share or progress <= made / self.published_steps)
         return in_time and iteration <= self.settings.static_steps

@@ -43,7 +43,7 @@ CPU_RAYS = 128
 
 @dataclass(frozen=True)
 class EndoNerfSettings:
-    """Published values, except that spread, last_rate and the unit s are ours (docs/rivals.md).
+    """Published values, but the octaves are D-NeRF's, and spread, last_rate and the unit s are ours (docs/rivals.md).
 
     spread         standard deviation of the samples about the depth, in s
     space_octaves, time_octaves, view_octaves  of the positional encodings

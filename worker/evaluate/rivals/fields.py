@@ -2,7 +2,8 @@
 
 Symbols: M points or rays, S samples a ray.
 
-A place in the box is [-1, 1]^3: x / z, y / z and 1 / z of the first camera, each from its least to its greatest.
+A place in the box is [-1, 1]^3: x / z and y / z of the first camera from least to greatest, and 1 / z without the
+outermost 0.1 % at either end, each with 5 % of its range beyond.
 Pixels of an endoscope at rest are columns of it, as in the normalised device coordinates of the papers. A place on a
 ray is its share s in [0, 1] of the ray, even in 1 / z of the ray's own camera: from the nearest depth of the training
 frames to the farthest, without the outermost 0.1 % at either end and with 5 % of that range beyond it.
@@ -54,13 +55,14 @@ class Box:
         depth_mm = seen.depth_mm[frame, row, column]
         place = _projected(origin + depth_mm[:, None] * direction)
         ends = place.new_tensor([OUTLIERS, 1 - OUTLIERS])
-        farthest, nearest = torch.quantile(place[:, 2], ends).unbind()
-        low = torch.stack([*place[:, :2].amin(0).unbind(), farthest])
-        high = torch.stack([*place[:, :2].amax(0).unbind(), nearest])
+        inverse_farthest, inverse_nearest = torch.quantile(place[:, 2], ends).unbind()
+        low = torch.stack([*place[:, :2].amin(0).unbind(), inverse_farthest])
+        high = torch.stack([*place[:, :2].amax(0).unbind(), inverse_nearest])
         room = MARGIN * (high - low).clamp(min=1e-6)
-        far, near = torch.quantile(1 / depth_mm, ends).tolist()
-        beyond = MARGIN * max(near - far, 0.01 * near)
-        return cls(low - room, high + room, 1 / (near + beyond), 1 / max(far - beyond, 0.1 * far))
+        inverse_far, inverse_near = torch.quantile(1 / depth_mm, ends).tolist()
+        beyond = MARGIN * max(inverse_near - inverse_far, 0.01 * inverse_near)  # one depth alone needs a range, too
+        far_mm = 1 / max(inverse_far - beyond, 0.1 * inverse_far)  # finite
+        return cls(low - room, high + room, 1 / (inverse_near + beyond), far_mm)
 
     def place(self, points_mm: Tensor) -> Tensor:
         """World points [..., 3] in the box, beyond [-1, 1] where they lie outside."""

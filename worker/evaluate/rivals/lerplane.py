@@ -35,6 +35,9 @@ WINDOW = 2
 HUBER_DELTA = 0.2
 """In s: the depth error from which its loss is linear."""
 
+HANDED_ON = 15
+"""Features that colour is decoded from, beside density."""
+
 CPU_RAYS = 512
 """Of a step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
 
@@ -143,7 +146,7 @@ class LerPlane(Rival):
     ) -> tuple[Shown, list[tuple[Tensor, Tensor]]]:
         """What is shown by rays at times [M], and each round's edges [M, K + 1] and weights [M, K], the field's last.
 
-        random: jitters the intervals; None puts them in the middle.
+        random: jitters the intervals' edges; None: no jitter.
         """
         edges = origin.new_tensor([0.0, 1.0]).expand(len(origin), 2)
         weight, rounds = torch.ones_like(edges[:, :1]), []
@@ -209,15 +212,14 @@ class _PlaneField(nn.Module):
         self.bins, hidden = settings.bins, settings.hidden
         self.planes = Planes(settings.cells, time_cells, settings.features)
         given = self.planes.size + 4 * settings.bins
-        self.decode = nn.Sequential(nn.Linear(given, hidden), nn.ReLU(), nn.Linear(hidden, 16))
-        self.colour = nn.Sequential(
-            nn.Linear(15, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3), nn.Sigmoid()
-        )
+        self.decode = nn.Sequential(nn.Linear(given, hidden), nn.ReLU(), nn.Linear(hidden, 1 + HANDED_ON))
+        colour = nn.Linear(HANDED_ON, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
+        self.colour = nn.Sequential(*colour, nn.Sigmoid())
 
     def forward(self, place: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         at = torch.cat([(place + 1) / 2, t[:, None]], 1)
-        middles = (torch.arange(self.bins).to(at) + 0.5) / self.bins
-        blobs = torch.exp(-0.5 * ((at[..., None] - middles) * self.bins).square()).flatten(1)
+        centres = (torch.arange(self.bins).to(at) + 0.5) / self.bins
+        blobs = torch.exp(-0.5 * ((at[..., None] - centres) * self.bins).square()).flatten(1)
         decoded = self.decode(torch.cat([self.planes(place, t), blobs], 1))
         return _density(decoded[:, 0]), self.colour(decoded[:, 1:])
 

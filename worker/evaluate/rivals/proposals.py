@@ -16,7 +16,11 @@ PADDING = 0.01
 
 
 def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generator | None) -> Tensor:
-    """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1]."""
+    """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1], after
+    PADDING is added to it.
+
+    random: moves each edge by up to half an interval; None: none.
+    """
     weight = weight + PADDING
     share = torch.cumsum(weight / weight.sum(-1, keepdim=True), -1)
     share = torch.cat([torch.zeros_like(share[:, :1]), share[:, :-1], torch.ones_like(share[:, :1])], -1)
@@ -32,7 +36,7 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generat
 
 
 def lengths(edges: Tensor) -> Tensor:
-    """Of the intervals between the edges [M, K + 1]; the last one is opaque."""
+    """Of the intervals between the edges [M, K + 1]: [M, K], in s; the last one is opaque."""
     return torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(edges[:, :1], SOLID)], 1)
 
 

@@ -101,12 +101,16 @@ class Rival(ABC):
     def motion_mm(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
     ) -> NDArray[np.float32]:
-        """[H, W, 3] world: where what each pixel shows at t = 0 has gone at t; NaN where the method does not tell."""
+        """[H, W, 3] mm, world: how far what each pixel shows at t = 0 has moved at t; NaN where it is not told."""
         del t, world_from_camera
         return np.full((intrinsics.height, intrinsics.width, 3), np.nan, np.float32)
 
     def step(self, iteration: int, progress: float) -> float:
-        """One iteration; returns its loss."""
+        """One iteration; returns its loss.
+
+        Raises:
+            TrainingDiverged: of the Gaussians, a place is not finite or all are transparent.
+        """
         for group, rate in zip(self.optimizer.param_groups, self.rates(progress), strict=True):
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)

@@ -46,7 +46,7 @@ Make = Callable[[Seen, int], Rival]
 
 @dataclass(frozen=True)
 class Length:
-    """How long a rival trains: to the first of what is given."""
+    """How long a rival trains: to the first of what is given, at least one of the two."""
 
     iterations: int | None
     budget_s: float | None
@@ -100,7 +100,7 @@ def train_rival(
 
     Raises:
         Cancelled: hooks.should_stop said so.
-        TrainingDiverged: a loss is not finite.
+        TrainingDiverged: a loss is not finite, or a Gaussian's place, or all Gaussians are transparent.
     """
     now = clock.elapsed_s
     marks = [mark for mark in SCORED_SECONDS if mark > now]
@@ -152,7 +152,7 @@ def run_rival(
     Raises:
         InputError: no training frame has valid depth.
         Cancelled: hooks.should_stop said so.
-        TrainingDiverged: the loss or a render is not finite.
+        TrainingDiverged: as train_rival, or a render is not finite.
     """
     scored = thinned(clip, step_px)
     if device == CPU:

@@ -18,6 +18,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
+import torch
+
 from contract.wire.errors import InputError
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
@@ -71,11 +73,11 @@ def run(kernel: Callable[..., object], *args: object) -> None:
     threads = thread_count()
     if getattr(_own, "is_alone", False):
         for thread in range(threads):
-            kernel(thread, threads, *args)
+            _flushing(kernel, thread, threads, *args)
         return
     others = [_pool(os.getpid()).submit(_timed, kernel, thread, threads, *args) for thread in range(1, threads)]
     try:
-        kernel(0, threads, *args)
+        _flushing(kernel, 0, threads, *args)
     finally:
         wait(others)  # they write into the caller's arrays
     _own.elsewhere_s = getattr(_own, "elsewhere_s", 0.0) + sum(other.result() for other in others)
@@ -124,5 +126,14 @@ def cpu_time_s() -> float:
 def _timed(kernel: Callable[..., object], *args: object) -> float:
     """Call the kernel; the CPU seconds that it took."""
     start_s = time.thread_time()
-    kernel(*args)
+    _flushing(kernel, *args)
     return time.thread_time() - start_s
+
+
+def _flushing(kernel: Callable[..., object], *args: object) -> None:
+    """Call the kernel; subnormal numbers, which moments of Adam fade through, count as 0 in it."""
+    torch.set_flush_denormal(True)
+    try:
+        kernel(*args)
+    finally:
+        torch.set_flush_denormal(False)

@@ -28,6 +28,10 @@ def five() -> list[nn.Parameter]:
     return [nn.Parameter(each) for each in (mean, quaternion, log_scale, opacity_logit, colour, harmonics)]
 
 
+def untrained(parameters: list[Tensor] | list[nn.Parameter]) -> torch.optim.Optimizer:
+    return torch.optim.Adam([{"params": [each]} for each in parameters])
+
+
 def trained(parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
     """An optimiser whose moments differ from Gaussian to Gaussian, after a step that changes next to nothing."""
     optimizer = torch.optim.Adam([{"params": [each]} for each in parameters], lr=1e-12)
@@ -41,7 +45,7 @@ def trained(parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
 CAMERA = Camera(200.0, 180.0, 32.0, 24.0, 64, 48, np.eye(4))
 
 
-def pulled(density: AdaptiveDensity, gradient: Tensor, mean: Tensor) -> None:
+def pull(density: AdaptiveDensity, gradient: Tensor, mean: Tensor) -> None:
     density.observe(gradient, mean.detach(), CAMERA)
 
 
@@ -54,7 +58,7 @@ def test_the_pull_is_the_mean_gradient_of_the_projection_over_the_steps_that_saw
     projected = project(mean, quaternion, log_scale.exp(), torch.sigmoid(opacity_logit[:, 0]), camera)
     weight = torch.tensor([[1.0, 2], [0, 0], [3, -1], [0.5, 0], [0, 1]], dtype=torch.float64)
     gradient, of_mean2d = torch.autograd.grad((projected.mean2d * weight).sum(), [mean, projected.mean2d])
-    density = AdaptiveDensity(SETTINGS, torch.optim.Adam([{"params": [each]} for each in parameters]))
+    density = AdaptiveDensity(SETTINGS, untrained(parameters))
     density.observe(gradient, mean.detach(), camera)
     density.observe(3 * gradient, mean.detach(), camera)
     density.observe(0 * gradient, mean.detach(), camera)
@@ -81,7 +85,7 @@ def test_a_transparent_gaussian_goes_and_one_that_is_pulled_becomes_two_smaller_
     density, gradient = AdaptiveDensity(SETTINGS, optimizer), torch.zeros(5, 3)
     gradient[2, 0] = 1.0
     gradient[3, 0] = 1e-6
-    pulled(density, gradient, parameters[0])
+    pull(density, gradient, parameters[0])
     old = [each.detach().clone() for each in parameters]
     new = density.split(torch.Generator().manual_seed(0))
     assert [len(each) for each in new] == [5] * 6
@@ -107,8 +111,8 @@ def test_children_lie_as_their_parent_s_density_says() -> None:
     parameters = [each.detach()[[0] * 4000] for each in five()]
     parameters[2][:] = torch.log(torch.tensor([0.5, 1e-6, 0.1]))
     parameters = [nn.Parameter(each) for each in parameters]
-    density = AdaptiveDensity(DensifySettings(), trained_alike(parameters))
-    pulled(density, torch.ones(4000, 3), parameters[0])
+    density = AdaptiveDensity(DensifySettings(), untrained(parameters))
+    pull(density, torch.ones(4000, 3), parameters[0])
     offset = density.split(torch.Generator().manual_seed(0))[0].detach() - torch.tensor([0.0, 0, 50])
     assert len(offset) == 8000
     turned = torch.tensor([0.0, -0.96, 0.28])  # where the quaternion (0.8, 0.6, 0, 0) takes the third axis
@@ -117,14 +121,10 @@ def test_children_lie_as_their_parent_s_density_says() -> None:
     assert float((offset @ torch.tensor([0.0, 0.28, 0.96])).abs().max()) < 1e-4
 
 
-def trained_alike(parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
-    return torch.optim.Adam([{"params": [each]} for each in parameters])
-
-
 def test_there_is_room_for_so_many_and_those_pulled_hardest_have_it() -> None:
     parameters = five()
     density = AdaptiveDensity(DensifySettings(max_count=5), trained(parameters))
-    pulled(density, torch.tensor([[1.0, 0, 0], [9, 0, 0], [3, 0, 0], [2, 0, 0], [0, 0, 0]]), parameters[0])
+    pull(density, torch.tensor([[1.0, 0, 0], [9, 0, 0], [3, 0, 0], [2, 0, 0], [0, 0, 0]]), parameters[0])
     colour = density.split(torch.Generator())[4].detach()[:, 0, 0]
     torch.testing.assert_close(colour, torch.tensor([0.0, 9, 12, 6, 6]))
 

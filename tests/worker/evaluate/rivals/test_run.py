@@ -13,7 +13,7 @@ import torch
 from contract.wire.errors import Cancelled, InputError, TrainingDiverged
 from tests.worker.evaluate.rivals.cases import check_step, small_clip
 from tests.worker.evaluate.rivals.test_endogaussian import TINY as TINY_GAUSSIANS
-from tests.worker.evaluate.rivals.test_endonerf import TINY
+from tests.worker.evaluate.rivals.test_endonerf import TINY as TINY_NERF
 from tests.worker.evaluate.rivals.test_lerplane import TINY as TINY_PLANES
 from worker.evaluate import stability
 from worker.evaluate.cells import Cell, capacity_grid, options_of, plan, preset_of
@@ -37,7 +37,7 @@ CLIP = "phantom:pull:64x48:9frames"
 
 
 def tiny(seen: Seen, seed: int) -> EndoNerf:
-    return EndoNerf(seen, seed, TINY)
+    return EndoNerf(seen, seed, TINY_NERF)
 
 
 def tiny_gaussians(seen: Seen, seed: int) -> EndoGaussian:
@@ -157,10 +157,10 @@ def test_a_rival_knows_how_much_of_its_time_is_used() -> None:
             return 0.0
 
     seen = Seen.of(small_clip(2), [1])
-    train_rival(Noting(seen, 0, TINY), Length(10**6, 0.1), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+    train_rival(Noting(seen, 0, TINY_NERF), Length(10**6, 0.1), Stopwatch(), TrainingHooks(), lambda _: math.nan)
     assert 0 <= shares[0] < shares[1] <= shares[-1] < 1
     shares.clear()
-    train_rival(Noting(seen, 0, TINY), Length(2, None), Stopwatch(), TrainingHooks(), lambda _: math.nan)
+    train_rival(Noting(seen, 0, TINY_NERF), Length(2, None), Stopwatch(), TrainingHooks(), lambda _: math.nan)
     assert shares == [0.0, 0.0]
 
 
