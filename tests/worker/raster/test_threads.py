@@ -16,7 +16,7 @@ from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
 from worker.raster.cpu import update
 from worker.raster.cpu.model import CpuModel
-from worker.raster.cpu.threads import THREADS_VARIABLE, alone, beside, cpu_time_s, run, thread_count
+from worker.raster.cpu.threads import THREADS_VARIABLE, alone, beside, cpu_time_s, flushing, run, thread_count
 from worker.raster.cpu.vectors import LANES
 from worker.raster.step import camera_vector
 
@@ -187,11 +187,13 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("is_alone", [False, True])
-def test_subnormal_numbers_count_as_zero_in_kernels_and_nowhere_else(*, is_alone: bool) -> None:
-    subnormal = np.full(LANES * thread_count(), 1e-40, np.float32)
-    value = np.zeros_like(subnormal)
-    nothing = np.float32(0.0)
+def test_subnormal_numbers_count_as_zero_in_flushing_kernels_alone(*, is_alone: bool) -> None:
+    first = np.full(LANES * thread_count(), 1e-40, np.float32)
+    value = np.zeros_like(first)
+    decay = value, value, first, value.copy(), np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(0.0)
     with alone(is_alone=is_alone):
-        run(update.adam, value, value, subnormal, value.copy(), nothing, np.float32(1.0), np.float32(0.5), nothing)
-    assert not subnormal.any(), "the first moment, decayed"
-    assert bool((torch.full((1,), 1e-40) * 0.5 > 0).all()), "on the caller's thread"
+        run(update.adam, *decay)
+        assert first.all()
+        run(flushing(update.adam), *decay)
+    assert not first.any()
+    assert bool((torch.full((1,), 1e-40) * 0.5 > 0).all()), "on the caller's thread, afterwards"

@@ -37,7 +37,7 @@ from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
-from worker.raster.cpu.threads import run
+from worker.raster.cpu.threads import flushing, run
 from worker.raster.model import put_back
 from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
 
@@ -299,7 +299,7 @@ def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: 
     if rate == 0.0:
         return
     flat = [_flat(each) for each in (value, gradient, moments[0], moments[1])]
-    run(update.adam, *flat, *map(np.float32, astuple(adam_step(rate, rates, iteration))))
+    run(flushing(update.adam), *flat, *map(np.float32, astuple(adam_step(rate, rates, iteration))))
 
 
 def _flat(array: Floats) -> Floats:

@@ -17,7 +17,7 @@ from worker.model.deformation import Deformation, FlexibleDeformation, LinearDef
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import update
 from worker.raster.cpu.rasterizer import Floats
-from worker.raster.cpu.threads import run
+from worker.raster.cpu.threads import flushing, run
 from worker.raster.cpu.unfused import AutogradMotion
 
 NEGLIGIBLE = 1e-3
@@ -108,7 +108,7 @@ class LinearMotion:
             adam = adam_step(1.0, rates, int(self.steps[j]))
             rate[j], eps[j] = channel_rates[:channels] * adam.size, adam.floor
         run(
-            update.update_shared, self.weight, self.first, self.second, v_state, values, alive, rate, eps,
+            flushing(update.update_shared), self.weight, self.first, self.second, v_state, values, alive, rate, eps,
             np.float32(rates.beta1), np.float32(rates.beta2),
         )  # fmt: skip
 
@@ -149,7 +149,7 @@ class FdmMotion:
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         adam = adam_step(rates.motion_mean, rates, iteration)
         run(
-            update.update_fdm, self.weight, self.centre, self.width, self.first, self.second, v_state,
+            flushing(update.update_fdm), self.weight, self.centre, self.width, self.first, self.second, v_state,
             np.array(times, np.float32), self._form.quartic, *map(np.float32, dataclasses.astuple(adam)),
         )  # fmt: skip
 

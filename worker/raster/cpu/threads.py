@@ -73,14 +73,30 @@ def run(kernel: Callable[..., object], *args: object) -> None:
     threads = thread_count()
     if getattr(_own, "is_alone", False):
         for thread in range(threads):
-            _flushing(kernel, thread, threads, *args)
+            kernel(thread, threads, *args)
         return
     others = [_pool(os.getpid()).submit(_timed, kernel, thread, threads, *args) for thread in range(1, threads)]
     try:
-        _flushing(kernel, 0, threads, *args)
+        kernel(0, threads, *args)
     finally:
         wait(others)  # they write into the caller's arrays
     _own.elsewhere_s = getattr(_own, "elsewhere_s", 0.0) + sum(other.result() for other in others)
+
+
+def flushing(kernel: Callable[..., object]) -> Callable[..., None]:
+    """The kernel, in which subnormal numbers count as 0, on whatever thread it runs.
+
+    Adam's moments fade through them, and a processor takes long over each (docs/decisions/080-subnormal-numbers.md).
+    """
+
+    def flushed(*args: object) -> None:
+        torch.set_flush_denormal(True)
+        try:
+            kernel(*args)
+        finally:
+            torch.set_flush_denormal(False)
+
+    return flushed
 
 
 @contextmanager
@@ -126,14 +142,5 @@ def cpu_time_s() -> float:
 def _timed(kernel: Callable[..., object], *args: object) -> float:
     """Call the kernel; the CPU seconds that it took."""
     start_s = time.thread_time()
-    _flushing(kernel, *args)
+    kernel(*args)
     return time.thread_time() - start_s
-
-
-def _flushing(kernel: Callable[..., object], *args: object) -> None:
-    """Call the kernel; subnormal numbers, which moments of Adam fade through, count as 0 in it."""
-    torch.set_flush_denormal(True)
-    try:
-        kernel(*args)
-    finally:
-        torch.set_flush_denormal(False)
