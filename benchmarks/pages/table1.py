@@ -47,11 +47,12 @@ needs neighbouring pixels, which a lattice does not have; `d4d-a` has no ground 
 LerPlane and EndoNeRF do not tell where a point goes.
 """
 _ORDERS = """
-The paper's table has each system ahead of the next in dB and in images a second: {systems}. The first three columns
-subtract the next system's `psnr_paper`, the paper's own score, after the longest run of each; two rivals are compared
-after the longest limit that both have had. The last three divide images a second. A difference below 0, or a quotient
-below 1, contradicts the paper's order, but with one seed some tenths of a dB tell nothing. `*`: the two ran on
-different machines, one of which renders more images a second, and makes more steps in a limit of time.
+The paper's table has each system ahead of the next in dB and in images a second:
+{systems}.
+The first three columns subtract the next system's `psnr_paper`, the paper's own score, after the longest run of each;
+two rivals are compared after the longest limit that both have had. The last three divide images a second. A difference
+below 0, or a quotient below 1, contradicts the paper's order, but with one seed some tenths of a dB tell nothing. `*`:
+the two ran on different machines, one of which renders more images a second, and makes more steps in a limit of time.
 """
 _COLUMNS = {
     "t_train_s": ("s", 0), "psnr_tissue_db": ("dB", 1), "ssim": ("SSIM", 3), "iterations": ("steps", 0),

@@ -86,7 +86,7 @@ class Candidate(Protocol):
         ...
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
-        """[H, W, 3] mm, world: how far what each pixel of frame 0 shows has moved at `frame`; NaN where none is."""
+        """[H, W, 3] mm, world: displacement up to `frame` of what each pixel of frame 0 shows; NaN where unknown."""
         ...
 
 

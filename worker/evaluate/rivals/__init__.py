@@ -30,6 +30,6 @@ a whole picture of 160x128 takes two cores 22 to 24 s."""
 
 
 def scored_step_px(series: str, device: Device, width: int) -> int:
-    """Of how many pixels, across and down, a system is scored on one (worker/evaluate/thinned.py), in a picture so many
-    pixels wide: more where rays take long."""
+    """The step in pixels, across and down, of the lattice that a system is scored on (worker/evaluate/thinned.py), in a
+    picture so many pixels wide: more than 1 where rays take long."""
     return max(CPU_STEP_PX, width // CPU_COLUMNS) if series in RAY_BY_RAY and device.kind == "cpu" else 1

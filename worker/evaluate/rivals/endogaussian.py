@@ -175,8 +175,8 @@ class EndoGaussian(Rival):
 
     def _is_static(self, iteration: int, progress: float) -> bool:
         """Whether a step is without motion: one of the first static_steps of a training that makes all published steps;
-        of one that ends sooner, only in its first static_share. More progress than the steps made are of those
-        published means that it ends sooner."""
+        of one that ends sooner, only in its first static_share. It ends sooner if progress is ahead of the share of
+        the published steps that are made."""
         share, made = self.settings.static_share, iteration - 1
         in_time = self.time_share < share and (progress < share or progress <= made / self.published_steps)
         return in_time and iteration <= self.settings.static_steps

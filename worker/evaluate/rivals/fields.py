@@ -3,10 +3,10 @@
 Symbols: M points or rays, S samples a ray.
 
 A place in the box is [-1, 1]^3: x / z and y / z of the first camera from least to greatest, and 1 / z without the
-outermost 0.1 % at either end, each with 5 % of its range beyond.
-Pixels of an endoscope at rest are columns of it, as in the normalised device coordinates of the papers. A place on a
-ray is its share s in [0, 1] of the ray, even in 1 / z of the ray's own camera: from the nearest depth of the training
-frames to the farthest, without the outermost 0.1 % at either end and with 5 % of that range beyond it.
+outermost 0.1 % at either end, each with 5 % of its range beyond. Pixels of an endoscope at rest are columns of it, as
+in the normalised device coordinates of the papers. A place on a ray is its share s in [0, 1] of the ray, even in 1 / z
+of the ray's own camera: from the nearest depth of the training frames to the farthest, without the outermost 0.1 % at
+either end and with 5 % of that range beyond it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Box:
         room = MARGIN * (high - low).clamp(min=1e-6)
         inverse_far, inverse_near = torch.quantile(1 / depth_mm, ends).tolist()
         beyond = MARGIN * max(inverse_near - inverse_far, 0.01 * inverse_near)  # one depth alone needs a range, too
-        far_mm = 1 / max(inverse_far - beyond, 0.1 * inverse_far)  # finite
+        far_mm = 1 / max(inverse_far - beyond, 0.1 * inverse_far)  # never beyond infinity
         return cls(low - room, high + room, 1 / (inverse_near + beyond), far_mm)
 
     def place(self, points_mm: Tensor) -> Tensor:

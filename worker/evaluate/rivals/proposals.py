@@ -19,7 +19,7 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generat
     """[M, count + 1] edges of intervals that each hold as much of the weight [M, K] between the edges [M, K + 1], after
     PADDING is added to it.
 
-    random: moves each edge by up to half an interval; None: none.
+    random: draws the jitter of each edge, at most half an interval; None: no jitter.
     """
     weight = weight + PADDING
     share = torch.cumsum(weight / weight.sum(-1, keepdim=True), -1)

@@ -101,7 +101,7 @@ class Rival(ABC):
     def motion_mm(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
     ) -> NDArray[np.float32]:
-        """[H, W, 3] mm, world: how far what each pixel shows at t = 0 has moved at t; NaN where it is not told."""
+        """[H, W, 3] mm, world: displacement up to t of what each pixel shows at t = 0; NaN where none is known."""
         del t, world_from_camera
         return np.full((intrinsics.height, intrinsics.width, 3), np.nan, np.float32)
 

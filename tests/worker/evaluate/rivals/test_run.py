@@ -36,7 +36,7 @@ from worker.train.presets import PRESETS
 CLIP = "phantom:pull:64x48:9frames"
 
 
-def tiny(seen: Seen, seed: int) -> EndoNerf:
+def tiny_nerf(seen: Seen, seed: int) -> EndoNerf:
     return EndoNerf(seen, seed, TINY_NERF)
 
 
@@ -48,13 +48,13 @@ def tiny_planes(seen: Seen, seed: int) -> LerPlane:
     return LerPlane(seen, seed, TINY_PLANES)
 
 
-OF_EACH_RIVAL = pytest.mark.parametrize("make", [tiny, tiny_gaussians, tiny_planes])
+OF_EACH_RIVAL = pytest.mark.parametrize("make", [tiny_nerf, tiny_gaussians, tiny_planes])
 
 
 @pytest.mark.parametrize(
     ("series", "make", "not_measured"),
     [
-        ("endonerf", tiny, ("motion", "confidence", "coverage and seen_ok", "whole pictures")),
+        ("endonerf", tiny_nerf, ("motion", "confidence", "coverage and seen_ok", "whole pictures")),
         ("endogaussian", tiny_gaussians, ("confidence",)),
     ],
 )
@@ -98,7 +98,7 @@ def test_a_step_changes_the_numbers_that_have_a_gradient(make: Make) -> None:
 
 
 def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
-    rival, clock = tiny(Seen.of(small_clip(2), [1]), 0), Stopwatch()
+    rival, clock = tiny_nerf(Seen.of(small_clip(2), [1]), 0), Stopwatch()
     scored: list[int] = []
 
     def score(made: int) -> float:
@@ -165,7 +165,7 @@ def test_a_rival_knows_how_much_of_its_time_is_used() -> None:
 
 
 def test_a_rival_stops_when_it_is_asked_to_and_when_its_loss_is_no_number() -> None:
-    rival = tiny(Seen.of(small_clip(2), [1]), 0)
+    rival = tiny_nerf(Seen.of(small_clip(2), [1]), 0)
     with pytest.raises(Cancelled):
         train_rival(rival, Length(9, None), Stopwatch(), TrainingHooks(should_stop=lambda: True), lambda _: math.nan)
     with torch.no_grad():
@@ -208,7 +208,7 @@ def test_a_rival_trains_on_the_frames_of_the_published_method_whatever_its_budge
 
 def test_a_picture_is_rendered_once_until_the_rival_trains_further() -> None:
     clip = small_clip(2)
-    rival = tiny(Seen.of(clip, [1]), 0)
+    rival = tiny_nerf(Seen.of(clip, [1]), 0)
     renders = Renders(rival)
     first = renders(0.5, clip.world_from_camera[1], clip.intrinsics)
     assert renders(0.5, clip.world_from_camera[1], clip.intrinsics) is first
@@ -225,7 +225,7 @@ def test_what_draws_ray_by_ray_is_scored_at_as_few_pixels_of_a_wide_clip_as_of_a
 
 
 def test_a_rival_has_cells_in_the_atlas_that_tell_of_the_clip(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(stability, "RIVAL_SYSTEMS", {"endonerf": tiny})
+    monkeypatch.setattr(stability, "RIVAL_SYSTEMS", {"endonerf": tiny_nerf})
     atlas = stability.StabilityBench(tmp_path, stability.Grid(64, 48, frames=9, iterations=2))
     cells = stability.plan(["smoke"], [5], ["endonerf"], [0])
     rows = [atlas.measure(cell, TrainingHooks()) for cell in cells]
