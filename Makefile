@@ -82,7 +82,7 @@ $(DEV_STAMP): $(STAMP)
 	@touch $@
 
 demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
-	@$(BIN)/python -m client.demo
+	@$(BIN)/python -m lab.demo
 
 # the whole suite runs a file on each core, up to four at a time
 WHOLE_SUITE := -n auto --maxprocesses 4 --dist loadfile
@@ -96,8 +96,8 @@ check: setup $(DEV_STAMP) ## style, types, the import rules and the containers' 
 	@$(BIN)/mypy
 	@$(BIN)/python -m pytest tests/test_layers.py tests/test_docker.py
 
-bench: setup ## every benchmarks/bm_*.py, one after the other
-	@set -e; for each in benchmarks/bm_*.py; do \
+bench: setup ## every lab/benchmarks/bm_*.py, one after the other
+	@set -e; for each in lab/benchmarks/bm_*.py; do \
 		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
 		echo "== $$each"; $(BIN)/python "$$each"; done
 
@@ -108,25 +108,25 @@ gpu-check: ## with an NVIDIA GPU: check its kernels and time them; at most 7 min
 		python=$(BIN)/python; fi; \
 	if ! "$$python" -c '$(NEW_ENOUGH)' 2>/dev/null; then \
 		echo "gpu-check: '$$python' is no Python of 3.11 or newer; name one: make gpu-check PYTHON=/path/to/python3" >&2; exit 1; fi; \
-	"$$python" benchmarks/gpu/check.py $(ARGS)
+	"$$python" lab/gpu/check.py $(ARGS)
 
 evaluate: setup ## every preset on every clip, and the charts; takes hours, and resumes (CLIPS="phantom:pull ...")
 	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
 	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
 	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --eyes left both --out docs/results)
 	@$(EVALUATE) $(CLIPS) --series ablation --out docs/results
-	@$(BIN)/python -m benchmarks.pages
+	@$(BIN)/python -m lab.pages
 
 table1: setup ## the systems of the paper's table 1: presets as they are, the others for TABLE_SECONDS each; takes a day, and resumes (TABLE_CLIPS=...)
 	@$(EVALUATE) $(TABLE_CLIPS) --series paper fast --out docs/results/table1
 	@for seconds in $(TABLE_SECONDS); do \
 		$(EVALUATE) $(TABLE_CLIPS) --series endogaussian lerplane endonerf --budget-s $$seconds --out docs/results/table1 || exit; \
 	done
-	@$(BIN)/python -m benchmarks.pages
+	@$(BIN)/python -m lab.pages
 
 capacity: setup ## a grid of fixed capacities beside the automatic choice; takes hours, and resumes
 	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
-	@$(BIN)/python -m benchmarks.pages
+	@$(BIN)/python -m lab.pages
 
 chaos: setup $(DEV_STAMP) ## kill every part of a running service at every point, and count what was lost; ARGS narrows it
 	@$(BIN)/python -m tests.chaos $(ARGS)

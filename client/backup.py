@@ -8,12 +8,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
-from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
 from contract.store.owner import check_owner
-from contract.wire.errors import InputError
 from contract.wire.job import JobState
+from intrasplat.commands.arguments import Commands, add_command, add_data_dir, settings_of
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError
 
 UNREADABLE = (
     "have records that cannot be read, which were left out; a restored service queues those anew whose clips are there"

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from contract.runtime.local import LOCAL_COMMANDS
+from intrasplat.commands.local import LOCAL_COMMANDS
 
 DASHBOARD_VARIABLE = "INTRASPLAT_DASHBOARD_DIR"
 
@@ -36,8 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_local(arguments: list[str]) -> int:
     """Replace this process by the worker's program, so that signals and exit status are the worker's."""
     if find_spec("worker") is None:  # the service's container has no torch
-        from contract.runtime.exits import end_by
-        from contract.wire.errors import UnavailableError
+        from intrasplat.commands.exits import end_by
+        from intrasplat.errors import UnavailableError
 
         problem = f"`intrasplat {arguments[0]}` needs the worker's packages, which are not installed here."
         return end_by(UnavailableError(problem, "Run it where a worker runs, such as in the worker's container."))

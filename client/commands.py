@@ -15,11 +15,11 @@ from client.backup import add_backup
 from client.keys import add_keys
 from client.remote import add_remote
 from client.slicer.command import add_slicer
-from contract.runtime.arguments import Commands, add_command, count
-from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
-from contract.runtime.local import LOCAL_COMMANDS, WORKER_SUMMARY
 from contract.runtime.settings import Settings, default_data_dir
-from contract.wire.errors import InputError, IntrasplatError
+from intrasplat.commands.arguments import Commands, add_command, count
+from intrasplat.commands.exits import EXIT_CODES_HELP, ExitCode, exit_code_of
+from intrasplat.commands.local import LOCAL_COMMANDS, WORKER_SUMMARY
+from intrasplat.errors import InputError, IntrasplatError
 
 EXAMPLES = """\
 a clip on this machine:

@@ -1,4 +1,4 @@
-"""A client for the commands: its errors become those of contract/wire/errors.py, and its remedies name commands.
+"""A client for the commands: its errors become those of intrasplat/errors.py, and its remedies name commands.
 
 The service's remedies name routes. Which command helps instead follows from the error's type and from the command that
 was refused, never from the words of the service.
@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 import intrasplat_client
-from contract.wire.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+from intrasplat.errors import Cancelled, InputError, IntrasplatError, UnavailableError
 from intrasplat_client import Client
 from intrasplat_client.session import DEFAULT_PATIENCE_S
 

@@ -16,10 +16,10 @@ from pydantic.json_schema import models_json_schema
 
 from contract.wire.cameras import SceneCameras
 from contract.wire.job import TERMINAL_STATES, JobView
-from contract.wire.measuring import Measurement
-from contract.wire.options import JobOptions
-from contract.wire.report import Report
 from contract.wire.webhooks import Delivery
+from intrasplat.measuring import Measurement
+from intrasplat.options import JobOptions
+from intrasplat.report import Report
 
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
 READ = (JobView, Delivery, Report, SceneCameras, Measurement)

@@ -18,13 +18,13 @@ from datetime import UTC, datetime
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now, utc_text
 from contract.access.keys import DAY_S, DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope, new_key
 from contract.access.webhook_secrets import tenant_secret
-from contract.runtime.arguments import Commands, add_command, add_data_dir, settings_of
-from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
-from contract.store.disk_errors import disk_errors
 from contract.store.owner import check_owner
-from contract.wire.errors import InputError
 from contract.wire.job import TENANT_PATTERN
+from intrasplat.commands.arguments import Commands, add_command, add_data_dir, settings_of
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError
+from intrasplat.files.disk_errors import disk_errors
 
 UNITS_S = {"d": DAY_S, "h": 3600.0}
 TIME_REMEDY = "Give a time to come: 90d, 12h, or a date or time such as 2030-01-31 or 2030-01-31T18:00 (UTC)."

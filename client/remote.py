@@ -11,15 +11,15 @@ from datetime import datetime
 from pathlib import Path
 
 from client.connected import KEY_VARIABLE, Remedies, connected
-from contract.runtime.arguments import Commands, add_command, add_options, count, finite, given_options
-from contract.runtime.exits import ExitCode
-from contract.runtime.progress_bar import ProgressBar
-from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobProgress
 from contract.wire.labels import NO_NAMES
-from contract.wire.names import MANIFEST
-from contract.wire.options import JobOptions
 from contract.wire.webhooks import CALLBACK_ABOUT
+from intrasplat.commands.arguments import Commands, add_command, add_options, count, finite, given_options
+from intrasplat.commands.exits import ExitCode
+from intrasplat.commands.progress_bar import ProgressBar
+from intrasplat.errors import InputError, SceneError
+from intrasplat.names import MANIFEST
+from intrasplat.options import JobOptions
 from intrasplat_client import Client, Conflict, JobState, JobView
 from intrasplat_client.connection import DEFAULT_URL
 

@@ -25,13 +25,13 @@ from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer, ServerEnd
 from contract.runtime.locks import FolderLock
-from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
 from contract.runtime.supervised import Supervised
-from contract.store.disk import Disk
-from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import StoreFullError, disk_errors
+from intrasplat.machine.processes import told_to_end
 from intrasplat_client import Client
 
 DASHBOARD = Path(__file__).resolve().parent / "dashboard"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from contract.store.disk import FULL_REMEDY, Disk
+from intrasplat.files.disk import FULL_REMEDY, Disk
 
 LOOK_PERIOD_S = 1.0
 

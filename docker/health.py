@@ -7,7 +7,7 @@ import urllib.request
 
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 TIMEOUT_S = 3.0
 

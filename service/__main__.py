@@ -10,11 +10,11 @@ from contract.access.keys import check_keys
 from contract.queue.installed import check_queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime import traces
-from contract.runtime.exits import ExitCode, end_by
 from contract.runtime.logs import configure
 from contract.runtime.settings import Settings
 from contract.store.store import open_store
-from contract.wire.errors import IntrasplatError, UnavailableError
+from intrasplat.commands.exits import ExitCode, end_by
+from intrasplat.errors import IntrasplatError, UnavailableError
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server

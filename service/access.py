@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from contract.access.keys import ApiKey, KeyFile, KeyScope, needs_keys
 from contract.runtime.settings import Settings
-from contract.wire.errors import ErrorCode
 from contract.wire.job import LOCAL_TENANT, JobRecord
+from intrasplat.errors import ErrorCode
 from service.limits import Limiter
 from service.problems import Problem
 

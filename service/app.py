@@ -12,8 +12,8 @@ from fastapi.staticfiles import StaticFiles
 
 from contract.queue.interface import Queue
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
-from contract.runtime.version import version
 from contract.store.store import Store
+from intrasplat.version import version
 from service import (
     check,
     exports,

@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
 from contract.runtime.logs import current_request_id
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 from service.access import Caller, Refusal
 from service.problems import Problem
 

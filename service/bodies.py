@@ -8,8 +8,8 @@ from pydantic.json_schema import models_json_schema
 
 from contract.wire.checks import DescribedClip
 from contract.wire.labels import Labels
-from contract.wire.names import JOB_ID_PATTERN
 from contract.wire.webhooks import CALLBACK_ABOUT, CALLBACK_PART, MAX_CALLBACK_CHARACTERS
+from intrasplat.names import JOB_ID_PATTERN
 from service.upload import CLIP_OF, PARTS, SUFFIXES
 
 EXAMPLE_ID = "0123456789abcdef0123456789abcdef"

@@ -18,8 +18,8 @@ from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
 import httpx
 
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError
 from contract.wire.webhooks import CALLBACK_PART, MAX_CALLBACK_CHARACTERS
+from intrasplat.errors import InputError
 
 DEFAULT_PORTS = {"https": 443, "http": 80}
 URL_TEXT = re.compile(r"[!-~]+", re.ASCII)

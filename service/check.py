@@ -15,15 +15,15 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
-from contract.intake.calibration.fit import fitted
-from contract.intake.calibration.opencv import look_at_calibration
-from contract.intake.calibration.types import StereoCalibration
-from contract.intake.fit import STEREO_VIDEOS, calibration_missing
-from contract.intake.limits import ClipLimits
-from contract.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_head
 from contract.wire.checks import DescribedClip, DescribedFile, Finding, FindingCode
-from contract.wire.errors import InputError, LimitError
-from contract.wire.options import JobOptions, parse_options
+from intrasplat.errors import InputError, LimitError
+from intrasplat.intake.calibration.fit import fitted
+from intrasplat.intake.calibration.opencv import look_at_calibration
+from intrasplat.intake.calibration.types import StereoCalibration
+from intrasplat.intake.fit import STEREO_VIDEOS, calibration_missing
+from intrasplat.intake.limits import ClipLimits
+from intrasplat.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_head
+from intrasplat.options import JobOptions, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.problems import Problem

@@ -17,8 +17,8 @@ from zmq.utils.monitor import parse_monitor_message
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.runtime import traces
-from contract.wire.errors import UnavailableError
 from contract.wire.rendering import CancelRequest, SceneRequest, WorkerReply, WorkerRequest
+from intrasplat.errors import UnavailableError
 
 CONNECT_TIMEOUT_S = 2.0
 """A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""

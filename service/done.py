@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from contract.queue.interface import Queue, place_of
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
+from intrasplat.errors import UnavailableError
 from service.listing import Page, SceneSearch, find_among, find_page
 from service.questions import Questions
 

@@ -17,8 +17,8 @@ from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import MAX_EVENTS, Queue, event_order
-from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobRecord, JobState, JobView
+from intrasplat.errors import UnavailableError
 
 POLL_PERIOD_S = 0.4
 LOOK_PERIOD_S = 2.0

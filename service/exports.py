@@ -16,10 +16,10 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.store.stored_exports import stored_parts
-from contract.wire.errors import UnavailableError
-from contract.wire.exports import EXPORT_FORMATS, ExportOptions, check_export
 from contract.wire.rendering import ExportRequest
+from intrasplat.errors import UnavailableError
+from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
+from intrasplat.scene.stored_exports import stored_parts
 from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer

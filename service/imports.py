@@ -12,11 +12,11 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.store.archive import read_archive
-from contract.wire.errors import InputError
 from contract.wire.job import JobFiles, JobRecord, JobView
-from contract.wire.options import JobOptions, parse_options
-from contract.wire.report import Imported
+from intrasplat.errors import InputError
+from intrasplat.options import JobOptions, parse_options
+from intrasplat.report import Imported
+from intrasplat.scene.archive import read_archive
 from service.access import Caller
 from service.bodies import SCENE_BODY
 from service.callbacks import check_callback

@@ -12,7 +12,7 @@ from starlette.requests import Request
 
 from contract.runtime.settings import Settings
 from contract.store.store import Store
-from contract.wire.errors import LimitError
+from intrasplat.errors import LimitError
 from service.partial import promised_bytes
 from service.problems import LENGTH_REMEDY, Problem, no_room_for, room_remedy
 from service.upload import LIMIT_REMEDY

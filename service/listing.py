@@ -17,10 +17,10 @@ from fastapi import Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.queue.interface import MAX_LISTED, Place, place_of
-from contract.wire.errors import InputError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import folded
-from contract.wire.names import PresetName
+from intrasplat.errors import InputError
+from intrasplat.names import PresetName
 
 MAX_LOOKED_AT = 2000
 """Jobs, for one page. Where none of so many fits, the page is short or empty and has a cursor all the same."""

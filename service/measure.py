@@ -9,8 +9,8 @@ from pydantic import ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
-from contract.wire.measuring import MAX_POINTS, Measurement, parse_points
 from contract.wire.rendering import MeasureRequest
+from intrasplat.measuring import MAX_POINTS, Measurement, parse_points
 from service.deps import AnyCaller, Services
 from service.renders import ViewQuery, image_response
 from service.scenes import finished_job

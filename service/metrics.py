@@ -17,10 +17,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from contract.access.keys import KeyFile
 from contract.queue.interface import Queue
 from contract.runtime import traces
-from contract.runtime.version import version
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
 from contract.wire.webhooks import DeliveryStatus
+from intrasplat.errors import UnavailableError
+from intrasplat.version import version
 
 NO_ROUTE = "none"
 """The page's files, and all that does not exist: paths are a caller's to choose, so they are no label."""

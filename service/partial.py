@@ -18,10 +18,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.store.durable import flush, replace_file
 from contract.store.shelf import is_job_id, new_job_id
 from contract.store.store import Store
-from contract.wire.names import JOB_ID_PATTERN
+from intrasplat.files.durable import flush, replace_file
+from intrasplat.names import JOB_ID_PATTERN
 
 DECLARATION = "upload.json"
 HASHED_AT_ONCE_BYTES = 2**20

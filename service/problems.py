@@ -13,8 +13,8 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocketState
 
 from contract.queue.interface import QueueFullError
-from contract.store.disk_errors import NO_ROOM, StoreFullError
-from contract.wire.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
+from intrasplat.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
+from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2

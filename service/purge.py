@@ -16,12 +16,12 @@ from pydantic import BaseModel, Field
 
 from contract.access.audit import AuditAction, utc_now
 from contract.queue.interface import Queue
-from contract.store.disk_errors import StoreFullError, disk_errors
-from contract.store.durable import flush
 from contract.store.shelf import Removed, is_job_id
 from contract.store.store import PURGING, Store
-from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES
+from intrasplat.errors import UnavailableError
+from intrasplat.files.disk_errors import StoreFullError, disk_errors
+from intrasplat.files.durable import flush
 from service.access import Caller
 from service.audit import Audit
 from service.done import DoneJobs

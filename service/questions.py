@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from contract.queue.redis_client import QUEUE_REMEDY
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 THREADS = 8
 """Questions at a time."""

@@ -18,17 +18,17 @@ from starlette.requests import ClientDisconnect
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.intake.fit import check_fit
-from contract.intake.limits import MAX_MEMORY_BYTES, ClipLimits
-from contract.intake.sniff import check_file
 from contract.queue.interface import Admission, QueueFullError
 from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
-from contract.wire.errors import InputError, LimitError, UnavailableError
 from contract.wire.job import Forecast, JobRecord, JobView
 from contract.wire.labels import parse_labels
-from contract.wire.options import JobOptions, parse_options
+from intrasplat.errors import InputError, LimitError, UnavailableError
+from intrasplat.intake.fit import check_fit
+from intrasplat.intake.limits import MAX_MEMORY_BYTES, ClipLimits
+from intrasplat.intake.sniff import check_file
+from intrasplat.options import JobOptions, parse_options
 from service.access import Caller
 from service.bodies import REQUEST_BODY
 from service.callbacks import check_callback

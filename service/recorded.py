@@ -7,9 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from contract.store.recorded import MASK, PICTURE, read_frame
-from contract.wire.names import RECORDED, Eye
-from contract.wire.rendering import MEDIA_TYPES, ImageFormat, RecordedMasks, RecordedRequest, WorkerReply
+from contract.wire.rendering import RecordedRequest, WorkerReply
+from intrasplat.names import RECORDED, Eye
+from intrasplat.picture import MEDIA_TYPES, ImageFormat, RecordedMasks
+from intrasplat.scene.recorded_file import MASK, PICTURE, read_frame
 from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services

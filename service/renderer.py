@@ -19,9 +19,9 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import WORKER_TTL_S, Queue
 from contract.runtime import traces
-from contract.store.durable import replace_file
-from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
+from intrasplat.errors import UnavailableError
+from intrasplat.files.durable import replace_file
 from service.connection import Answer, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `intrasplat worker`."

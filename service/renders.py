@@ -16,21 +16,13 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.runtime.settings import Settings
-from contract.runtime.version import version
 from contract.wire.job import JobState
-from contract.wire.names import Eye
-from contract.wire.notices import NoticeCode
-from contract.wire.pose import Pose, parse_pose
-from contract.wire.rendering import (
-    MEDIA_TYPES,
-    Highlights,
-    ImageFormat,
-    IntrinsicsOverride,
-    Layer,
-    RenderRequest,
-    ReplyError,
-    Unseen,
-)
+from contract.wire.rendering import RenderRequest, ReplyError
+from intrasplat.names import Eye
+from intrasplat.notices import NoticeCode
+from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+from intrasplat.pose import Pose, parse_pose
+from intrasplat.version import version
 from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer

@@ -13,9 +13,9 @@ from contract.queue.interface import Queue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
 from contract.store.store import Store
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord
-from contract.wire.options import JobOptions
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.options import JobOptions
 from service.purge import Purger, try_to_purge
 
 LOOK_PERIOD_S = 300.0

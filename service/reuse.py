@@ -7,8 +7,8 @@ from pathlib import Path
 
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
-from contract.wire.errors import InputError, LimitError, UnavailableError
 from contract.wire.job import JobRecord
+from intrasplat.errors import InputError, LimitError, UnavailableError
 from service.access import Caller
 from service.deps import Deps, not_found
 from service.partial import sha256_of

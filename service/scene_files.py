@@ -14,9 +14,9 @@ from starlette.responses import FileResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.store.results import listed_files
-from contract.wire.errors import SceneError
-from contract.wire.names import MANIFEST, SCENE
+from intrasplat.errors import SceneError
+from intrasplat.names import MANIFEST, SCENE
+from intrasplat.scene.results import listed_files
 from service.bodies import BINARY
 from service.deps import AnyCaller, Services
 from service.problems import Problem

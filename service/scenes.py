@@ -11,11 +11,11 @@ from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.store.shelf import is_job_id
 from contract.wire.cameras import CamerasRequest, SceneCameras
-from contract.wire.errors import SceneError
 from contract.wire.job import JobRecord, JobState
-from contract.wire.names import CURVE, MASKS
-from contract.wire.notices import NoticeCode, Severity
-from contract.wire.report import Report
+from intrasplat.errors import SceneError
+from intrasplat.names import CURVE, MASKS
+from intrasplat.notices import NoticeCode, Severity
+from intrasplat.report import Report
 from service.access import Caller
 from service.bodies import BINARY, TEXT
 from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene

@@ -28,8 +28,8 @@ from starlette.types import Message
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.wire.job import JobState
-from contract.wire.notices import Notice
 from contract.wire.rendering import PictureCamera
+from intrasplat.notices import Notice
 from service.access import Caller, Refusal, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of

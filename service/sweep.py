@@ -19,8 +19,8 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import Queue
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
+from intrasplat.errors import UnavailableError
 
 SWEEP_PERIOD_S = 2.0
 ABANDONED_PERIOD_S = 3600.0

@@ -11,9 +11,10 @@ from starlette.responses import Response
 from contract import CONTRACT_VERSION
 from contract.access.audit import utc_text
 from contract.access.keys import KeyScope
-from contract.runtime.version import version
-from contract.wire.errors import UnavailableError
-from contract.wire.rendering import ImageFormat, Layer, WorkerAddress
+from contract.wire.rendering import WorkerAddress
+from intrasplat.errors import UnavailableError
+from intrasplat.picture import ImageFormat, Layer
+from intrasplat.version import version
 from service.bodies import TEXT
 from service.deps import AnyCaller, EarlyCaller, Services
 from service.problems import Problem, no_room, room_remedy

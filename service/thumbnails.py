@@ -10,10 +10,11 @@ from fastapi import APIRouter, Header, Response
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.keys import KeyScope
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.notices import NoticeCode
-from contract.wire.rendering import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, RenderRequest
+from contract.wire.rendering import RenderRequest
+from intrasplat.errors import UnavailableError
+from intrasplat.notices import NoticeCode
+from intrasplat.picture import MEDIA_TYPES, ImageFormat, IntrinsicsOverride
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
 from service.renders import Shown, answer_to, matches, problem_of_reply

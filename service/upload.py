@@ -14,11 +14,11 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from contract.intake.limits import MAX_CALIBRATION_BYTES
-from contract.wire.errors import InputError, LimitError
 from contract.wire.job import JobFiles
 from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, Labels, parse_labels
 from contract.wire.webhooks import CALLBACK_PART
+from intrasplat.errors import InputError, LimitError
+from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
 from service.problems import Problem, no_room_for
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")

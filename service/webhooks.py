@@ -26,9 +26,9 @@ from contract.queue.deliveries import Loan
 from contract.queue.interface import Queue
 from contract.runtime import traces
 from contract.runtime.settings import Settings
-from contract.runtime.version import version
-from contract.wire.errors import UnavailableError
 from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnded, TryFailure
+from intrasplat.errors import UnavailableError
+from intrasplat.version import version
 from service.callbacks import LookUps, is_allowed, permitted_addresses
 from service.retry_after import asked_wait_s
 

@@ -12,27 +12,27 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from contract.store.archive import ARCHIVE, archive_parts
-from contract.wire.names import CURVE, MANIFEST, REPORT, SCENE
-from contract.wire.report import Report
+from intrasplat.names import CURVE, MANIFEST, REPORT, SCENE
+from intrasplat.report import Report
+from intrasplat.scene.archive import ARCHIVE, archive_parts
+from intrasplat.scene.checkpoint import save_scene
+from intrasplat.scene.scene import TrainedScene
+from tests.intrasplat.scene.compacting import compacted
+from tests.intrasplat.scenes import random_scene
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from tests.worker.scene.compacting import compacted
-from tests.worker.scenes import random_scene
-from worker.scene.checkpoint import save_scene
-from worker.scene.scene import Scene
 
 ORIGIN = "0123456789abcdef" * 2
 Files = dict[str, bytes]
 
 
-def small_scene(count: int = 300) -> Scene:
+def small_scene(count: int = 300) -> TrainedScene:
     """A compact scene of some hundred Gaussians."""
     scene = random_scene(count=count)
     wide = dataclasses.replace(scene.gaussians, mean=scene.gaussians.mean * scene.gaussians.mean.new([12, 9, 1]))
     return compacted(dataclasses.replace(scene, gaussians=wide))
 
 
-def report_of(scene: Scene, **changes: object) -> Report:
+def report_of(scene: TrainedScene, **changes: object) -> Report:
     fitting = {
         "gaussians": len(scene.gaussians),
         "frame_count": scene.frame_count,
@@ -43,7 +43,7 @@ def report_of(scene: Scene, **changes: object) -> Report:
     return REPORT_OF_A_SCENE.model_copy(update={**fitting, **changes})
 
 
-def stored(folder: Path, scene: Scene, **changes: object) -> Path:
+def stored(folder: Path, scene: TrainedScene, **changes: object) -> Path:
     """A scene's folder as a worker leaves it. changes: of its report."""
     save_scene(folder, scene)
     (folder / REPORT).write_text(report_of(scene, **changes).model_dump_json(indent=1))
@@ -51,7 +51,7 @@ def stored(folder: Path, scene: Scene, **changes: object) -> Path:
     return folder
 
 
-def archived(folder: Path, scene: Scene, **changes: object) -> bytes:
+def archived(folder: Path, scene: TrainedScene, **changes: object) -> bytes:
     """The archive of a scene that is stored in the folder."""
     return b"".join(archive_parts(stored(folder, scene, **changes), ORIGIN))
 

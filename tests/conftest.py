@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.machine.gpu import find_gpu
+from intrasplat.machine.gpu import find_gpu
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SEED = 20240527

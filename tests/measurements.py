@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 
-from contract.wire.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
 from contract.wire.rendering import MeasureRequest
+from intrasplat.camera import Intrinsics
+from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
 from tests.cameras import CAMERAS, FRAMES, RATE_HZ
-from worker.daemon.serve import Reply
-from worker.input.camera import Intrinsics
+from worker.serve import Reply
 
 DEPTH_MM, UNCERTAINTY_MM = 60.0, 0.4
 RANGE_MM = (45.0, 78.0)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from contract.wire.notices import Notice, NoticeCode
-from contract.wire.report import Report
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.report import Report
 
 REPORT_OF_A_SCENE = Report(
     psnr_tissue_db=36.2,

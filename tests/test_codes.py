@@ -6,13 +6,13 @@ import re
 from collections.abc import Iterator
 
 import contract.queue.interface
-import contract.store.disk_errors  # noqa: F401
-import worker.daemon.serve  # noqa: F401
+import intrasplat.files.disk_errors  # noqa: F401
+import worker.serve  # noqa: F401
 from contract.wire.checks import FindingCode
-from contract.wire.errors import ErrorCode, IntrasplatError
-from contract.wire.measuring import RefusalCode
-from contract.wire.notices import NoticeCode
 from contract.wire.webhooks import TryFailure
+from intrasplat.errors import ErrorCode, IntrasplatError
+from intrasplat.measuring import RefusalCode
+from intrasplat.notices import NoticeCode
 from tests.test_repository import REPOSITORY
 
 PAGE, ERRORS, REFUSALS, TRIES = re.split(

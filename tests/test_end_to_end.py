@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from client.demo import started_service
 from intrasplat_client import Client, JobRejected, JobState
+from lab.demo import started_service
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 12
 MIN_PSNR_DB = 20.0

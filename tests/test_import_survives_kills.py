@@ -10,7 +10,7 @@ from contextlib import suppress
 import httpx
 import pytest
 
-from contract.wire.names import SCENE
+from intrasplat.names import SCENE
 from tests.archives import archived, files_of, small_scene
 from tests.chaos.deployment import Deployment, Victim
 from tests.chaos.points import Point

@@ -18,9 +18,9 @@ from contract.queue.interface import Claim
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import ENVIRONMENT_PREFIX, OTHER_VARIABLES, Settings
 from contract.store.shelf import new_job_id
-from contract.wire.errors import InputError
 from contract.wire.job import JobFiles, JobRecord, JobState
-from contract.wire.options import JobOptions, Priority
+from intrasplat.errors import InputError
+from intrasplat.options import JobOptions, Priority
 from tests.contract.conftest import emptied, valkey_url
 from tests.test_docker import SERVICES, project
 from tests.test_repository import REPOSITORY

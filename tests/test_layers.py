@@ -99,7 +99,7 @@ def imports_of(package: str) -> Iterator[Import]:
 
 
 def room_of(module: str) -> str:
-    """worker.raster.cpu.blend belongs to raster; worker itself and other packages' modules to no room ("")."""
+    """intrasplat.splat.cpu.blend belongs to raster; worker itself and other packages' modules to no room ("")."""
     package, *rest = module.split(".")
     return rest[0] if rest and package in ROOMS else ""
 
@@ -148,9 +148,9 @@ def test_a_room_imports_only_rooms_above_it(package: str) -> None:
 def test_the_checks_see_imports_inside_functions_and_of_names() -> None:
     source = "def late() -> None:\n    from worker import train\n"
     modules = [each.module for each in imports_of_source(REPOSITORY / "worker" / "model" / "loss.py", source)]
-    assert "worker.train" in modules
-    assert is_out_of_order("worker.model.loss", "worker.train")
-    assert not is_out_of_order("worker.train.loop", "worker.model")
+    assert "intrasplat.train" in modules
+    assert is_out_of_order("intrasplat.splat.loss", "intrasplat.train")
+    assert not is_out_of_order("intrasplat.train.loop", "intrasplat.splat")
 
 
 @pytest.mark.parametrize("module", ["contract", "client", "client.cli", "intrasplat_client", "service.app"])

@@ -19,8 +19,8 @@ import pytest
 
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime.settings import Settings
+from intrasplat.view.frame import render_frame
 from tests.archives import archived, files_of, small_scene
-from worker.render.view import render_frame
 
 pytest.importorskip("s3fs")
 moto_server: Any = pytest.importorskip("moto.server")

@@ -9,7 +9,7 @@ from contract.queue.interface import LEASE_S, MAX_ATTEMPTS
 from contract.runtime.settings import ENVIRONMENT_PREFIX, Settings, default_data_dir
 from contract.store.s3 import SEEN_FOR_S
 from tests.test_repository import REPOSITORY
-from worker.daemon.supervisor import TIDY_PERIOD_S
+from worker.supervisor import TIDY_PERIOD_S
 
 PAGE = (REPOSITORY / "docs" / "operations.md").read_text(encoding="utf-8")
 

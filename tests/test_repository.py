@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from worker.machine.gpu import MAX_TRITON, MIN_TRITON, triton_range
+from intrasplat.machine.gpu import MAX_TRITON, MIN_TRITON, triton_range
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("docker/**/*.md")])

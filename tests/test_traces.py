@@ -15,21 +15,21 @@ from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.trace import SpanKind
 
-from client.demo import free_port, started_service
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime import traces
 from contract.runtime.otlp import OtlpRecorder
 from contract.runtime.settings import Settings
 from intrasplat_client import Client
+from lab.demo import free_port, started_service
 from service import webhooks
 from tests.collector import Seen, collecting
+from tests.intrasplat.clip.hostile import CALIBRATION, VIDEO
 from tests.receiver import Receiver
 from tests.service.live import live_service
 from tests.service.telling import cancelled, log_of, telling
 from tests.service.test_logs import MARKER, say_it_everywhere
 from tests.service.under_test import CLIP, Painter, ServiceUnderTest, running_service
 from tests.test_repository import REPOSITORY
-from tests.worker.input.clip.hostile import CALIBRATION, VIDEO
 
 CALLERS_TRACE, CALLERS_SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 TRACEPARENT = f"00-{CALLERS_TRACE}-{CALLERS_SPAN}-01"
@@ -208,7 +208,7 @@ def test_a_caller_whose_trace_is_not_sampled_has_no_spans(
 
 def test_without_the_variables_no_span_is_made_and_no_sdk_imported() -> None:
     program = (
-        "import sys, service.__main__, worker.daemon.supervisor; from contract.runtime import traces; "
+        "import sys, service.__main__, worker.supervisor; from contract.runtime import traces; "
         "traces.configure('service', environment={}); traces.begin('x').end(); "
         "print([each for each in ('contract.runtime.otlp', 'opentelemetry.sdk.trace') if each in sys.modules])"
     )

@@ -10,12 +10,12 @@ import pytest
 
 from contract.queue.redis_hash import new_record, record_of
 from contract.store.store import Store
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
-from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.notices import NoticeCode
 from contract.wire.rendering import WorkerAddress
 from contract.wire.webhooks import Delivery, TryFailure
+from intrasplat.errors import ErrorCode
+from intrasplat.names import CURVE, MANIFEST, REPORT
+from intrasplat.notices import NoticeCode
 from tests.contract.queues import TRAINING, job
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 

@@ -15,24 +15,24 @@ from importlib import import_module
 from typing import NoReturn
 
 from contract.runtime import traces
-from contract.runtime.arguments import add_command
-from contract.runtime.exits import EXIT_CODES_HELP, ExitCode, end_by
-from contract.runtime.local import LOCAL_COMMANDS, WORKER_SUMMARY
 from contract.runtime.logs import configure
-from contract.runtime.processes import told_to_end
 from contract.runtime.settings import Settings
-from contract.wire.errors import IntrasplatError, UnavailableError
-from worker.machine.cores import keep_libraries_to_one_thread
+from intrasplat.commands.arguments import add_command
+from intrasplat.commands.exits import EXIT_CODES_HELP, ExitCode, end_by
+from intrasplat.commands.local import LOCAL_COMMANDS, WORKER_SUMMARY
+from intrasplat.errors import IntrasplatError, UnavailableError
+from intrasplat.machine.cores import keep_libraries_to_one_thread
+from intrasplat.machine.processes import told_to_end
 
 MODULES = {
-    "reconstruct": "worker.commands.reconstruct",
-    "render": "worker.commands.render",
-    "export": "worker.commands.export",
-    "measure": "worker.commands.measure",
-    "poses": "worker.commands.poses",
-    "phantom": "worker.phantom.command",
-    "evaluate": "worker.evaluate.command",
-    "stability": "worker.evaluate.stability_command",
+    "reconstruct": "intrasplat.commands.reconstruct",
+    "render": "intrasplat.commands.render",
+    "export": "intrasplat.commands.export",
+    "measure": "intrasplat.commands.measure",
+    "poses": "intrasplat.commands.poses",
+    "phantom": "lab.phantom.command",
+    "evaluate": "lab.evaluate.command",
+    "stability": "lab.evaluate.stability_command",
 }
 """By command: the module with its add_cli_arguments and run_cli."""
 
@@ -89,7 +89,7 @@ def _consume(options: argparse.Namespace) -> int:
     traces.configure("worker", settings.worker_name)
     if settings.redis_url is None:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
-    from worker.daemon.supervisor import run_supervisor
+    from worker.supervisor import run_supervisor
 
     run_supervisor(settings, told_to_end(), renders_only=options.renders_only)
     return ExitCode.OK
@@ -99,7 +99,7 @@ def _device(options: argparse.Namespace) -> int:
     settings = Settings.from_environment()
     configure(settings, "device")
     traces.configure("device", settings.worker_name)
-    from worker.daemon.device import run_device
+    from worker.device import run_device
 
     run_device(settings)
     return ExitCode.OK

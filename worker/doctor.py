@@ -18,10 +18,10 @@ from contract.access.keys import KeyFile
 from contract.queue.embedded import find_server
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import GIB, Settings
-from contract.wire.errors import IntrasplatError, UnavailableError
-from contract.wire.names import DeviceName
-from worker.machine.cores import cores
-from worker.machine.gpu import Gpu, find_gpu, triton_range
+from intrasplat.errors import IntrasplatError, UnavailableError
+from intrasplat.machine.cores import cores
+from intrasplat.machine.gpu import Gpu, find_gpu, triton_range
+from intrasplat.names import DeviceName
 
 PACKAGES = (
     "torch",
@@ -140,7 +140,7 @@ def _device(settings: Settings) -> list[Finding]:
 
 def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:
     """What would be trained on, where this is the setting and that is there."""
-    backend = importlib.import_module("worker.raster.backend")
+    backend = importlib.import_module("intrasplat.splat.backend")
     try:
         device = backend.choose_device(asked, gpu, cpu_by=backend.CPU_BY_VARIABLE)
     except UnavailableError as error:
@@ -180,7 +180,7 @@ def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
 def _segmenter(settings: Settings) -> list[Finding]:
     if settings.segmenter is None:
         return []
-    from worker.instruments import load_segmenter  # needs packages that _packages may miss
+    from intrasplat.instruments import load_segmenter  # needs packages that _packages may miss
 
     try:
         load_segmenter(settings.segmenter)

@@ -12,7 +12,7 @@ const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDow
 const ENDS = { Home: 0, End: 100 };
 const MIDDLE = 50;
 const TOLD_MS = 10_000;
-/** The hatch of what nobody saw (worker/render/unseen.py). */
+/** The hatch of what nobody saw (intrasplat/view/unseen.py). */
 const GREYS = ["rgb(40 40 40)", "rgb(74 74 74)"];
 const STRIPES_A_PICTURE = 96;
 

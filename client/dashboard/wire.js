@@ -295,7 +295,7 @@ export const LIMITS = {
   retention_hours: {"default": null, "above": 0, "max": 87600},
 };
 
-/** The colours of contract/wire/colours.py, RRGGBB. */
+/** The colours of intrasplat/colours.py, RRGGBB. */
 export const COLOUR_TABLE = [
   "00224e00234f00245100255300255400265600275800285900285b00295d002a5f002a61002b62002c64002c66002d68",
   "002e6a002e6c002f6d00306f0030700031700031710132710533710833700c34700f357012357014367016377018376f",

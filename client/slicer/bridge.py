@@ -23,8 +23,8 @@ from client.slicer.link import Link
 from client.slicer.playback import Playback
 from client.slicer.status import Status
 from client.slicer.surface import Surface
-from contract.wire.errors import InputError, SceneError
-from contract.wire.pose import parse_pose
+from intrasplat.errors import InputError, SceneError
+from intrasplat.pose import parse_pose
 from intrasplat_client import (
     AsyncClient,
     Forbidden,

@@ -12,12 +12,12 @@ import intrasplat_client
 from client.connected import command_error
 from client.remote import add_service
 from client.slicer.say import say
-from contract.runtime.arguments import Commands, add_command, count, finite
-from contract.runtime.exits import ExitCode
-from contract.runtime.processes import heeding_signals
 from contract.runtime.settings import LOOPBACK_NAMES
-from contract.wire.errors import InputError, UnavailableError
-from contract.wire.report import RESEARCH_USE
+from intrasplat.commands.arguments import Commands, add_command, count, finite
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.machine.processes import heeding_signals
+from intrasplat.report import RESEARCH_USE
 
 if TYPE_CHECKING:
     from client.slicer.bridge import Bridge, Choice

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from client.slicer.messages import HEADER_BYTES, HEARD, DamagedError, Heard, read, read_header
 from client.slicer.say import say
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 MAX_PEERS = 8
 MAX_HEARD_BYTES, MAX_SKIPPED_BYTES = 1 << 16, 1 << 28

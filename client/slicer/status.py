@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from client.slicer.playback import Playback
-from contract.wire.report import RESEARCH_USE
+from intrasplat.report import RESEARCH_USE
 from intrasplat_client.models import Report, Severity
 from intrasplat_client.views import Image
 

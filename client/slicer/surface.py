@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from contract.wire.errors import SceneError
+from intrasplat.errors import SceneError
 
 VERTEX = np.dtype([("place", "<f4", 3), ("colour", "u1", 3)])
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict
 
 from contract.access.chain import HEAD_PATTERN, START, head_of
 from contract.runtime.locks import held
-from contract.store.disk_errors import StoreFullError, disk_errors
-from contract.store.durable import flush
+from intrasplat.files.disk_errors import StoreFullError, disk_errors
+from intrasplat.files.durable import flush
 
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"

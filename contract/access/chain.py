@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 
 START = "0" * 64
 HEAD_PATTERN = r"[0-9a-f]{64}"

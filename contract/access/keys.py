@@ -24,10 +24,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from contract.runtime.locks import held
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
-from contract.store.disk_errors import disk_errors
-from contract.store.durable import replace_file
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TENANT_PATTERN
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.files.disk_errors import disk_errors
+from intrasplat.files.durable import replace_file
 
 KEYS_FILE = "keys.json"
 ROTATED_FILE = "keys.rotated.json"

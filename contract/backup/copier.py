@@ -10,7 +10,7 @@ from pathlib import Path
 
 from contract.backup.manifest import PIECE_BYTES, BackedUpFile
 from contract.store.local import remove_tree
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 MAX_TRIES = 10
 """A folder's files change at most a few times: when its scores, its labels and its thumbnail come."""

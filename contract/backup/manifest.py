@@ -25,8 +25,8 @@ from contract.access.audit import AUDIT_FILE, HEAD_FILE
 from contract.access.keys import KEYS_FILE, ROTATED_FILE
 from contract.store.shelf import Area
 from contract.store.store import PURGING, UNSCORED
-from contract.wire.errors import InputError
 from contract.wire.job import JobRecord
+from intrasplat.errors import InputError
 
 MANIFEST_FILE = "backup.json"
 JOBS_FILE = "jobs.jsonl"

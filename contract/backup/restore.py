@@ -40,13 +40,13 @@ from contract.backup.manifest import (
 from contract.queue.interface import IDEMPOTENCY_S, Queue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
-from contract.store.disk import Disk
-from contract.store.disk_errors import NO_ROOM
-from contract.store.durable import flush
 from contract.store.local import remove_tree
 from contract.store.store import RESTORING, Store
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import NO_ROOM
+from intrasplat.files.durable import flush
 
 NO_CONTENT = frozenset({"lost+found"})
 """What may lie in an empty folder: the root of a disk has it."""

@@ -30,15 +30,15 @@ from contract.backup.manifest import (
 from contract.queue.interface import Queue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
-from contract.runtime.version import version
-from contract.store.disk import Disk
-from contract.store.disk_errors import NO_ROOM
-from contract.store.durable import move_folder
 from contract.store.local import LocalShelf, remove_tree
 from contract.store.shelf import Area, ShelfEntry, is_job_id
 from contract.store.store import PURGING, UNSCORED
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import NO_ROOM
+from intrasplat.files.durable import move_folder
+from intrasplat.version import version
 
 FIELD = "DEST"
 COPIED = (Area.SPOOL, Area.SCENES)

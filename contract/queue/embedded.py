@@ -23,10 +23,10 @@ from contract.queue.log_reserve import fill_reserve
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
 from contract.runtime.supervised import Supervised
-from contract.store.disk import Disk
-from contract.store.disk_errors import disk_errors
-from contract.store.durable import replace_file
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import disk_errors
+from intrasplat.files.durable import replace_file
 
 MAX_SOCKET_PATH_BYTES = 107
 """The longest path of a unix socket on Linux: sun_path without the final zero."""

@@ -10,7 +10,7 @@ from contract.queue.embedded import EmbeddedServer
 from contract.queue.interface import Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 logger = logging.getLogger("intrasplat.queue")
 

@@ -19,13 +19,13 @@ from statistics import median
 from typing import Protocol
 
 from contract.queue.deliveries import Deliveries
-from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
-from contract.wire.names import BUDGETS_S
-from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import WorkerAddress
 from contract.wire.webhooks import DeliveryStatus
+from intrasplat.errors import ErrorCode, UnavailableError
+from intrasplat.names import BUDGETS_S
+from intrasplat.options import ReconstructionOptions
 
 MAX_ATTEMPTS = 3
 """A job whose worker has died this often fails: the job is assumed to be the cause."""

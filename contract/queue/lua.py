@@ -15,9 +15,9 @@ from contract.queue.deliveries import OWED_FOR_S
 from contract.queue.interface import MAX_ATTEMPTS, MAX_DURATIONS, MAX_EVENTS, YIELD_S, worker_died
 from contract.queue.redis_client import reachable
 from contract.queue.redis_hash import EVENT_FIELDS
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError, JobState, sources_of
-from contract.wire.names import BUDGETS_S
+from intrasplat.errors import ErrorCode
+from intrasplat.names import BUDGETS_S
 
 NAMES = (
     *("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget"),

@@ -13,7 +13,7 @@ from redis.sentinel import MasterNotFoundError
 
 from contract.queue.sentinels import SentinelsRefuseError, primary_of
 from contract.runtime.queue_url import VARIABLE, parse_queue_url
-from contract.wire.errors import InputError, UnavailableError
+from intrasplat.errors import InputError, UnavailableError
 
 PATIENCE_S = 12.0
 """How long to try, in all, until the server counts as away."""

@@ -82,11 +82,11 @@ from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import PATIENCE_S, connect, reachable
 from contract.queue.redis_deliveries import RedisDeliveries
 from contract.queue.redis_hash import BESIDE_EVENTS, label_fields, new_record, record_of, table_of
-from contract.wire.errors import UnavailableError
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
 from contract.wire.webhooks import DeliveryStatus
+from intrasplat.errors import UnavailableError
 
 PREFIX = "{intrasplat}:"
 INDEX = PREFIX + "index"

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 HELD_TIMEOUT_S = 5.0
 """Whoever holds a lock by held() does so for milliseconds only."""

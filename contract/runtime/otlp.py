@@ -19,7 +19,7 @@ from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from contract.runtime.traces import TRACEPARENT, Attributes, Kind, Span, flush
-from contract.runtime.version import version
+from intrasplat.version import version
 
 NAMES = {
     "method": "http.request.method",

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
 
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 
 VARIABLE = "REDIS_URL"
 SCHEMES = ("redis", "rediss", "unix")

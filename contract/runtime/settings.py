@@ -13,8 +13,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic_core.core_schema import ValidationInfo
 
 from contract.runtime.queue_url import parse_queue_url
-from contract.wire.errors import InputError
-from contract.wire.names import DeviceName
+from intrasplat.errors import InputError
+from intrasplat.names import DeviceName
 
 GIB = 2**30
 ENVIRONMENT_PREFIX = "INTRASPLAT_"

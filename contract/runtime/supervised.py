@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
-from contract.runtime.processes import die_with_parent
-from contract.wire.errors import UnavailableError
+from intrasplat.commands.exits import LAST_WORDS_VARIABLE, ExitCode, take_last_words
+from intrasplat.errors import UnavailableError
+from intrasplat.machine.processes import die_with_parent
 
 FIRST_PAUSE_S = 0.5
 MAX_PAUSE_S = 30.0
@@ -42,7 +42,7 @@ class Supervised:
         name: of the child, for messages.
         command: the program and its arguments.
         environment: of the child; None: the environment of this process.
-        last_words: the file in which the child leaves the UnavailableError that ended it (contract/runtime/exits.py);
+        last_words: the file in which the child leaves the UnavailableError that ended it (intrasplat/commands/exits.py);
             None: its status alone is looked at.
         log: the file that receives stdout and stderr; None: the child writes where this process does.
         pipes: connect stdin and stdout to this process. The child is asked to end by closing its stdin, not by SIGTERM.

@@ -8,9 +8,9 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from contract.store.disk_errors import disk_errors
-from contract.store.durable import flush, move_folder, replace_file
 from contract.store.shelf import MARKERS, Area, Removed, ShelfEntry, checked, entry_of
+from intrasplat.files.disk_errors import disk_errors
+from intrasplat.files.durable import flush, move_folder, replace_file
 
 
 class LocalShelf:

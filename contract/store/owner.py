@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from contract.store.shelf import Area
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 
 def check_owner(data_dir: Path) -> None:

@@ -23,9 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from contract.store.disk_errors import NO_ROOM, disk_errors
 from contract.store.local import LocalShelf, remove_tree
-from contract.store.results import listed_files
 from contract.store.shelf import (
     ABANDONED_AFTER_S,
     MARKERS,
@@ -36,8 +34,10 @@ from contract.store.shelf import (
     entry_of,
     new_job_id,
 )
-from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.names import MANIFEST
+from intrasplat.errors import SceneError, UnavailableError
+from intrasplat.files.disk_errors import NO_ROOM, disk_errors
+from intrasplat.names import MANIFEST
+from intrasplat.scene.results import listed_files
 
 SEEN_FOR_S = 2.0
 """How long an entry that was found counts as there. A purge on another machine takes effect with this delay."""

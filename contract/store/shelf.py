@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Protocol
 
-from contract.wire.names import JOB_ID_PATTERN, MANIFEST, RESUME, SUBMISSION
+from intrasplat.names import JOB_ID_PATTERN, MANIFEST, RESUME, SUBMISSION
 
 ABANDONED_AFTER_S = 24 * 3600.0
 """What has not changed for this long belongs to a process that has ended."""

@@ -33,17 +33,17 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from contract.runtime.settings import Settings
-from contract.store.disk_errors import disk_errors
-from contract.store.durable import replace_file
 from contract.store.local import LocalShelf, remove_tree
-from contract.store.results import RESULTS, add_scores
 from contract.store.s3 import S3Shelf
 from contract.store.shelf import ABANDONED_AFTER_S, Area, Removed, Shelf, ShelfEntry, entry_of, is_job_id
-from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.labels import Labels
-from contract.wire.names import KEPT, LABELS, REPORT, SUBMISSION, THUMBNAIL
-from contract.wire.report import Report
+from intrasplat.errors import SceneError, UnavailableError
+from intrasplat.files.disk_errors import disk_errors
+from intrasplat.files.durable import replace_file
+from intrasplat.names import KEPT, LABELS, REPORT, SUBMISSION, THUMBNAIL
+from intrasplat.report import Report
+from intrasplat.scene.results import RESULTS, add_scores
 
 UNSCORED = "unscored"
 PURGING = "purging"

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.wire.names import JOB_ID_PATTERN
+from intrasplat.names import JOB_ID_PATTERN
 
 Offset = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
 Row = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]

@@ -9,12 +9,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.wire.codes import known_code
-from contract.wire.errors import ErrorCode
 from contract.wire.labels import Labels
-from contract.wire.names import JOB_ID_PATTERN
-from contract.wire.options import JobOptions
-from contract.wire.report import Imported
+from intrasplat.codes import known_code
+from intrasplat.errors import ErrorCode
+from intrasplat.names import JOB_ID_PATTERN
+from intrasplat.options import JobOptions
+from intrasplat.report import Imported
 
 LOCAL_TENANT = "local"
 """Whose jobs they are where no key is asked for."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 
 MAX_LABEL_CHARACTERS = 80
 MAX_METADATA = 16

@@ -15,11 +15,11 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
-from contract.wire.exports import ExportOptions
-from contract.wire.measuring import MAX_POINTS, Point
-from contract.wire.names import JOB_ID_PATTERN, Eye
-from contract.wire.notices import Notice
-from contract.wire.pose import MatrixPose, OrbitPose
+from intrasplat.formats import ExportOptions
+from intrasplat.measuring import MAX_POINTS, Point
+from intrasplat.names import JOB_ID_PATTERN, Eye
+from intrasplat.notices import Notice
+from intrasplat.pose import MatrixPose, OrbitPose
 
 
 class Layer(StrEnum):

@@ -13,9 +13,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.wire.codes import known_code
 from contract.wire.job import JobRecord, JobState
-from contract.wire.names import JOB_ID_PATTERN
+from intrasplat.codes import known_code
+from intrasplat.names import JOB_ID_PATTERN
 
 CALLBACK_PART = "callback_url"
 MAX_CALLBACK_CHARACTERS = 1000

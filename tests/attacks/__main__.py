@@ -18,10 +18,10 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.bm_service import wait_for_stage
+from lab.benchmarks.bm_service import wait_for_stage
+from lab.evaluate.rows import commit, machine
 from tests.attacks.arena import Arena, View, p99_ms, standing
 from tests.attacks.attacks import ATTACKS, Attack, Heard
-from worker.evaluate.rows import commit, machine
 
 MAX_RATIO = 2.0
 SETTLE_S = 1.0

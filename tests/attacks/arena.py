@@ -18,10 +18,10 @@ from typing import Any
 import httpx
 import numpy as np
 
-from benchmarks.bm_service import PhantomClip, make_clip, trained
-from client.demo import started_service
 from contract.access.keys import DEFAULT_SCOPES, KeyFile
 from intrasplat_client import Client
+from lab.benchmarks.bm_service import PhantomClip, make_clip, trained
+from lab.demo import started_service
 
 GIB = 2**30
 ROOM_BYTES = 40 * GIB

@@ -17,11 +17,11 @@ from typing import Any
 
 import httpx
 
-from benchmarks.bm_service import process
-from contract.intake.limits import MAX_CALIBRATION_BYTES
+from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
 from intrasplat_client import JobRejected
+from lab.benchmarks.bm_service import process
 from tests.attacks.arena import GIB, Arena
-from tests.worker.input.clip.hostile import CALIBRATION, VIDEO
+from tests.intrasplat.clip.hostile import CALIBRATION, VIDEO
 
 LARGE = {"width": "4096", "height": "2160", "format": "jpeg"}
 UPLOADS_OF_TENANT = 4

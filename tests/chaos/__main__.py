@@ -20,12 +20,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from contract.queue.interface import BEAT_PERIOD_S, LEASE_S
+from lab.evaluate.rows import commit, machine
 from tests.chaos.campaign import CELLS, NO_MATTER, Outcome, run_kill
 from tests.chaos.deployment import TENANTS, Deployment, Victim
 from tests.chaos.history import RERUN_WITHIN_S, ClipHistory, orphans
 from tests.chaos.points import Point
 from tests.chaos.scenarios import ScenarioResult, bad_wire, zombie
-from worker.evaluate.rows import commit, machine
 
 CANCEL_EVERY = 5
 """Every fifth kill at a point that a cancel can precede comes after one."""

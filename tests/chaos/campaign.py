@@ -18,8 +18,8 @@ from urllib.parse import urlsplit
 import httpx
 
 from contract.queue.deliveries import LOAN_S
-from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+from intrasplat.errors import SceneError, UnavailableError
 from tests.chaos.deployment import TENANTS, Deployment, Victim
 from tests.chaos.history import ClipHistory, violations
 from tests.chaos.points import Point

@@ -9,7 +9,7 @@ from pathlib import Path
 from contract.queue.interface import BEAT_PERIOD_S, LEASE_S, Event
 from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobState
-from contract.wire.names import MANIFEST
+from intrasplat.names import MANIFEST
 from tests.chaos.deployment import WEBHOOK_SECRET
 from tests.chaos.trainer import STEPS, STEPS_MADE
 from tests.receiver import Webhook

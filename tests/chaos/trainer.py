@@ -1,4 +1,4 @@
-"""A stand-in for the device child: obeys worker/daemon/orders.py, trains nothing, and is done in half a second."""
+"""A stand-in for the device child: obeys worker/orders.py, trains nothing, and is done in half a second."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import time
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 
-from contract.runtime.processes import die_with_parent
 from contract.runtime.settings import Settings
 from contract.wire.job import JobProgress
-from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME
+from intrasplat.machine.processes import die_with_parent
+from intrasplat.names import CURVE, MANIFEST, REPORT, RESUME
 from tests.chaos.points import Point, reach
 from tests.reports import REPORT_OF_A_SCENE
-from worker.daemon.channel import Channel, Orders, Task
-from worker.daemon.orders import Advanced, Finished, Ready, RunJob, Scored, ScoreScene, Stopped
+from worker.channel import Channel, Orders, Task
+from worker.orders import Advanced, Finished, Ready, RunJob, Scored, ScoreScene, Stopped
 
 STEPS = 10
 STEPS_MADE = "steps_made"
@@ -52,7 +52,7 @@ def _obey(channel: Channel, orders: Orders) -> None:
 
 def _views(endpoint: str) -> AbstractContextManager[object]:
     """Answer every render with the same bytes as long as the context lasts."""
-    from worker.daemon.serve import Reply, RequestServer  # with OpenCV: too slow a start for who is killed often
+    from worker.serve import Reply, RequestServer  # with OpenCV: too slow a start for who is killed often
 
     return RequestServer(endpoint, lambda request: Reply(PICTURE, "image/jpeg", 0.0))
 
@@ -82,7 +82,7 @@ def _kept_steps(kept: Path) -> list[int]:
 
 
 def _keep(kept: Path, made: list[int]) -> None:
-    """As worker/train/keep.py does: aside, then in place. One whose folder a later attempt has taken over goes on."""
+    """As intrasplat/train/keep.py does: aside, then in place. One whose folder a later attempt has taken over goes on."""
     aside = kept / f".{RESUME}.new"
     with suppress(FileNotFoundError):
         aside.write_text(json.dumps(made))

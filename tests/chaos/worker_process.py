@@ -9,7 +9,7 @@ import threading
 
 from contract.runtime.settings import Settings
 from tests.chaos.points import install_worker_points
-from worker.daemon.supervisor import run_supervisor
+from worker.supervisor import run_supervisor
 
 REAL_CHILD = "INTRASPLAT_CHAOS_REAL_CHILD"
 """Set: the device child is the real one, too."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from PIL import Image
 from selenium.webdriver.support.ui import WebDriverWait
 
-from client.demo import started_service, zipped
+from lab.demo import started_service, zipped
 from tests.client.page import LOOK_S, Page, browser
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "images" / "dashboard.png"

@@ -22,24 +22,16 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
 from contract.wire.job import JobError
-from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.rendering import (
-    MEDIA_TYPES,
-    ExportRequest,
-    Highlights,
-    MeasureRequest,
-    RecordedRequest,
-    SceneRequest,
-    Unseen,
-    WorkerAddress,
-)
+from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, SceneRequest, WorkerAddress
+from intrasplat.names import CURVE, MANIFEST, REPORT
+from intrasplat.picture import MEDIA_TYPES, Highlights, Unseen
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from worker.daemon.serve import Reply, RequestServer
+from worker.serve import Reply, RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7

@@ -32,34 +32,30 @@ from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
 from contract.wire.job import JobFiles, JobProgress, JobRecord
-from contract.wire.names import CURVE, MANIFEST, REPORT, Eye
-from contract.wire.notices import Notice, NoticeCode
-from contract.wire.pose import OrbitPose
 from contract.wire.rendering import (
-    MEDIA_TYPES,
     ExportRequest,
-    Highlights,
-    ImageFormat,
-    Layer,
     MeasureRequest,
     PictureCamera,
     RecordedRequest,
     RenderRequest,
     SceneRequest,
-    Unseen,
     WorkerAddress,
 )
-from contract.wire.report import Report
+from intrasplat.names import CURVE, MANIFEST, REPORT, Eye
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
+from intrasplat.pose import OrbitPose
+from intrasplat.report import Report
+from intrasplat.scene.checkpoint import save_scene
+from intrasplat.scene.scene import TrainedScene
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from worker.daemon.pace import Pace
-from worker.daemon.serve import Reply, RequestServer
-from worker.scene.checkpoint import save_scene
-from worker.scene.scene import Scene
+from worker.pace import Pace
+from worker.serve import Reply, RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0
@@ -227,7 +223,7 @@ class Site:
             claim, progress.model_copy(update={"seconds_left": seconds_left, "psnr_right_db": psnr_right_db})
         )
 
-    def finish(self, claim: Claim, *, scored: bool = True, model: Scene | None = None) -> str:
+    def finish(self, claim: Claim, *, scored: bool = True, model: TrainedScene | None = None) -> str:
         """The job's scene; model: as it is stored, for those who read it."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
         if model is None:
@@ -242,7 +238,7 @@ class Site:
         self.announce()
         return claim.job_id
 
-    def scene(self, mark: str = "", model: Scene | None = None) -> str:
+    def scene(self, mark: str = "", model: TrainedScene | None = None) -> str:
         """A finished scene whose id begins with the mark."""
         self.queued_job(mark)
         return self.finish(self.claim(), model=model)

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from selenium import webdriver
 
 from client.up import DASHBOARD
-from contract.wire.pose import parse_pose
+from intrasplat.pose import parse_pose
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.view.camera import pose_of
+from intrasplat.view.frame import render_frame
+from intrasplat.view.unseen import hatched
 from service.guard import ANSWER_HEADERS
 from tests.client.page import GRAPHICS, browser
-from worker.daemon.views import pose_of
-from worker.render.unseen import hatched
-from worker.render.view import render_frame
-from worker.scene.scene import Scene
 
 Picture = NDArray[np.uint8]
 
@@ -133,7 +133,7 @@ class PlayerPage:
         times: dict[str, float] = self.run(LOAD, SCENES)
         return times
 
-    def compare(self, scene: Scene, seen: Seen, scale: float = 1.0, *, is_timed: bool = False) -> Compared:
+    def compare(self, scene: TrainedScene, seen: Seen, scale: float = 1.0, *, is_timed: bool = False) -> Compared:
         """A view of the scene that is loaded, drawn by both."""
         camera = scene.intrinsics
         camera = camera.resized(round(camera.width * scale), round(camera.height * scale))

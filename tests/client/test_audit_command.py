@@ -11,7 +11,7 @@ import pytest
 from client.cli import main
 from contract.access.audit import AUDIT_FILE, HEAD_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.chain import check_file
-from contract.runtime.exits import ExitCode
+from intrasplat.commands.exits import ExitCode
 
 
 def write(folder: Path, count: int) -> Path:

@@ -9,11 +9,11 @@ import pytest
 
 from client.cli import main
 from contract.queue.installed import installed_queue
-from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
 from contract.store.owner import check_owner
 from contract.store.store import Store
-from contract.wire.errors import UnavailableError
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import UnavailableError
 from tests.contract.stores import SERVICE, accepted, given_to
 
 

@@ -8,8 +8,8 @@ import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
-from contract.wire.notices import Notice, NoticeCode
-from contract.wire.pose import OrbitPose, parse_pose
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.pose import OrbitPose, parse_pose
 from tests.cameras import CAMERAS, FIRST_CAMERAS, FRAMES
 from tests.client.page import CAMERA, DEPTH_MM, Page, Site
 from tests.client.words import say

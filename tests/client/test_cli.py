@@ -18,11 +18,11 @@ from client.cli import main
 from client.connected import command_error
 from client.remote import progress_of
 from contract.access.keys import KeyFile, KeyScope
-from contract.runtime.exits import ExitCode, exit_code_of
-from contract.wire.errors import IntrasplatError
 from contract.wire.job import JobError
-from contract.wire.names import MASKS, SUBMISSION
-from contract.wire.report import Masks
+from intrasplat.commands.exits import ExitCode, exit_code_of
+from intrasplat.errors import IntrasplatError
+from intrasplat.names import MASKS, SUBMISSION
+from intrasplat.report import Masks
 from intrasplat_client import Client, JobState
 from intrasplat_client.errors import error_of_document
 from tests.archives import archived, small_scene

@@ -16,7 +16,7 @@ import pytest
 
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError, JobProgress
-from contract.wire.names import MASKS
+from intrasplat.names import MASKS
 from intrasplat_client import (
     AsyncClient,
     Client,
@@ -35,8 +35,8 @@ from intrasplat_client import (
 )
 from tests.cameras import CAMERAS
 from tests.client.local_service import SNAPSHOT_ITERATION, LocalService, line_to, local_service
+from tests.intrasplat.clip.hostile import CALIBRATION
 from tests.reports import REPORT_OF_A_SCENE
-from tests.worker.input.clip.hostile import CALIBRATION
 
 WAIT_S = 10.0
 

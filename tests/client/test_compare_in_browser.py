@@ -11,14 +11,14 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
-from contract.wire.names import RECORDED, Eye
+from intrasplat.camera import Intrinsics
+from intrasplat.clip import DepthClip
+from intrasplat.clip import Eye as ClipEye
+from intrasplat.names import RECORDED, Eye
+from intrasplat.view.recorded import EYES, kept_frames
 from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
 from tests.client.test_theatre_in_browser import SIZES, box_of, screen_of
 from tests.client.words import say
-from worker.input.camera import Intrinsics
-from worker.input.clip import DepthClip
-from worker.input.clip import Eye as ClipEye
-from worker.render.recorded import EYES, kept_frames
 
 FRAMES = REPORT_OF_THE_PAGE.frame_count
 HATCH = (40, 74)

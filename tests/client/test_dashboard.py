@@ -11,7 +11,7 @@ import pytest
 
 from client.generate_page import PAGE_TYPES, generate
 from client.up import DASHBOARD
-from contract.wire.options import JobOptions
+from intrasplat.options import JobOptions
 from tests.client.words import table
 
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))

@@ -13,9 +13,9 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 from contract.access.keys import KeyFile, KeyScope
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError, JobState
-from contract.wire.rendering import Highlights, Unseen
+from intrasplat.errors import ErrorCode
+from intrasplat.picture import Highlights, Unseen
 from tests.client.local_service import CLIP
 from tests.client.page import (
     CAMERA,
@@ -26,7 +26,7 @@ from tests.client.page import (
     site_at,
 )
 from tests.client.words import say
-from worker.daemon.pace import MAX_SAVED_S, SHARE
+from worker.pace import MAX_SAVED_S, SHARE
 
 POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
 ACTIONS = "return [...document.querySelectorAll(`[data-job='${arguments[0]}'] button`)].map((b) => b.dataset.action)"

@@ -12,8 +12,8 @@ import pytest
 from client.cli import main
 from contract.access.audit import AUDIT_FILE, utc_text
 from contract.access.keys import DAY_S, KEYS_FILE, KeyFile, KeyScope
-from contract.runtime.exits import ExitCode
-from contract.store.durable import aside_of
+from intrasplat.commands.exits import ExitCode
+from intrasplat.files.durable import aside_of
 from tests.contract.stores import SERVICE, given_to
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from client.cli import main
-from contract.runtime.exits import ExitCode
+from intrasplat.commands.exits import ExitCode
 from intrasplat_client import Client, InputError, JobState, core
 from tests.client.local_service import LocalService
 

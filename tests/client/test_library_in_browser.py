@@ -12,10 +12,10 @@ from selenium.webdriver.common.keys import Keys
 
 from client.up import DASHBOARD
 from contract.access.keys import KeyFile, KeyScope
-from contract.wire.exports import EXPORT_FORMATS
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.labels import LabelChange, Labels
-from contract.wire.notices import Notice, NoticeCode
+from intrasplat.formats import EXPORT_FORMATS
+from intrasplat.notices import Notice, NoticeCode
 from tests.client.page import REPORT_OF_THE_PAGE, Page, Site, grey_of, site_at
 from tests.client.words import say
 

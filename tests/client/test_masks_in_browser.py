@@ -8,8 +8,8 @@ from zipfile import ZipFile
 import pytest
 from selenium.webdriver.support.select import Select
 
-from contract.wire.names import MASKS
-from contract.wire.report import Masks
+from intrasplat.names import MASKS
+from intrasplat.report import Masks
 from tests.client.local_service import CLIP
 from tests.client.page import RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
 from tests.client.words import say

@@ -9,7 +9,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select
 
-from contract.wire.colours import COLOUR_TABLE
+from intrasplat.colours import COLOUR_TABLE
 from tests.client.page import CAMERA, Page, Site
 from tests.client.words import say
 from tests.measurements import DEPTH_MM, RANGE_MM, UNCERTAINTY_MM, stretch

@@ -9,16 +9,16 @@ import pytest
 
 from client.up import DASHBOARD
 from contract.wire.checks import FindingCode
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobState
-from contract.wire.notices import NoticeCode
+from intrasplat.errors import ErrorCode
+from intrasplat.machine.forecast import COMPILATION, USUAL_S
+from intrasplat.notices import NoticeCode
+from intrasplat.quality.judge import STAGE
 from service.problems import TITLES
 from tests.client.words import LANGUAGES, table
 from tests.test_codes import NOTICES
-from worker.daemon.consume import PUBLISHING
-from worker.daemon.orders import FETCHING
-from worker.machine.forecast import COMPILATION, USUAL_S
-from worker.report.judge import STAGE
+from worker.consume import PUBLISHING
+from worker.orders import FETCHING
 
 API_WORDS = re.compile(
     r"\b(GET|POST|PUT|PATCH|DELETE|HEAD)\b|/(jobs|scenes|render|uploads|key|reconstruct)\b|\w=\w|https?:|\bJSON\b"

@@ -8,8 +8,8 @@ import pytest
 
 from client.generate_models import MODELS, generate
 from contract.wire.job import TERMINAL_STATES
-from contract.wire.notices import NoticeCode
-from contract.wire.options import JobOptions
+from intrasplat.notices import NoticeCode
+from intrasplat.options import JobOptions
 from intrasplat_client import InputError, JobState, JobView, Report, models
 from intrasplat_client.submission import checked_options
 from tests.reports import REPORT_OF_A_SCENE, a_warning

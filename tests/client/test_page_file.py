@@ -17,10 +17,14 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from client.cli import DASHBOARD_VARIABLE
 from client.up import DASHBOARD
-from contract.runtime.exits import ExitCode
-from contract.store.inline import CannotInlineError, inlined
-from contract.store.stored_exports import stored_parts
-from contract.wire.errors import InputError, SceneError, UnavailableError
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError, SceneError, UnavailableError
+from intrasplat.scene.checkpoint import load_scene
+from intrasplat.scene.inline import CannotInlineError, inlined
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.scene.stored_exports import stored_parts
+from intrasplat.view.frame import render_frame
+from intrasplat.view.unseen import hatched
 from tests.archives import ORIGIN, small_scene, stored
 from tests.client.page import browser
 from tests.client.player import drawing_browser
@@ -28,12 +32,8 @@ from tests.client.test_accessible_in_browser import RUN
 from tests.client.test_accessible_in_browser import axe as axe
 from tests.client.test_player import scattered
 from tests.client.words import table
-from tests.worker.scenes import random_scene
+from tests.intrasplat.scenes import random_scene
 from worker.__main__ import main
-from worker.render.unseen import hatched
-from worker.render.view import render_frame
-from worker.scene.checkpoint import load_scene
-from worker.scene.scene import Scene
 
 LEAST_DB = 50.0
 OPENS_WITHIN_S = 120.0
@@ -54,12 +54,12 @@ setTimeout(look, 1500);
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> TrainedScene:
     return scattered(14, moves=True)
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
+def file(tmp_path_factory: pytest.TempPathFactory, scene: TrainedScene) -> Path:
     folder = tmp_path_factory.mktemp("page")
     path = folder / "scene.html"
     path.write_bytes(b"".join(stored_parts("html", stored(folder / "scene", scene), ORIGIN, DASHBOARD)))
@@ -100,7 +100,7 @@ def psnr_db(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
 
 
 def test_the_file_opens_from_a_disk_and_shows_what_a_worker_renders(
-    driver: webdriver.Chrome, file: Path, scene: Scene
+    driver: webdriver.Chrome, file: Path, scene: TrainedScene
 ) -> None:
     player = scene.units_per_mm
     for view, t, orbit in (("", 0.0, None), ("#t=0.5&orbit=12,-7,1.5", 0.5, (12.0, -7.0, 1.5))):
@@ -119,7 +119,7 @@ def test_the_file_opens_from_a_disk_and_shows_what_a_worker_renders(
 
 
 def orbit_pose(yaw_deg: float, pitch_deg: float, zoom: float, depth_mm: float) -> NDArray[np.float64]:
-    """As contract/wire/pose.py defines an orbit about the point at the median depth."""
+    """As intrasplat/pose.py defines an orbit about the point at the median depth."""
     yaw, pitch = np.radians([-yaw_deg, -pitch_deg])
     about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])

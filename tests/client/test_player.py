@@ -12,21 +12,21 @@ import pytest
 import torch
 from selenium import webdriver
 
+from intrasplat.scene.checkpoint import SCENE_FILE, load_scene, save_scene
+from intrasplat.scene.compact import unpack
+from intrasplat.scene.files import parse_tensors
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.deformation import SharedBasis
 from tests.client.player import SCENES, TIE_LEVELS, Seen, drawing_browser, player_page
-from tests.worker.scene.compacting import compacted
-from tests.worker.scenes import random_scene
-from worker.model.deformation import SharedBasis
-from worker.scene.checkpoint import SCENE_FILE, load_scene, save_scene
-from worker.scene.compact import unpack
-from worker.scene.files import parse_tensors
-from worker.scene.scene import Scene
+from tests.intrasplat.scene.compacting import compacted
+from tests.intrasplat.scenes import random_scene
 
 COUNT = 700
 LEAST_DB = 50.0
 RIGHT_EYE_MM = (4.0, 0.1, 0.0)
 
 
-def scattered(channels: int, *, moves: bool) -> Scene:
+def scattered(channels: int, *, moves: bool) -> TrainedScene:
     """Gaussians of every shape, some needle-thin, some never seen, all over a small picture, as they are stored.
 
     moves: the camera.

@@ -12,16 +12,16 @@ from selenium import webdriver
 from contract.access.keys import KeyFile, KeyScope
 from contract.store.store import Store
 from contract.wire.rendering import SceneRequest
+from intrasplat.scene.checkpoint import SCENE_FILE
 from tests.client.drawn import VIEWER, Drawn, beside_the_service, opened, picture_of, same_as_the_service, view_here
 from tests.client.local_service import Line
 from tests.client.page import Painter, Site, browser, site_at
 from tests.client.player import drawing_browser
 from tests.client.test_player import scattered
 from tests.client.words import say
-from tests.worker.scenes import random_scene
-from worker.daemon.serve import Reply
-from worker.daemon.views import Views
-from worker.scene.checkpoint import SCENE_FILE
+from tests.intrasplat.scenes import random_scene
+from worker.serve import Reply
+from worker.views import Views
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from typing import Literal
 
 import pytest
 
-from contract.wire.notices import Notice, NoticeCode
-from contract.wire.report import CameraPoses, Masks, Report
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.report import CameraPoses, Masks, Report
 from tests.client.page import REPORT_OF_THE_PAGE, Page, Site
 from tests.client.test_theatre_in_browser import SIZES, screen_of
 from tests.client.words import say

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from selenium.webdriver.common.keys import Keys
 
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
-from contract.wire.notices import NoticeCode
+from intrasplat.errors import ErrorCode
+from intrasplat.notices import NoticeCode
 from tests.client.page import Page, Site
 from tests.client.words import LANGUAGES, say
 from tests.reports import a_warning

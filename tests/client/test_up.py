@@ -18,19 +18,19 @@ from client.up import Installation, check_port, worker_names
 from contract.queue.embedded import EmbeddedServer, ServerEnd
 from contract.queue.installed import installed_queue
 from contract.queue.redis_queue import RedisQueue
-from contract.runtime.exits import ExitCode
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
 from contract.runtime.supervised import Supervised
-from contract.store.disk import Disk
-from contract.store.disk_errors import StoreFullError
-from contract.wire.errors import UnavailableError
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import UnavailableError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import StoreFullError
 from tests.contract.queues import job
 
 SLEEP = "import time; time.sleep(60)"
 LACKS = """
-from contract.wire.errors import UnavailableError
-from contract.runtime.exits import end_by
+from intrasplat.errors import UnavailableError
+from intrasplat.commands.exits import end_by
 raise SystemExit(end_by(UnavailableError("There is no such device.", "Set INTRASPLAT_DEVICE.")))
 """
 

@@ -12,8 +12,8 @@ from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
 from contract.access.keys import KeyFile, KeyScope
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
+from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
 from tests.client.page import Page, Site, site_at
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of

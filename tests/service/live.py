@@ -18,14 +18,14 @@ from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
-from contract.wire.errors import SceneError
 from contract.wire.job import JobFiles, JobRecord
-from contract.wire.names import MANIFEST
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
+from intrasplat.errors import SceneError
+from intrasplat.names import MANIFEST
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.daemon.serve import Reply, RequestServer
+from worker.serve import Reply, RequestServer
 
 WORKER = "worker-1"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from contract.queue.embedded import short_socket_path
-from contract.wire.errors import UnavailableError
 from contract.wire.rendering import WorkerAddress
+from intrasplat.errors import UnavailableError
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
 
 

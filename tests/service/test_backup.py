@@ -26,9 +26,9 @@ from contract.backup.take import Taken, take_backup
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.installed import installed_queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
-from contract.runtime.exits import ExitCode
 from contract.runtime.settings import Settings
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
+from intrasplat.commands.exits import ExitCode
 from tests.contract.queues import ERROR, TRAINING
 from tests.service.under_test import ServiceUnderTest, another_clip, bearer, running_service
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 from service import webhooks
 from service.callbacks import LookUps, permitted_addresses
 from service.webhooks import MAX_TRIES

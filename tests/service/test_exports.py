@@ -8,13 +8,13 @@ from pathlib import Path
 import httpx
 import pytest
 
-from contract.wire.errors import InputError, UnavailableError
-from contract.wire.exports import EXPORT_FORMATS
 from contract.wire.rendering import ExportRequest, SceneRequest
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.formats import EXPORT_FORMATS
 from service import exports
 from tests.service.live import live_service
 from tests.service.under_test import ServiceUnderTest, assert_problem
-from worker.daemon.serve import Reply
+from worker.serve import Reply
 
 PARTS = 5
 

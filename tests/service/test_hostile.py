@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from client.demo import started_service
 from intrasplat_client import Client, JobRejected, RequestRefused
+from lab.demo import started_service
+from tests.intrasplat.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
 from tests.service.under_test import ServiceUnderTest, assert_problem
-from tests.worker.input.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile
 
 JSON = {"Content-Type": "application/json"}
 FOREIGN = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}

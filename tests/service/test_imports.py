@@ -14,12 +14,13 @@ from contract.access.audit import AUDIT_FILE, AuditLog
 from contract.access.keys import DEFAULT_SCOPES, KeyScope
 from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
-from contract.store.archive import archive_parts
 from contract.store.store import Store
 from contract.wire.job import JobState
-from contract.wire.names import REPORT, SCENE
-from contract.wire.notices import NoticeCode
-from contract.wire.report import Report
+from intrasplat.names import REPORT, SCENE
+from intrasplat.notices import NoticeCode
+from intrasplat.report import Report
+from intrasplat.scene.archive import archive_parts
+from intrasplat.scene.checkpoint import load_scene
 from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import Purger
@@ -28,12 +29,11 @@ from service.retention import Retention
 from service.sweep import Sweep
 from tests.archives import HOSTILE, ORIGIN, archived, files_of, small_scene, stored
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
-from worker.daemon.channel import Channel, Task
-from worker.daemon.device import obey
-from worker.daemon.orders import Failed, Finished, RunJob, Scored, ScoreScene
-from worker.daemon.pace import Pace
-from worker.daemon.snapshot import Snapshots
-from worker.scene.checkpoint import load_scene
+from worker.channel import Channel, Task
+from worker.device import obey
+from worker.orders import Failed, Finished, RunJob, Scored, ScoreScene
+from worker.pace import Pace
+from worker.snapshot import Snapshots
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
 from contract.queue.memory import MemoryQueue
 from contract.wire.labels import Labels
-from contract.wire.names import LABELS
+from intrasplat.names import LABELS
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
 LABEL, METADATA = "series Quokka 3", {"ris": "Wombat-17"}

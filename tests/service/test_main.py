@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from contract.access.keys import KeyFile, KeyScope
-from contract.runtime.exits import ExitCode
+from intrasplat.commands.exits import ExitCode
 from service.__main__ import main
 from service.server import Server
 from tests.contract.queues import RunningServer, valkey_binary

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from contract.access.keys import KeyScope
-from contract.wire.measuring import Measurement
-from contract.wire.pose import OrbitPose
-from contract.wire.rendering import IntrinsicsOverride, MeasureRequest
+from contract.wire.rendering import MeasureRequest
+from intrasplat.measuring import Measurement
+from intrasplat.picture import IntrinsicsOverride
+from intrasplat.pose import OrbitPose
 from tests.measurements import measured_flat
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 

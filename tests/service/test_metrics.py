@@ -8,9 +8,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from contract.access.keys import KeyFile, KeyScope
-from contract.runtime.version import version
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError
+from intrasplat.errors import UnavailableError
+from intrasplat.version import version
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]

@@ -21,10 +21,10 @@ from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import PURGING, Store
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobError, JobFiles, JobRecord
-from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.options import JobOptions
+from intrasplat.errors import InputError, UnavailableError
+from intrasplat.names import CURVE, MANIFEST, REPORT
+from intrasplat.options import JobOptions
 from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, Purger

@@ -9,10 +9,10 @@ import pytest
 
 from contract.queue.interface import MAX_LISTED, Place
 from contract.queue.memory import MemoryQueue
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
-from contract.wire.names import MANIFEST
 from contract.wire.rendering import WorkerAddress
+from intrasplat.errors import UnavailableError
+from intrasplat.names import MANIFEST
 from tests.service.under_test import assert_problem, bearer, running_service
 
 

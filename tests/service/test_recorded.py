@@ -10,9 +10,10 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
-from contract.store.recorded import MASK, PICTURE, name_of
-from contract.wire.names import RECORDED
-from contract.wire.rendering import RecordedMasks, RecordedRequest
+from contract.wire.rendering import RecordedRequest
+from intrasplat.names import RECORDED
+from intrasplat.picture import RecordedMasks
+from intrasplat.scene.recorded_file import MASK, PICTURE, name_of
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 
 KEPT = (0, 3, 6, 11)

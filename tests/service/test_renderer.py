@@ -17,11 +17,11 @@ import zmq
 
 from contract.queue.embedded import short_socket_path
 from contract.queue.memory import MemoryQueue
-from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
+from intrasplat.errors import UnavailableError
 from service.connection import Answer
 from service.renderer import ZmqRenderer
-from worker.daemon.serve import Reply, RequestServer
+from worker.serve import Reply, RequestServer
 
 SCENES = [f"{number:032x}" for number in range(40)]
 SECRET, ANOTHER = "a secret of at least 32 characters", "another secret of 32 characters!"

@@ -17,9 +17,9 @@ from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue
 from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.job import JobRecord
-from contract.wire.names import MANIFEST, MASKS, REPORT
 from contract.wire.rendering import RenderRequest, WorkerAddress, WorkerReply
-from contract.wire.report import Report
+from intrasplat.names import MANIFEST, MASKS, REPORT
+from intrasplat.report import Report
 from tests.cameras import CAMERAS
 from tests.reports import REPORT_OF_A_SCENE
 from tests.service.under_test import (

@@ -15,8 +15,8 @@ from contract.queue.embedded import short_socket_path
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from tests.service.live import live_service
 from tests.service.under_test import ServiceUnderTest, assert_problem
-from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
-from worker.daemon.serve import Reply, RequestServer
+from worker.pace import MAX_SAVED_S, SHARE, Pace
+from worker.serve import Reply, RequestServer
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])

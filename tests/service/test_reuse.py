@@ -7,8 +7,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
+from intrasplat.errors import UnavailableError
+from tests.intrasplat.clip.hostile import CALIBRATION, OPENCV
 from tests.service.test_safety import audit
 from tests.service.test_tus import uploaded
 from tests.service.under_test import (
@@ -20,7 +21,6 @@ from tests.service.under_test import (
     bearer,
     running_service,
 )
-from tests.worker.input.clip.hostile import CALIBRATION, OPENCV
 
 OTHER_ZIP = EMPTY_ZIP[:-2] + b"\x03\x00abc"
 """With a comment."""

@@ -20,9 +20,9 @@ from contract.access.audit import AUDIT_FILE, RESERVE_FILE
 from contract.access.keys import DAY_S, KEYS_FILE, KeyFile, KeyScope
 from contract.runtime.settings import Settings
 from contract.store.store import Store
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobError
-from contract.wire.names import MANIFEST
+from intrasplat.errors import ErrorCode
+from intrasplat.names import MANIFEST
 from service import deps
 from service.app import create_app
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service

@@ -9,7 +9,7 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
-from contract.wire.names import CURVE, MANIFEST, RECORDED, REPORT, SCENE
+from intrasplat.names import CURVE, MANIFEST, RECORDED, REPORT, SCENE
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 
 CONTENT = bytes(range(256)) * 40

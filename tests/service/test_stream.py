@@ -16,11 +16,12 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
-from contract.wire.rendering import ExportRequest, Highlights, RenderRequest, Unseen
+from contract.wire.rendering import ExportRequest, RenderRequest
+from intrasplat.picture import Highlights, Unseen
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from tests.service.under_test import CAMERA
-from worker.daemon.serve import NotYetError, Reply
+from worker.serve import NotYetError, Reply
 
 TIMEOUT_S = 10.0
 LARGE = 4 * 2**20

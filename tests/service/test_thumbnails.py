@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from contract.access.keys import KeyScope
-from contract.wire.names import MANIFEST, REPORT, THUMBNAIL
-from contract.wire.notices import Notice, NoticeCode
 from contract.wire.rendering import RenderRequest
+from intrasplat.names import MANIFEST, REPORT, THUMBNAIL
+from intrasplat.notices import Notice, NoticeCode
 from service import thumbnails
 from tests.reports import REPORT_OF_A_SCENE
 from tests.service.under_test import COARSE_WIDTH, ServiceUnderTest, assert_problem, bearer

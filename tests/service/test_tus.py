@@ -14,8 +14,8 @@ import pytest
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
 from service.partial import promised_bytes
+from tests.intrasplat.clip.hostile import CALIBRATION
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, another_clip, assert_problem, running_service
-from tests.worker.input.clip.hostile import CALIBRATION
 
 TUS = {"Tus-Resumable": "1.0.0"}
 BYTES = {**TUS, "Content-Type": "application/offset+octet-stream"}

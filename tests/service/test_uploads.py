@@ -15,14 +15,14 @@ from fastapi import FastAPI
 
 from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
 from contract.store.store import Store
-from contract.wire.errors import ErrorCode
 from contract.wire.job import JobRecord
-from contract.wire.names import SUBMISSION
+from intrasplat.errors import ErrorCode
+from intrasplat.names import SUBMISSION
 from service.problems import Problem, install_handlers
 from service.upload import UploadLimits, receive_upload
+from tests.intrasplat.clip.hostile import CALIBRATION
 from tests.service.asgi import serving
 from tests.service.under_test import CLIP, EMPTY_ZIP, ServiceUnderTest, assert_problem, running_service
-from tests.worker.input.clip.hostile import CALIBRATION
 
 PATIENCE_S = 10.0
 UPLOAD_HEADERS = {

@@ -19,8 +19,8 @@ from contract.access.webhook_secrets import tenant_secret
 from contract.queue.deliveries import Loan
 from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
-from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
+from intrasplat.errors import ErrorCode, UnavailableError
 from service import webhooks
 from service.webhooks import MAX_TRIES
 from tests.receiver import Receiver, Webhook

@@ -12,9 +12,9 @@ from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
 from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
-from contract.wire.errors import ErrorCode
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from contract.wire.webhooks import MAX_TRIES_BEFORE_AGAIN, DeliveryStatus
+from intrasplat.errors import ErrorCode
 from service import webhooks
 from service.webhooks import MAX_TRIES
 from tests.receiver import Receiver

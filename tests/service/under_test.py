@@ -16,20 +16,19 @@ from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
-from contract.wire.errors import InputError, SceneError
 from contract.wire.job import JobRecord
-from contract.wire.names import CURVE, MANIFEST, REPORT
-from contract.wire.notices import Notice, NoticeCode
 from contract.wire.rendering import (
     ExportRequest,
-    ImageFormat,
-    Layer,
     MeasureRequest,
     PictureCamera,
     RecordedRequest,
     SceneRequest,
     WorkerAddress,
 )
+from intrasplat.errors import InputError, SceneError
+from intrasplat.names import CURVE, MANIFEST, REPORT
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.picture import ImageFormat, Layer
 from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
@@ -37,7 +36,7 @@ from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
-from worker.daemon.serve import Reply, RequestServer
+from worker.serve import Reply, RequestServer
 
 CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable
 
-from contract.wire.exports import check_export
 from contract.wire.rendering import ExportRequest, SceneRequest
-from worker.daemon.serve import Reply
+from intrasplat.formats import check_export
+from worker.serve import Reply
 
 
 def export_request(scene_id: str, name: str = "ply", **options: object) -> ExportRequest:

@@ -10,7 +10,7 @@ from contract.queue.interface import Queue
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.job import TERMINAL_STATES, JobFiles, JobRecord, JobState
-from contract.wire.options import JobOptions
+from intrasplat.options import JobOptions
 
 WAIT_S = 40.0
 STANDIN = Path(__file__).with_name("standin.py")

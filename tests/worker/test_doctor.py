@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from contract.runtime.settings import Settings
+from intrasplat.machine.gpu import Gpu
 from tests.contract.queues import RunningServer, valkey_binary
 from worker.doctor import (
     FIXED_FFMPEG,
@@ -22,7 +23,6 @@ from worker.doctor import (
     examine,
     format_findings,
 )
-from worker.machine.gpu import Gpu
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.9.0")
 

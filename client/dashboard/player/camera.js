@@ -1,11 +1,11 @@
 // The cameras of a scene: where the endoscope was, where a viewer stands, and what it sees of the gloss
-// (worker/render/camera.py, contract/wire/pose.py). Matrices are rows; poses are world_from_camera in mm.
+// (intrasplat/view/camera.py, intrasplat/pose.py). Matrices are rows; poses are world_from_camera in mm.
 
-/** Optimiser units of the clip's median depth (worker/train/targets.py). */
+/** Optimiser units of the clip's median depth (intrasplat/train/targets.py). */
 const MEDIAN_DEPTH_UNITS = 60;
 /** Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2). */
 const FADING = 1.0;
-/** Pixels in which a picture is judged at most (worker/render/view.py). */
+/** Pixels in which a picture is judged at most (intrasplat/view/frame.py). */
 const MAX_JUDGED_PIXELS = 2 ** 21;
 
 /** @typedef {number[][]} Matrix */
@@ -81,7 +81,7 @@ export class Cameras {
   }
 
   /**
-   * See contract/wire/pose.py.
+   * See intrasplat/pose.py.
    * @param {number[]} [about] x, y, z of the point looked at; by default the median-depth point on frame 0's axis
    * @returns {Matrix}
    */
@@ -95,7 +95,7 @@ export class Cameras {
   }
 
   /**
-   * @param {string | null} pose as the service spells it (contract/wire/pose.py); null is the endoscope's own
+   * @param {string | null} pose as the service spells it (intrasplat/pose.py); null is the endoscope's own
    * @param {number} t the time that is shown
    * @returns {Matrix}
    */
@@ -107,7 +107,7 @@ export class Cameras {
   }
 
   /**
-   * side and dim of worker/raster/__init__.py for a camera there.
+   * side and dim of intrasplat/splat/camera.py for a camera there.
    * @param {number} t
    * @param {Matrix} pose
    * @param {boolean} highlights

@@ -1,4 +1,4 @@
-// The table of whole numbers in a compact scene: what worker/scene/compact.py reads, bit for bit. docs/scene-file.md
+// The table of whole numbers in a compact scene: what intrasplat/scene/compact.py reads, bit for bit. docs/scene-file.md
 // has the equations. Symbols: N Gaussians, K columns, cut into PARTS runs that are coded by themselves.
 
 export const PARTS = 4;

@@ -4,7 +4,7 @@ import { STATE } from "./pack.js";
 import { ADD, ALONG, BLEND, DEFORM, EVERYWHERE, MISSING, NUMBERS_ROW, ROW, SHOW, SPLAT, SUMS } from "./shaders.js";
 import { halfEven } from "./trust.js";
 
-/** Of worker/render/unseen.py: shares of the picture's width. */
+/** Of intrasplat/view/unseen.py: shares of the picture's width. */
 const SMOOTHED_SHARE = 1 / 128;
 const STRIPE_SHARE = 1 / 96;
 const TELL_EVERY_MS = 250;

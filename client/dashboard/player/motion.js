@@ -1,6 +1,6 @@
-// How a scene moves: its patterns at a time, from bases that all Gaussians share (worker/model/deformation/shared.py).
+// How a scene moves: its patterns at a time, from bases that all Gaussians share (intrasplat/splat/deformation/shared.py).
 
-/** A basis below this at a time is left out, as the service does (worker/raster/cpu/motion.py). */
+/** A basis below this at a time is left out, as the service does (intrasplat/splat/cpu/motion.py). */
 const NEGLIGIBLE = 1e-3;
 
 /** @typedef {{channels: number, patterns: number, bases: number, pattern: Float32Array, centre: Float32Array,

@@ -2,7 +2,7 @@
 
 import { STATE } from "./pack.js";
 
-/** Of worker/model/constants.py. */
+/** Of intrasplat/splat/constants.py. */
 const NEAR = 0.2;
 const MIN_ALPHA = 1 / 255;
 const RADIX_BITS = 11;

@@ -1,5 +1,5 @@
 // What the GPU computes: the state of every Gaussian at a time, its ellipse on the image, the blend, and the hatch. The
-// contract is worker/raster/__init__.py; the bounds are those of worker/model/constants.py.
+// contract is intrasplat/splat/camera.py; the bounds are those of intrasplat/splat/constants.py.
 
 /** Gaussians in a row of a texture. */
 export const ROW = 512;

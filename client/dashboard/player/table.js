@@ -6,7 +6,7 @@ import { tensorsOf } from "./safetensors.js";
 
 /** Channels that move: place, shape; with colour; with gloss. */
 const CHANNELS = [10, 13, 14];
-/** As worker/scene/compact.py; a small file must not fill the memory. */
+/** As intrasplat/scene/compact.py; a small file must not fill the memory. */
 const MAX_NUMBERS = 7 * 2 ** 25;
 
 /**

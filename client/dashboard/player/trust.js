@@ -1,5 +1,5 @@
 // How far Gaussians are trusted: what training saw of them, less what has left a moving endoscope's view
-// (worker/render/unseen.py, worker/render/left.py). Symbols: N Gaussians, S sampled frames.
+// (intrasplat/view/unseen.py, intrasplat/view/out_of_view.py). Symbols: N Gaussians, S sampled frames.
 
 /** What a Gaussian that no training frame saw counts in the blend. */
 const NEVER_SEEN = -0.1;

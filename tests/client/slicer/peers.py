@@ -23,16 +23,16 @@ from pyigtl.messages import message_type_to_class_constructor
 
 from contract.queue.embedded import short_socket_path
 from contract.store.store import Store
-from contract.wire.names import REPORT
+from intrasplat.names import REPORT
+from intrasplat.scene.checkpoint import save_scene
+from intrasplat.view.frame import render_frame
 from tests.client.page import Painter, Site
+from tests.intrasplat.export.sheet import tissue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.test_repository import REPOSITORY
-from tests.worker.export.sheet import tissue
-from worker.daemon.pace import Pace
-from worker.daemon.serve import RequestServer
-from worker.daemon.views import Views
-from worker.render.view import render_frame
-from worker.scene.checkpoint import save_scene
+from worker.pace import Pace
+from worker.serve import RequestServer
+from worker.views import Views
 
 WAIT_S = 60.0
 DOUBT = "The clip is short."

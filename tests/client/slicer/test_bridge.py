@@ -14,7 +14,7 @@ import trimesh
 from intrasplat_client import Client
 from tests.client.page import Site
 from tests.client.slicer.peers import DOUBT, Peer, bridge, free_port, peer_of, publish, rendering_site, until
-from tests.worker.export.sheet import tissue
+from tests.intrasplat.export.sheet import tissue
 
 SCENE = tissue()
 FRAMES, CAMERA = SCENE.frame_count, SCENE.intrinsics

@@ -19,8 +19,8 @@ from contract.access.audit import (
     AuditLog,
     utc_now,
 )
-from contract.store.disk_errors import StoreFullError
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
+from intrasplat.files.disk_errors import StoreFullError
 from tests.contract.stores import files_no_larger_than
 
 

@@ -15,8 +15,8 @@ import pytest
 from contract.access import audit, chain
 from contract.access.audit import AUDIT_FILE, HEAD_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.chain import START, CheckedFile, audit_lines, check_file, check_files, in_order
-from contract.store.disk_errors import StoreFullError
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
+from intrasplat.files.disk_errors import StoreFullError
 from tests.contract.stores import files_no_larger_than
 
 

@@ -18,7 +18,7 @@ from contract.access.keys import (
     check_keys,
 )
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError, UnavailableError
+from intrasplat.errors import InputError, UnavailableError
 
 
 def test_a_key_is_found_by_its_text_and_by_nothing_else(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import RESTORING, Store, open_store
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobFiles, JobRecord, JobState
+from intrasplat.errors import InputError, UnavailableError
 from tests.contract.queues import ERROR, claimed, job, known
 from tests.contract.stores import BUCKET_URL, SERVICE, files_no_larger_than, finished, given_to, published
 

@@ -17,9 +17,9 @@ from contract.queue.interface import Queue
 from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import PURGING, UNSCORED, Store
-from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import Labels
+from intrasplat.errors import InputError, UnavailableError
 from tests.contract.stores import accepted, files_no_larger_than, finished
 
 

@@ -13,7 +13,7 @@ import pytest
 import redis
 
 from contract.queue.embedded import MAX_SOCKET_PATH_BYTES, EmbeddedServer, find_server, short_socket_path
-from contract.wire.errors import UnavailableError
+from intrasplat.errors import UnavailableError
 
 
 def test_what_was_acknowledged_survives_a_killed_server(tmp_path: Path) -> None:

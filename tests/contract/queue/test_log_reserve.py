@@ -12,8 +12,8 @@ import redis
 
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.log_reserve import LOG_FOLDER, RESERVE_BYTES, fill_reserve
-from contract.store.disk import Disk
-from contract.store.disk_errors import StoreFullError
+from intrasplat.files.disk import Disk
+from intrasplat.files.disk_errors import StoreFullError
 
 DISK_MIB = 40
 

@@ -17,8 +17,8 @@ from contract.queue.interface import (
 )
 from contract.store.shelf import new_job_id
 from contract.wire.job import JobRecord, JobState
-from contract.wire.options import JobOptions
 from contract.wire.rendering import WorkerAddress
+from intrasplat.options import JobOptions
 from tests.contract.queues import ERROR, TRAINING, claimed, job, known, state_of
 
 # From submission to the end

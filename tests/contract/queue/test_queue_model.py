@@ -22,8 +22,8 @@ from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
 from contract.wire.labels import LabelChange
-from contract.wire.options import Priority
 from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, TryFailure
+from intrasplat.options import Priority
 from tests.contract.conftest import emptied
 from tests.contract.queues import ERROR, TRAINING, job
 

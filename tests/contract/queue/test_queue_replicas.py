@@ -16,8 +16,8 @@ import redis
 
 from contract.queue.interface import Claim, Order
 from contract.queue.redis_queue import RedisQueue
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
+from intrasplat.errors import UnavailableError
 from tests.contract.queues import TRAINING, RunningServer, claimed, free_port, job, known, redis_binary, state_of
 from tests.test_repository import REPOSITORY
 

@@ -16,9 +16,9 @@ from contract.queue import redis_queue as queue_redis
 from contract.queue.interface import Admission, Order, Queue
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, UNREADABLE, RedisQueue
 from contract.store.shelf import new_job_id
-from contract.wire.errors import UnavailableError
 from contract.wire.job import JobState
 from contract.wire.rendering import WorkerAddress
+from intrasplat.errors import UnavailableError
 from tests.contract.queues import (
     ERROR,
     TRAINING,

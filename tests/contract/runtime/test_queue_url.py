@@ -7,7 +7,7 @@ import pytest
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.queue_url import QueueUrl, parse_queue_url
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 
 
 def test_the_url_of_a_server_stays_as_it_is() -> None:

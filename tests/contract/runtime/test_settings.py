@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.wire.errors import InputError
+from intrasplat.errors import InputError
 
 
 def test_settings_are_read_from_their_variables_and_empty_ones_count_as_unset(tmp_path: Path) -> None:

@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 
 from contract.runtime import supervised
-from contract.runtime.exits import ExitCode
 from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
-from contract.wire.errors import UnavailableError
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import UnavailableError
 
 SLEEP = "import time; time.sleep(60)"
 LACKS = """
-from contract.wire.errors import UnavailableError
-from contract.runtime.exits import end_by
+from intrasplat.errors import UnavailableError
+from intrasplat.commands.exits import end_by
 raise SystemExit(end_by(UnavailableError("There is no such device.", "Set INTRASPLAT_DEVICE.")))
 """
 

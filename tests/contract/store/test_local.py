@@ -8,7 +8,7 @@ import pytest
 
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
-from contract.wire.names import MANIFEST, SUBMISSION
+from intrasplat.names import MANIFEST, SUBMISSION
 from tests.contract.stores import accepted
 
 

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.store.recorded import PICTURE, name_of, read_frame
 from contract.store.shelf import ABANDONED_AFTER_S, new_job_id
 from contract.store.store import Store, open_store
-from contract.wire.errors import SceneError, UnavailableError
-from contract.wire.names import CURVE, MANIFEST, RECORDED, REPORT, RESUME, SUBMISSION
+from intrasplat.errors import SceneError, UnavailableError
+from intrasplat.names import CURVE, MANIFEST, RECORDED, REPORT, RESUME, SUBMISSION
+from intrasplat.scene.recorded_file import PICTURE, name_of, read_frame
 from tests.contract.stores import BUCKET_URL, accepted, lead_to, published, received
 from tests.reports import REPORT_OF_A_SCENE
 

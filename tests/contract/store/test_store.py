@@ -11,10 +11,10 @@ import pytest
 
 from contract.store.shelf import ABANDONED_AFTER_S, is_job_id, new_job_id
 from contract.store.store import Store
-from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.labels import Labels
-from contract.wire.names import MANIFEST, PREPARED, RESUME, SUBMISSION
+from intrasplat.errors import SceneError, UnavailableError
+from intrasplat.names import MANIFEST, PREPARED, RESUME, SUBMISSION
 from tests.contract.store.conftest import MakeStore
 from tests.contract.stores import accepted, published, received
 

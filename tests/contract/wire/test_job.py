@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from contract.runtime.exits import LAST_WORDS_VARIABLE, ExitCode, end_by, exit_code_of, take_last_words
-from contract.runtime.progress_bar import ProgressBar, format_progress
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
-from contract.wire.errors import Cancelled, InputError, LimitError, SceneError, UnavailableError
 from contract.wire.job import (
     TERMINAL_STATES,
     TRANSITIONS,
@@ -23,7 +20,10 @@ from contract.wire.job import (
     JobView,
     sources_of,
 )
-from contract.wire.options import JobOptions
+from intrasplat.commands.exits import LAST_WORDS_VARIABLE, ExitCode, end_by, exit_code_of, take_last_words
+from intrasplat.commands.progress_bar import ProgressBar, format_progress
+from intrasplat.errors import Cancelled, InputError, LimitError, SceneError, UnavailableError
+from intrasplat.options import JobOptions
 
 PROGRESS = JobProgress(stage="train", fraction=0.25, iteration=50, iterations=200, psnr_db=31.237, seconds_left=42.4)
 

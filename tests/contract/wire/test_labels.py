@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from contract.wire.errors import InputError
 from contract.wire.labels import LabelChange, Labels, folded, parse_labels
+from intrasplat.errors import InputError
 
 
 def test_labels_are_short_texts_by_name() -> None:

@@ -1,1 +1,0 @@
-"""Rows of docs/results/ in; the results page and the README's evaluation block out: `python -m benchmarks.pages`."""

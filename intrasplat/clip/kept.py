@@ -1,0 +1,122 @@
+"""A clip with depth in a folder: one .npy file for each array, and manifest.json, which is written last.
+
+A folder without its manifest holds nothing. How the clip was made does not matter here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+from intrasplat.clip.recorded_masks import Rectification
+from intrasplat.clip.types import PIXELS, DepthClip, Eye
+from intrasplat.files.durable import flush, replace_file
+from intrasplat.machine.mapped import let_go
+from intrasplat.notices import Notice
+from intrasplat.report import CameraPoses, Masks, RightEye
+
+VERSION = 5
+"""Raised whenever what the folder holds changes; no version reads another's."""
+MANIFEST = "manifest.json"
+EYES = ("left", "right")
+ARRAYS = (*PIXELS, "world_from_camera")
+TIMES = "frame_times_s"
+
+
+def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callable[[], bool] = lambda: False) -> None:
+    """Write the clip into a folder, which is made if need be. It is on disk when this returns.
+
+    Args:
+        identity: what the clip was made of, in any form; load_clip asks for it.
+        should_stop: asked before each frame; after a yes the folder is removed.
+
+    Raises:
+        OSError: the disk is full or refuses; the folder is removed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    try:
+        if not all(_write(folder / f"{name}.npy", array, should_stop) for name, array in _arrays(clip).items()):
+            shutil.rmtree(folder, ignore_errors=True)
+            return
+    except OSError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    flush(folder)
+    told = {
+        "version": VERSION,
+        "identity": identity,
+        "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
+        "registration": clip.registration and clip.registration.model_dump(),
+        "masks": clip.masks and clip.masks.model_dump(),
+        "rectification": clip.rectification and clip.rectification.numbers(),
+        "poses": clip.poses and clip.poses.model_dump(),
+        "left_out": clip.left_out,
+        "assumptions": [notice.model_dump() for notice in clip.assumptions],
+        "warnings": [notice.model_dump() for notice in clip.warnings],
+        "measurements": clip.measurements,
+    }
+    replace_file(folder / MANIFEST, json.dumps(told).encode())
+
+
+def load_clip(folder: Path, identity: str) -> DepthClip | None:
+    """The clip that save_clip wrote with this identity, its arrays mapped into memory; None if there is none.
+
+    Do not write to the arrays. The files may be removed at once: the mappings live as long as the arrays.
+    """
+    try:
+        told = json.loads((folder / MANIFEST).read_bytes())
+        if (told["version"], told["identity"]) != (VERSION, identity):
+            return None
+        eyes = [_eye(folder, name, each) for name, each in zip(EYES, told["intrinsics"], strict=False)]
+        return DepthClip(
+            **eyes[0],
+            frame_times_s=np.load(folder / f"{TIMES}.npy"),
+            right=Eye(**eyes[1]) if len(eyes) > 1 else None,
+            registration=told["registration"] and RightEye.model_validate(told["registration"]),
+            masks=told["masks"] and Masks.model_validate(told["masks"]),
+            rectification=told["rectification"] and Rectification.parsed(told["rectification"]),
+            poses=told["poses"] and CameraPoses.model_validate(told["poses"]),
+            left_out=tuple(told["left_out"]),
+            assumptions=tuple(Notice.model_validate(each) for each in told["assumptions"]),
+            warnings=tuple(Notice.model_validate(each) for each in told["warnings"]),
+            measurements=told["measurements"],
+        )
+    except (OSError, EOFError, ValueError, KeyError, TypeError):  # nothing, or of another program
+        return None
+
+
+def _arrays(clip: DepthClip) -> dict[str, NDArray[Any]]:
+    arrays = {
+        f"{side}_{name}": getattr(eye, name) for side, eye in zip(EYES, clip.eyes, strict=False) for name in ARRAYS
+    }
+    return arrays | {TIMES: clip.frame_times_s}
+
+
+def _eye(folder: Path, side: str, intrinsics: dict[str, Any]) -> dict[str, Any]:
+    arrays = {name: np.asarray(np.load(folder / f"{side}_{name}.npy", mmap_mode="r+")) for name in ARRAYS}
+    return {**arrays, "intrinsics": Intrinsics.parsed(intrinsics)}
+
+
+def _write(path: Path, array: NDArray[Any], should_stop: Callable[[], bool]) -> bool:
+    """Write an array frame by frame and wait until it is on disk; False if it was stopped."""
+    with path.open("wb") as file:
+        header = npy.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype)) | {"shape": array.shape}
+        npy.write_array_header_1_0(file, header)
+        for frame in array:
+            if should_stop():
+                return False
+            file.write(np.ascontiguousarray(frame).data)
+            let_go(frame)
+        file.flush()
+        os.fsync(file.fileno())
+    return True

@@ -1,0 +1,94 @@
+"""What an input layout is, and what it gets to open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from intrasplat.clip.files import FileTree
+from intrasplat.clip.images import open_images
+from intrasplat.clip.masks import BrightClass, MaskFrames
+from intrasplat.clip.naming import eye_of
+from intrasplat.clip.packing import FrameSequence
+from intrasplat.clip.types import DepthClip, StereoClip
+from intrasplat.clip.video import open_video, open_video_in
+from intrasplat.errors import InputError
+from intrasplat.intake.limits import ClipLimits
+from intrasplat.names import MaskPolarity, PoseConvention
+
+
+@dataclass(frozen=True)
+class ClipFiles:
+    """The files of a clip and what the caller said of them; nothing is decoded yet.
+
+    tree             files of a folder or zip, or one image; None where path is a single other file, such as a video
+    detected         the caller left the layout open
+    masks            those that the caller gave in addition to the clip
+    ignores_masks    the caller wants no masks, not even those in the tree
+    mask_polarity    what white means in masks, as the caller said
+    pose_convention  axes of poses_bounds.npy, as the caller said
+    """
+
+    path: Path
+    tree: FileTree | None
+    limits: ClipLimits
+    detected: bool = False
+    masks: MaskFrames | None = None
+    ignores_masks: bool = False
+    mask_polarity: MaskPolarity = "auto"
+    pose_convention: PoseConvention = "opengl"
+
+    def tree_for(self, layout: str) -> FileTree:
+        """The files of a layout that needs several. InputError where a single file was given."""
+        if self.tree is None:
+            problem = f'layout "{layout}" needs a folder or zip, {self.path.name} is neither.'
+            raise InputError("options.layout", problem, "Leave it out.")
+        return self.tree
+
+    @cached_property
+    def videos(self) -> tuple[str, ...]:
+        """Names of the tree's videos that are not masks."""
+        return outside_masks(self.tree.videos()) if self.tree is not None else ()
+
+    @cached_property
+    def images(self) -> tuple[str, ...]:
+        """Names of the tree's images that are not masks."""
+        return outside_masks(self.tree.images()) if self.tree is not None else ()
+
+    @cached_property
+    def sequence(self) -> FrameSequence | None:
+        """The pictures, where there is one sequence of them: one video, or images whose names name no eye."""
+        if self.tree is None:
+            return open_video(self.path, "clip", self.limits)
+        if len(self.videos) == 1:
+            return open_video_in(self.tree, self.videos[0])
+        if self.videos or not self.images or any(eye_of(name) for name in self.images):
+            return None
+        return open_images(self.tree, self.images)
+
+
+@dataclass(frozen=True)
+class InputLayout:
+    """How files make a clip.
+
+    name        what callers choose
+    recognises  whether files that nobody named a layout for are in this one; it may raise InputError
+    open        the clip, or InputError or LimitError. A DepthClip comes with its masks applied; the masks of a
+                StereoClip are applied by open_clip
+    white       what white means in the masks of a StereoClip, unless the caller says; None: their look decides
+    title       the name as its makers write it, for messages
+    """
+
+    name: str
+    recognises: Callable[[ClipFiles], bool]
+    open: Callable[[ClipFiles], StereoClip | DepthClip]
+    white: BrightClass | None = None
+    title: str = ""
+
+
+def outside_masks(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names that lie in no folder called masks or mask."""
+    masks = {"masks", "mask"}
+    return tuple(name for name in names if not masks & {part.lower() for part in PurePosixPath(name).parts[:-1]})

@@ -1,0 +1,134 @@
+"""The two kinds of clip that the front of the pipeline gives, and an eye of a clip with depth.
+
+Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+from intrasplat.clip.recorded_masks import Rectification
+from intrasplat.machine.mapped import let_go
+from intrasplat.notices import Notice
+from intrasplat.report import CameraPoses, Masks, RightEye
+
+PIXELS = ("rgb", "tissue", "depth_mm", "depth_confidence")
+"""Names of an eye's arrays [T, H, W, ...]. They may lie in files (intrasplat/machine/mapped.py)."""
+
+RgbFrame = NDArray[np.uint8]  # [H, W, 3]
+
+
+class PairSource(Protocol):
+    """Left and right frames, decoded on demand. Each call starts again from frame 0."""
+
+    def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]: ...
+
+
+@dataclass(frozen=True)
+class StereoClip:
+    """A stereo clip as recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
+
+    tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
+    tissue_right is the same of the right eye, or None if the masks show the left eye alone.
+    frame_times_s is [T] float64, from the container, or i / 30 if it has none.
+    """
+
+    frame_count: int
+    height: int
+    width: int
+    pairs: PairSource
+    tissue: NDArray[np.bool_] | None
+    frame_times_s: NDArray[np.float64]
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+    tissue_right: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class Eye:
+    """The frames of one rectified eye with metric depth, tissue mask and camera.
+
+    rgb              [T, H, W, 3] uint8
+    tissue           [T, H, W]    bool, True = tissue (tools, labels and borders are False)
+    depth_mm         [T, H, W]    float32, camera z in mm, 0 = invalid
+    depth_confidence [T, H, W]    uint8, 255 = left-right consistent and textured, 0 where depth is invalid
+    world_from_camera [T, 4, 4]   float64, mm, OpenCV axes; the world is the left camera of frame 0
+    """
+
+    rgb: NDArray[np.uint8]
+    tissue: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
+    depth_confidence: NDArray[np.uint8]
+    intrinsics: Intrinsics
+    world_from_camera: NDArray[np.float64]
+
+    @property
+    def frame_count(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """Model time of each frame, t_i = i / T, in [0, 1)."""
+        return np.arange(self.frame_count) / self.frame_count
+
+    def let_go(self, index: int) -> None:
+        """Take a frame's pixels out of memory, as far as they lie in files. They come back when they are asked for."""
+        for name in PIXELS:
+            let_go(getattr(self, name)[index])
+
+    def one_by_one(self, frames: Iterable[int]) -> Iterator[int]:
+        """The frames as given; each is taken out of memory when the next is asked for."""
+        for index in frames:
+            yield index
+            self.let_go(index)
+
+    def arrays_at(self, frames: slice) -> dict[str, Any]:
+        """The eye's arrays by name, of some frames alone: views."""
+        return {name: getattr(self, name)[frames] for name in (*PIXELS, "world_from_camera")}
+
+
+@dataclass(frozen=True)
+class DepthClip(Eye):
+    """The left eye, when its frames were taken, and the right eye if there is one. Training reads nothing else.
+
+    frame_times_s    [T]          float64, seconds from frame 0
+    right            the same moments and size; None for a clip of one eye
+    registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
+    masks            where `tissue` comes from
+    rectification    how the recorded left eye became this one; None: it is as recorded
+    poses            how world_from_camera is known; None: nobody has asked yet
+    left_out         frames that show nothing new (sampling.py): nobody looks at them, and stereo gives them no depth
+    """
+
+    frame_times_s: NDArray[np.float64]
+    right: Eye | None = None
+    registration: RightEye | None = None
+    masks: Masks | None = None
+    rectification: Rectification | None = None
+    poses: CameraPoses | None = None
+    left_out: tuple[int, ...] = ()
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+    measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
+
+    @property
+    def eyes(self) -> tuple[Eye, ...]:
+        """Left, and right if there is one."""
+        return (self,) if self.right is None else (self, self.right)
+
+    @property
+    def used(self) -> list[int]:
+        """The frames that are not left out, in order."""
+        return sorted(set(range(self.frame_count)) - set(self.left_out))
+
+    def moment(self, index: int) -> DepthClip:
+        """A clip of one frame of both eyes, which views this one's arrays."""
+        only = slice(index, index + 1)
+        right = None if self.right is None else replace(self.right, **self.right.arrays_at(only))
+        return replace(self, right=right, frame_times_s=self.frame_times_s[only], left_out=(), **self.arrays_at(only))

@@ -1,0 +1,14 @@
+"""The option --device, which several commands have."""
+
+from __future__ import annotations
+
+import argparse
+from typing import get_args
+
+from intrasplat.names import DeviceName
+
+
+def add_device(parser: argparse.ArgumentParser, default: str) -> None:
+    """Adds --device."""
+    what = "auto: an NVIDIA GPU if all of its requirements are met, else the CPU"
+    parser.add_argument("--device", choices=get_args(DeviceName), default=default, help=f"{what} (default: {default})")

@@ -1,0 +1,88 @@
+"""Exit codes of every intrasplat command, the same for work here and on a server; and the last words of a process."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from enum import IntEnum
+from pathlib import Path
+
+from intrasplat.errors import Cancelled, InputError, IntrasplatError, UnavailableError
+from intrasplat.options import FIELD_PREFIX
+
+
+class ExitCode(IntEnum):
+    """The meaning of a command's exit status. Scripts may rely on it."""
+
+    OK = 0
+    USAGE = 2
+    BAD_INPUT = 3
+    FAILED = 4
+    UNAVAILABLE = 5
+    INTERRUPTED = 130
+
+
+EXIT_CODES_HELP = (
+    "exit codes: 0 ok, 2 wrong usage, 3 the input cannot be used, 4 the work failed, "
+    "5 something needed is not there, 130 interrupted"
+)
+
+
+def exit_code_of(error: IntrasplatError) -> ExitCode:
+    """The exit code that stands for `error`."""
+    if isinstance(error, InputError):
+        return ExitCode.BAD_INPUT
+    if isinstance(error, UnavailableError):
+        return ExitCode.UNAVAILABLE
+    if isinstance(error, Cancelled):
+        return ExitCode.INTERRUPTED
+    return ExitCode.FAILED
+
+
+LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
+"""Names the file in which a process leaves the UnavailableError that ends it; Supervised sets it."""
+
+
+def end_by(error: IntrasplatError) -> ExitCode:
+    """Say on stderr why this process ends, leave an UnavailableError as last words, and return the exit code."""
+    print(f"intrasplat: {_in_flags(error)}", file=sys.stderr)
+    if isinstance(error, UnavailableError):
+        leave_last_words(error)
+    return exit_code_of(error)
+
+
+def leave_last_words(error: UnavailableError) -> bool:
+    """Leave the error to the process that started this one; False: nobody asked, or the file cannot be written."""
+    path = os.environ.get(LAST_WORDS_VARIABLE)
+    if not path:
+        return False
+    try:
+        words = {"problem": error.problem, "remedy": error.remedy, "may_return": error.may_return}
+        Path(path).write_text(json.dumps(words))
+    except OSError:  # the disk may be full
+        return False
+    return True
+
+
+def flag_of(name: str) -> str:
+    """The command-line option of a name: budget_s is --budget-s."""
+    return f"--{name.replace('_', '-')}"
+
+
+def _in_flags(error: IntrasplatError) -> str:
+    """The error's sentences; an option is named as the command line names it."""
+    prefix = f"{FIELD_PREFIX}."
+    if not isinstance(error, InputError) or not error.field.startswith(prefix):
+        return str(error)
+    return f"{flag_of(error.field.removeprefix(prefix))}: {error.problem} {error.remedy}"
+
+
+def take_last_words(path: Path) -> UnavailableError | None:
+    """The last words of a process that has ended; None if it left none. Removes their file."""
+    try:
+        return UnavailableError(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    finally:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,109 @@
+"""`intrasplat poses`: estimates the path of a stereo clip's camera, and compares it with a known one."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from intrasplat.commands.arguments import add_options, given_options
+from intrasplat.commands.exits import ExitCode
+from intrasplat.commands.progress_bar import ProgressBar
+from intrasplat.errors import InputError
+from intrasplat.notices import NoticeCode
+from intrasplat.options import ReconstructionOptions
+
+if TYPE_CHECKING:
+    from intrasplat.clip import DepthClip
+    from intrasplat.poses.rigid import Reals
+
+OPTIONS = (
+    "layout",
+    "mask_polarity",
+    "mask_source",
+    "pose_convention",
+    "holdout",
+    "use_frames",
+    "poses",
+    "min_depth_mm",
+    "max_depth_mm",
+)
+"""Those of reconstruct that decide on poses."""
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `poses`; run_cli reads them."""
+    parser.add_argument("clip", type=Path, metavar="CLIP", help="as for reconstruct")
+    parser.add_argument(
+        "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument("--masks", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument("--segmenter", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="TUM",
+        help="the true path, with a pose for each frame or beginning with the clip: prints the absolute trajectory "
+        "error against it",
+    )
+    parser.add_argument("--out", type=Path, metavar="TUM", help="file to write the path to, in seconds and metres")
+    add_options(parser, ReconstructionOptions, *OPTIONS)
+    parser.set_defaults(**{name: None for name in ReconstructionOptions.model_fields if name not in OPTIONS})
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Estimates, prints, writes. Returns the exit code.
+
+    Raises:
+        InputError: the clip, an option or the true path cannot be used.
+    """
+    from intrasplat.decode import keep_decoder_ready
+    from intrasplat.machine.hooks import Hooks
+    from intrasplat.machine.timing import Timings
+    from intrasplat.poses import with_poses
+    from intrasplat.poses.trajectory import from_first, read_tum, trajectory_error, write_tum
+    from intrasplat.stereo import ClipPaths, open_with_depth
+    from worker.orders import job_progress
+
+    out: Path | None = options.out
+    if out is not None and (out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK)):
+        raise InputError("--out", f"{out} cannot be written.", "Name a file in a folder that is there.")
+    known = read_tum(options.against) if options.against else None
+    given, timings = given_options(options, ReconstructionOptions), Timings()
+    keep_decoder_ready()
+    with ProgressBar(sys.stderr) as bar:
+        hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)))
+        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+        clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
+        true = None if known is None else from_first(_of_frames(clip, *known))
+        clip = with_poses(clip, given, hooks, timings)
+    for notice in clip.assumptions:
+        if notice.code is NoticeCode.POSES:
+            print(notice.text)
+    for notice in clip.warnings:
+        print(f"{notice.severity}: {notice.text}")
+    if out is not None:
+        write_tum(out, clip.frame_times_s, clip.world_from_camera)
+    if true is not None:
+        error = trajectory_error(clip.world_from_camera, true)
+        print(f"absolute trajectory error: {error.mm:.2f} mm, {error.deg:.2f} degrees")
+    return ExitCode.OK
+
+
+def _of_frames(clip: DepthClip, times_s: Reals, poses: Reals) -> Reals:
+    """The known poses [T, 4, 4] of the clip's frames: a line for each, or those at their times since the first line.
+
+    Raises:
+        InputError: the path is not this clip's.
+    """
+    from intrasplat.poses.trajectory import at_times
+
+    if len(poses) == clip.frame_count:
+        return poses
+    if any(notice.code is NoticeCode.FRAME_TIMES for notice in clip.assumptions):
+        problem = f"the path has {len(poses)} poses, the clip {clip.frame_count} frames whose times nobody knows."
+        raise InputError("--against", problem, "Give a pose for each frame.")
+    return at_times(times_s - times_s[0], poses, clip.frame_times_s - clip.frame_times_s[0])

@@ -1,0 +1,136 @@
+"""`intrasplat render`: writes images of a scene."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from intrasplat.commands.arguments import finite
+from intrasplat.commands.device import add_device
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError
+from intrasplat.names import MANIFEST
+from intrasplat.picture import Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+
+SUFFIX_FORMATS = {
+    ".png": ImageFormat.PNG,
+    ".jpg": ImageFormat.JPEG,
+    ".jpeg": ImageFormat.JPEG,
+    ".webp": ImageFormat.WEBP,
+    ".npy": ImageFormat.NPY,
+}
+MAX_RENDER_PIXELS = 8192 * 8192
+
+
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `render`; run_cli reads them."""
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
+    when = parser.add_mutually_exclusive_group(required=True)
+    when.add_argument("--t", type=finite, help="time: 0 is the first frame, 1 the end of the clip")
+    when.add_argument("--frames", type=_frames, metavar="LIST", help="frame numbers such as 1,9,17; writes a folder")
+    parser.add_argument(
+        "--pose",
+        help="world_from_camera, 12 or 16 numbers in mm, or orbit:YAW,PITCH,ZOOM[,X,Y,Z]: degrees, times nearer, "
+        "and the point looked at in mm "
+        "(default: the endoscope's own)",
+    )
+    camera = {"width": "of the image", "height": "of the image", "fx": "focal length", "fy": "focal length"}
+    for name, what in (camera | {"cx": "optical axis from the left edge", "cy": "from the upper edge"}).items():
+        kind = int if name in ("width", "height") else float
+        parser.add_argument(f"--{name}", type=kind, metavar="PX", help=f"{what}, in pixels (default: the clip's)")
+    parser.add_argument(
+        "--layer",
+        choices=[layer.value for layer in Layer],
+        default=Layer.RGB.value,
+        help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1 (default: rgb)",
+    )
+    parser.add_argument(
+        "--unseen",
+        choices=[each.value for each in Unseen],
+        default=Unseen.MARK.value,
+        help="what to show where no frame of the clip saw anything: mark: a hatch, transparent in PNG and WebP, and "
+        "depth and confidence 0; guess: what the model draws there (default: mark)",
+    )
+    parser.add_argument(
+        "--highlights",
+        choices=[each.value for each in Highlights],
+        default=Highlights.ON.value,
+        help="off: colours without the highlights that both eyes of a stereo clip told apart; a scene of one eye knows "
+        "none and is shown as it is (default: on)",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
+    )
+    add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
+
+
+def _frames(text: str) -> list[int]:
+    try:
+        frames = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list such as 1,9,17") from None
+    if min(frames) < 0:
+        raise argparse.ArgumentTypeError("frames count from 0")
+    return frames
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Renders what is asked for and returns the exit code.
+
+    Raises:
+        InputError: there is no scene, or an option cannot be used with it.
+        UnavailableError: the device is not there.
+    """
+    from intrasplat.pose import parse_pose
+    from intrasplat.scene.checkpoint import load_scene
+    from intrasplat.splat.backend import choose_device
+    from intrasplat.view.camera import camera_of, pose_of
+    from intrasplat.view.encode import encode_layer
+    from intrasplat.view.frame import render_frame, renderer_of
+
+    device = choose_device(options.device)
+    if not (options.scene / MANIFEST).is_file():
+        raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
+    scene = load_scene(options.scene)
+    layer = Layer(options.layer)
+    highlights = Highlights(options.highlights).shown_in(layer)
+    wanted = _camera(options)
+    camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
+    pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
+    for t, path in _targets(options, scene.frame_count):
+        image_format = SUFFIX_FORMATS.get(path.suffix.lower())
+        if image_format is None:
+            raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
+        frame = render_frame(scene, t, pose, camera, device, highlights=highlights)
+        range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(
+            encode_layer(frame, layer, image_format, unseen=Unseen(options.unseen), depth_range_mm=range_mm)
+        )
+        print(path)
+        for notice in frame.warnings:
+            print(f"{notice.severity}: {notice.text}", file=sys.stderr)
+    return ExitCode.OK
+
+
+def _camera(options: argparse.Namespace) -> IntrinsicsOverride:
+    """The parts of the camera that the caller gave."""
+    try:
+        return IntrinsicsOverride(**{name: getattr(options, name) for name in IntrinsicsOverride.model_fields})
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{first['input']} is not accepted: {first['msg']}."
+        raise InputError(f"--{first['loc'][0]}", problem, "Give pixels of a usual size.") from error
+
+
+def _targets(options: argparse.Namespace, frame_count: int) -> list[tuple[float, Path]]:
+    """Times and files to write; frame i is shown at t = i / T and written as 00000i.png."""
+    if options.frames is None:
+        return [(options.t, options.out)]
+    beyond = [frame for frame in options.frames if frame >= frame_count]
+    if beyond:
+        raise InputError("--frames", f"{beyond[0]} is not there.", f"The clip has frames 0 to {frame_count - 1}.")
+    return [(frame / frame_count, options.out / f"{frame:06d}.png") for frame in options.frames]

@@ -1,0 +1,66 @@
+"""`python -m intrasplat.decode.child`: the process that reads files from outside.
+
+It loads the decoders, reads one request as JSON from its input, confines itself, and only then opens files from
+outside. It answers in lines of JSON: any number of {"pictures": ..., "frames": ..., "share": ..., "field": ...}; for a
+stereo clip one {"opened": ...} before its first frame; then one {"result": ...} or {"error": ...}.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from intrasplat.decode.guard import Allowance, lock_in
+from intrasplat.decode.reports import Reports
+from intrasplat.errors import InputError, LimitError
+
+Work = Callable[[dict[str, Any], Path, Reports], dict[str, Any]]
+"""work(request, folder for the arrays, reports); returns the result."""
+
+
+def serve(work_of: Callable[[], Work]) -> None:
+    """Import what the work needs, by work_of, read the request, confine this process, work, answer.
+
+    It may be started long before there is a request, and ends without one when its parent does.
+    """
+    with os.fdopen(os.dup(1), "wb") as stream:
+        os.dup2(2, 1)  # output of libraries must not mix with the answer
+        work = work_of()
+        line = sys.stdin.buffer.readline()
+        if not line:
+            return
+        request = json.loads(line)
+        folder = Path.cwd()
+        granted = lock_in(Allowance(**request["allowance"]), [Path(each) for each in request["readable"]], folder)
+        if os.getppid() != request["parent"]:  # it ended before lock_in could ask the kernel to watch it
+            return
+        reports = Reports(stream, granted)
+        try:
+            reports.end(work(request, folder, reports))
+        except Exception as error:
+            reports.fail(_described(error))
+
+
+def _described(error: Exception) -> dict[str, Any]:
+    if isinstance(error, InputError):
+        told = {"field": error.field, "problem": error.problem, "remedy": error.remedy}
+        return told | {"kind": "limit" if isinstance(error, LimitError) else "input"}
+    if isinstance(error, MemoryError):
+        return {"kind": "memory"}
+    places = "".join(traceback.format_tb(error.__traceback__))
+    return {"kind": "fault", "type": type(error).__name__, "errno": getattr(error, "errno", None), "where": places}
+
+
+def _decode() -> Work:
+    from intrasplat.decode.reading import read_clip
+
+    return read_clip
+
+
+if __name__ == "__main__":
+    serve(_decode)

@@ -1,0 +1,227 @@
+"""The parent's side of the decoding process: what the process wrote down becomes a clip and its calibration.
+
+Symbols: T frames, H W pixels of one eye.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+from intrasplat.clip import ClipLimits, DepthClip, StereoClip
+from intrasplat.clip.files import MAX_FOLDER_DEPTH
+from intrasplat.clip.layouts import registered_files
+from intrasplat.clip.types import RgbFrame
+from intrasplat.decode.contained import MALFORMED, REMEDY, Decoder, take_decoder
+from intrasplat.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
+from intrasplat.decode.handover import EYES, MASKS, ArrayFile, map_array
+from intrasplat.errors import InputError
+from intrasplat.intake.calibration.check import check_calibration
+from intrasplat.intake.calibration.types import (
+    RawCalibration,
+    RectifiedCalibration,
+    StereoCalibration,
+    parse_calibration,
+)
+from intrasplat.machine.hooks import Hooks, Progress
+from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.machine.memory_limit import memory_bytes
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.options import ClipOptions
+from intrasplat.report import Masks
+
+STAGE = "decode"
+LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy, OpenCV and a decoder's threads
+MAX_SHARE = 2 / 3  # of the memory there is; the rest is for the worker and the scenes that it shows
+MAX_CPU_S = 1800  # of all cores together; the same as MAX_TOTAL_S of one core
+
+
+@dataclass(frozen=True)
+class StereoRecording:
+    """A stereo clip, whose frames arrive while they are decoded, and its calibration.
+
+    clip.pairs waits for each frame, and raises what decode_clip raises when decoding fails on the way. It can be read
+    again. close() ends decoding; a recording that was read to its end, or that nobody holds any more, is closed.
+    """
+
+    clip: StereoClip
+    calibration: StereoCalibration
+    close: Callable[[], None]
+
+
+class _ArrivingPairs:
+    """Left and right frames [H, W, 3] out of the files of a process that may still write them; the same again later.
+
+    They are read, not mapped: nothing that the process does to its files harms who reads them.
+    """
+
+    def __init__(self, decoder: Decoder, size: tuple[int, int, int]) -> None:
+        self._decoder, self._size = decoder, size
+        self._files: dict[str, ArrayFile] = {}
+
+    def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
+        for index in range(self._size[0]):
+            self._decoder.until_frame(index)
+            try:
+                self._files = self._files or {eye: ArrayFile(self._decoder.folder, eye, self._size) for eye in EYES}
+                left, right = (self._files[eye].frame(index) for eye in EYES)
+            except (ValueError, OSError) as error:
+                raise _unfit(error) from error
+            if index + 1 == self._size[0]:
+                self._decoder.until_ended()
+                self._decoder.close()
+            yield left, right
+
+
+def decode_clip(
+    clip: Path,
+    right: Path | None = None,
+    *,
+    calibration: Path | None = None,
+    masks: Path | None = None,
+    options: ClipOptions | None = None,
+    limits: ClipLimits | None = None,
+    hooks: Hooks | None = None,
+) -> StereoRecording | DepthClip:
+    """The clip and calibration of these files. The same bits as open_clip and load_calibration give.
+
+    Another process decodes every frame into a private folder below tempfile.gettempdir(). Its memory and time are
+    limited; if the kernel allows it, it has no network and can read only these files. `assumptions` list the
+    protections that were in force. A clip with depth is whole when this returns; of a stereo clip the process goes on
+    decoding the frames. The folder is removed with the process; arrays and open files live with the clip.
+
+    Raises:
+        InputError, LimitError: as open_clip and load_calibration raise them; or the stereo clip has no calibration; or
+            the decoder crashed, made no progress for 10 s, or took more memory or time than allowed.
+        Cancelled: hooks.should_stop said so.
+        UnavailableError: the disk is full.
+    """
+    limits, hooks = limits or ClipLimits(), hooks or Hooks()
+    given = {"path": clip, "right": right, "masks": masks, "calibration": calibration}
+    paths = {name: str(path.absolute()) for name, path in given.items() if path is not None}
+    layouts = [str(file) for file in registered_files()]
+    request = {
+        "paths": paths,
+        "options": (options or ClipOptions()).model_dump(include=set(ClipOptions.model_fields)),
+        "layouts": layouts,
+        "readable": [each for path in (*paths.values(), *layouts) for each in _reached(path)],
+        "limits": limits.numbers(),
+    }
+    allowance = allowance_of(limits)
+    decoder = take_decoder()
+    decoder.ask(
+        request,
+        allowance,
+        on_report=lambda share: hooks.on_progress(Progress(STAGE, share)),
+        should_stop=hooks.should_stop,
+    )
+    decoder.until_opened()
+    try:
+        return _received(decoder, allowance)
+    except (*MALFORMED, OSError) as error:
+        decoder.close()
+        raise _unfit(error) from error
+
+
+def allowance_of(limits: ClipLimits) -> Allowance:
+    """Of the process that decodes a clip: what libraries and clip may take, and at most MAX_SHARE of the memory."""
+    wanted, there = LIBRARIES_BYTES + limits.decoded_bytes, memory_bytes()
+    allowed = wanted if there is None else min(wanted, int(MAX_SHARE * there))
+    return Allowance(allowed, max(limits.clip_bytes, limits.decoded_bytes), MAX_CPU_S)
+
+
+def _unfit(error: Exception) -> InputError:
+    return InputError(
+        "clip", f"it cannot be decoded: the decoder's answer does not fit ({type(error).__name__}).", REMEDY
+    )
+
+
+def _reached(path: str) -> list[str]:
+    """A file or folder, and the targets of links in the folder. Only a user of this machine can give one with links."""
+    found = [path]
+    for folder, subfolders, files in os.walk(path, followlinks=True):
+        if len(Path(folder).relative_to(path).parts) >= MAX_FOLDER_DEPTH:
+            subfolders.clear()
+        entries = (os.path.join(folder, name) for name in (*subfolders, *files))
+        found += [os.path.realpath(entry) for entry in entries if os.path.islink(entry)]
+    return found
+
+
+def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | DepthClip:
+    told, folder = decoder.opened or decoder.result or {}, decoder.folder
+    frames, height, width = (int(each) for each in told["size"])
+    size = (frames, height, width)
+    if min(size) < 1 or frames * height * width > allowance.file_bytes:
+        raise ValueError(f"a clip of {size}")
+    frame_times_s = ArrayFile(folder, "frame_times_s", size).whole()
+    if not np.isfinite(frame_times_s).all():
+        raise ValueError("frame times that are not finite")
+    assumptions = (*_notices(told["assumptions"]), _protection(told["granted"], allowance))
+    warnings = _notices(told["warnings"])
+    if decoder.opened is None:
+        whole = DepthClip(
+            rgb=map_array(folder, "rgb", size),
+            tissue=_tissue(folder, "tissue", size),
+            depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
+            depth_confidence=map_array(folder, "depth_confidence", size),
+            intrinsics=Intrinsics.parsed(told["intrinsics"]),
+            world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
+            frame_times_s=frame_times_s,
+            masks=told["masks"] and Masks.model_validate(told["masks"]),
+            assumptions=assumptions,
+            warnings=warnings,
+        )
+        decoder.close()
+        return whole
+    tissue, tissue_right = (_tissue(folder, name, size) if name in told["masked"] else None for name in MASKS)
+    pairs = _ArrivingPairs(decoder, size)
+    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right)
+    return StereoRecording(clip, _calibration(told["calibration"]), decoder.close)
+
+
+def _tissue(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[np.bool_]:
+    file, tissue = ArrayFile(folder, name, size), mapped_zeros(size, np.bool_)
+    for index, mask in enumerate(tissue):
+        np.not_equal(file.frame(index), 0, out=mask)
+        let_go(mask)
+    return tissue
+
+
+def _notices(told: Any) -> tuple[Notice, ...]:
+    return tuple(Notice.model_validate(each) for each in told)
+
+
+def _protection(granted: list[str], allowance: Allowance) -> Notice:
+    """The protections in force while the clip was decoded, and those that the kernel did not grant."""
+    amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
+    held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
+    lacking = [each for each in PROTECTIONS if each not in granted]
+    denied = f"; the kernel did not grant: {', '.join(lacking)}" if lacking else ""
+    text = f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
+    return Notice.info(NoticeCode.DECODING, text)
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    if not np.isfinite(values).all():
+        raise ValueError("poses that are not finite")
+    return values
+
+
+def _checked_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The depth, if it is finite and not negative. It is checked frame by frame because it is large."""
+    if not all(bool(np.isfinite(frame).all()) and float(frame.min()) >= 0 for frame in depth_mm):
+        raise ValueError("depth that is negative or not finite")
+    return depth_mm
+
+
+def _calibration(value: Any) -> RectifiedCalibration | RawCalibration:
+    calibration = parse_calibration(value)
+    check_calibration(calibration)
+    return calibration

@@ -1,0 +1,129 @@
+"""How the decoding process confines itself before it opens files from outside.
+
+The limits hold on every system. Some protections depend on the kernel. Without them decoding goes on, and the report
+says so. The process cannot undo any of it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import resource
+import struct
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from intrasplat.decode.landlock import confine_files
+from intrasplat.decode.seccomp import forbid_network_and_programs
+from intrasplat.machine.processes import die_with_parent
+
+MAX_OPEN_FILES = 128  # a zip, a video, the results, and Python's own files
+
+_PR_SET_NO_NEW_PRIVS = 38
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWNET = 0x40000000
+_CAPABILITY_VERSION = 0x20080522
+_CAP_DAC_READ_SEARCH = 1 << 2  # kept if held: a worker that runs as root gets files of other users
+
+LIMITED_MEMORY = "limited memory"
+NO_NETWORK = "no network"
+NO_PROGRAMS = "no other program"
+OWN_FILES = "no files but its own"
+PROTECTIONS = (LIMITED_MEMORY, NO_NETWORK, NO_PROGRAMS, OWN_FILES)
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """Limits of the process: memory, size of a file that it writes, seconds of all its cores together."""
+
+    memory_bytes: int
+    file_bytes: int
+    cpu_s: int
+
+
+def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
+    """Give up rights that decoding does not need. Returns the protections that were granted.
+
+    Call it before the first thread starts. readable lists files and folders from outside; writable is the folder for
+    the results.
+
+    Raises:
+        OSError: a limit cannot be set.
+        RuntimeError: another thread runs, which would not be confined.
+    """
+    _check_alone()
+    die_with_parent()
+    _gain_no_privileges()
+    _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
+    _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
+    _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU names the cause; SIGKILL follows
+    _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
+    granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
+    apart = _leave_network()
+    confined = confine_files(_libraries() + list(readable), writable)
+    _drop_capabilities()
+    filtered = forbid_network_and_programs()
+    if apart or filtered:
+        granted.append(NO_NETWORK)
+    if filtered:
+        granted.append(NO_PROGRAMS)
+    if confined:
+        granted.append(OWN_FILES)
+    return granted
+
+
+def _check_alone() -> None:
+    threads = Path("/proc/self/task")
+    if threads.is_dir() and len(list(threads.iterdir())) > 1:
+        raise RuntimeError("a library has started a thread, which would not be confined")
+
+
+def _limit(kind: int, soft: int, hard: int | None = None) -> None:
+    """Lower a limit. A lower one stays."""
+    _, maximum = resource.getrlimit(kind)
+    hard = soft if hard is None else hard
+    hard = hard if maximum == resource.RLIM_INFINITY else min(hard, maximum)
+    resource.setrlimit(kind, (min(soft, hard), hard))
+
+
+def _limit_memory(max_bytes: int) -> bool:
+    """Limit memory; False if the system refuses, as macOS may."""
+    try:
+        _limit(resource.RLIMIT_AS, max_bytes)
+    except (ValueError, OSError):
+        return False
+    return True
+
+
+def _gain_no_privileges() -> None:
+    """Forbid new privileges, which Landlock and seccomp require."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+
+
+def _drop_capabilities() -> None:
+    """Drop all capabilities but one, also those in a user namespace of our own."""
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = struct.pack("=Ii", _CAPABILITY_VERSION, 0)
+    held = ctypes.create_string_buffer(struct.calcsize("=6I"))  # effective, permitted, inheritable; then bits 32 up
+    if libc.capget(header, held) == 0:
+        kept = struct.unpack_from("=I", held, 4)[0] & _CAP_DAC_READ_SEARCH
+        libc.capset(header, struct.pack("=6I", kept, kept, 0, 0, 0, 0))
+
+
+def _leave_network() -> bool:
+    """Move to an empty network namespace; an ordinary user needs a user namespace for it, too."""
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    return any(libc.unshare(flags) == 0 for flags in (_CLONE_NEWNET, _CLONE_NEWUSER | _CLONE_NEWNET))
+
+
+def _libraries() -> list[Path]:
+    """Folders of Python and the libraries that it loads."""
+    package = Path(__file__).resolve().parents[2]
+    installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
+    return [package, package.parent / "contract", *map(Path, (*installed, "/usr", "/lib", "/lib64"))]

@@ -1,0 +1,131 @@
+"""What a stored scene can be exported as: names, files, which options fit which format, and how they are checked.
+
+intrasplat/export writes the formats; docs/export.md lists their units, axes and readers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from intrasplat.errors import InputError
+
+VideoView = Literal["endoscope", "orbit", "stereo"]
+FORMAT_REMEDY = "docs/export.md lists the formats and their options."
+
+
+class ExportOptions(BaseModel):
+    """What a caller may choose about an export. EXPORT_FORMATS says which options fit which format."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    exclusive: ClassVar[tuple[str, ...]] = ()
+    """Options of which at most one may be given."""
+
+    t: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="the moment: 0 is the first frame, 1 the end of the clip (default: 0)",
+    )
+    every: int | None = Field(
+        default=None, ge=1, le=1000, description="of formats over time: one of so many frames (default: 1, all)"
+    )
+    view: VideoView | None = Field(
+        default=None,
+        description="of a video: endoscope: as it saw the clip; orbit: circling about it, about one moment if t is "
+        "given; stereo: both eyes side by side (default: endoscope)",
+    )
+    baseline_mm: float | None = Field(
+        default=None,
+        gt=0,
+        le=50,
+        allow_inf_nan=False,
+        description="distance of the eyes of view=stereo in mm (default: the endoscope's own)",
+    )
+
+    def given(self) -> dict[str, object]:
+        """The options that were chosen, by name."""
+        return self.model_dump(exclude_none=True)
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format: what comes after the scene's name in a file's name, the media type, and the options that fit."""
+
+    suffix: str
+    media_type: str
+    options: tuple[str, ...]
+    about: str
+    is_stored: bool = False
+    """Made of the stored files, by the service itself; for keys that may download them."""
+
+
+_VIDEO = ("view", "every", "t", "baseline_mm")
+_BYTES = "application/octet-stream"
+EXPORT_FORMATS = {
+    "ply": ExportFormat(".ply", _BYTES, ("t",), "the Gaussians at time t as splat viewers read them, mm"),
+    "ply-zip": ExportFormat("-ply.zip", "application/zip", ("every",), "a ply for each frame, in a zip"),
+    "splat": ExportFormat(".splat", _BYTES, ("t",), "the Gaussians at time t in 32 bytes each, mm"),
+    "gltf": ExportFormat(
+        ".glb",
+        "model/gltf-binary",
+        ("t",),
+        "the Gaussians at time t as glTF splats, metres, +Y up",
+    ),
+    "points": ExportFormat("-points.ply", _BYTES, ("t",), "the Gaussians' centres at time t as coloured points, mm"),
+    "mesh-stl": ExportFormat("-mesh.stl", "model/stl", ("t",), "the surface at time t as STL without colours, mm"),
+    "mesh-ply": ExportFormat("-mesh.ply", _BYTES, ("t",), "the surface at time t as a coloured mesh, mm"),
+    "mesh-glb": ExportFormat(
+        "-mesh.glb", "model/gltf-binary", ("t",), "the surface at time t as glTF, coloured, metres, +Y up"
+    ),
+    "depth": ExportFormat("-depth.npy", _BYTES, ("every",), "depth of each frame, [T, H, W] float32 mm"),
+    "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
+    "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
+    "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (VP9)"),
+    "html": ExportFormat(
+        ".html", "text/html", (), "a page with player and scene that opens from a disk", is_stored=True
+    ),
+    "scene": ExportFormat(
+        ".scene.zip", "application/zip", (), "the scene itself, to be imported elsewhere", is_stored=True
+    ),
+    "tum": ExportFormat(".tum", "text/plain", (), "the endoscope's path as a TUM file, seconds and metres"),
+}
+"""The formats by name."""
+
+_OF_VIEW = {"t": "orbit", "baseline_mm": "stereo"}
+"""Options of a video that fit one view alone."""
+
+
+def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
+    """The options of an export, checked against its format; those that are None count as not given.
+
+    Raises:
+        InputError: there is no such format, an option does not fit it, or a value is out of its range.
+    """
+    export_format = EXPORT_FORMATS.get(name)
+    if export_format is None:
+        near = get_close_matches(name, EXPORT_FORMATS, 1, 0.5)
+        remedy = f"Did you mean {near[0]}?" if near else f"Use one of: {', '.join(EXPORT_FORMATS)}."
+        raise InputError("format", f"{name[:40]!r} is not an export format.", remedy)
+    chosen = {key: value for key, value in given.items() if value is not None}
+    for option in chosen:
+        if option not in export_format.options:
+            takes = f"It takes {' and '.join(export_format.options)}." if export_format.options else "It takes none."
+            remedy = f"Leave it out. {takes}"
+            raise InputError(option, f"{option} does not fit the format {name}: {export_format.about}.", remedy)
+    for option, view in _OF_VIEW.items():
+        if option in chosen and "view" in export_format.options and chosen.get("view") != view:
+            raise InputError(option, f"{option} is for view={view} alone.", f"Leave it out, or add view={view}.")
+    if "t" in chosen and "every" in chosen:
+        raise InputError("every", "With t one moment is shown, and every frame is of it.", "Leave out every or t.")
+    try:
+        return ExportOptions.model_validate(chosen)
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{str(first['input'])[:80]!r} is not accepted: {first['msg']}."
+        raise InputError(str(first["loc"][0]), problem, FORMAT_REMEDY) from error

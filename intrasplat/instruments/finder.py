@@ -1,0 +1,79 @@
+"""What finds a clip's instruments, a frame at a time, and what the report says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.instruments.find import FoundMask, Image, Looked, Rgb, TissueLook, find_instruments
+from intrasplat.instruments.segmenter import Segmenter
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.report import Masks
+
+MIN_SURE = 0.7
+"""Of what might be instruments, told clearly; below it the report warns."""
+MAX_UNSURE = 0.012
+"""Share of the picture that looks like instruments and is not told clearly; above it the report warns, however much of
+it is clear."""
+MAX_MISSED = 0.001
+"""Share of the picture that may be instruments and is not masked; above it the report warns. Clips whose instruments
+are all found or that have none have 0.0005 at most, those with one missed 0.002 and more."""
+LOOKED_AT = 7
+"""Pictures that tell the tissue's colour."""
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds instruments in single pictures of one clip: by the segmenter if there is one, else by colour and depth."""
+
+    look: TissueLook | None
+    segmenter: Segmenter | None = None
+
+    @classmethod
+    def of(cls, pictures: Iterable[Rgb], segmenter: Segmenter | None = None) -> Finder:
+        """The finder of a clip, from some of its pictures [H, W, 3]."""
+        return cls(TissueLook.of(pictures) if segmenter is None else None, segmenter)
+
+    def __call__(self, rgb: Rgb, nearness: Callable[[Rgb], Image]) -> FoundMask:
+        """The instruments in a picture [H, W, 3]; nearness(coarse) is that of its coarse form."""
+        if self.segmenter is not None:
+            return self.segmenter(rgb)
+        assert self.look is not None
+        picture = Looked.at(rgb)
+        return find_instruments(picture, nearness(picture.coarse), self.look)
+
+    def told(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:
+        """What the report says: of masks, the assumption, and warnings.
+
+        Args:
+            share: of all pixels, which is masked.
+            found: [frames looked at, 3] seen, clear and missed (FoundMask).
+        """
+        seen, clear, missed = found.mean(axis=0)
+        sure = float(clear / seen) if seen > 0 else 1.0
+        how = "found by colour and depth" if self.segmenter is None else "found by this installation's segmenter"
+        told = Masks(source="found" if self.segmenter is None else "segmenter", share=share, sure=sure)
+        text = f"masks: none given; instruments were {how} in {share:.1%} of the picture"
+        warnings = []
+        if sure < MIN_SURE or seen - clear > MAX_UNSURE:
+            doubt = (
+                f"No masks were given, and of what looks like instruments only {sure:.0%} is told clearly from tissue: "
+                "some may be modelled as tissue, or tissue left out. Give masks."
+            )
+            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
+        elif missed > MAX_MISSED:
+            doubt = (
+                f"No masks were given, and {missed:.1%} of the picture may be instruments that were not found: they "
+                "lie on the tissue or are wholly inside the picture. Whatever is not masked is modelled as tissue: if "
+                "they are instruments, give masks."
+            )
+            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
+        return told, Notice.info(NoticeCode.MASKS, text), tuple(warnings)
+
+
+def looked_at(frames: Sequence[int]) -> Sequence[int]:
+    """Those of a clip's frames whose pictures tell the tissue's colour."""
+    return frames[:: -(-len(frames) // LOOKED_AT)]

@@ -1,0 +1,96 @@
+"""Calibrations as text: our JSON, and the ini of StereoMIS and SCARED. The format is told by the content."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import re
+from typing import Any
+
+from pydantic import ValidationError
+
+from intrasplat.errors import InputError
+from intrasplat.intake.calibration.check import FIELD, check_calibration
+from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
+
+FORMATS_REMEDY = (
+    "Give our JSON (model rectified or raw), an OpenCV YAML or XML with M1 D1 M2 D2 R T, "
+    "or an ini with [StereoLeft] and [StereoRight]."
+)
+
+_BLANKS = re.compile(r"[^\S\n]+")
+
+
+def read_calibration(text: str) -> StereoCalibration | None:
+    """The calibration that a text means; None if its format is not one of these.
+
+    Raises:
+        InputError: it lacks a number, or is what no stereo endoscope has.
+    """
+    value = parse_text(text)
+    return None if value is None else checked_calibration(value)
+
+
+def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
+    """The calibration that a JSON-like value means; raises as read_calibration()."""
+    try:
+        calibration = parse_calibration(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
+            problem = f"model is {str(value.get('model'))[:80]}, not rectified or raw."
+            raise InputError(FIELD, problem, FORMATS_REMEDY) from None
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise InputError(
+            FIELD, f"{where}: {first['msg']} (given {str(first['input'])[:80]}).", FORMATS_REMEDY
+        ) from None
+    check_calibration(calibration)
+    return calibration
+
+
+def parse_text(text: str) -> dict[str, Any] | None:
+    """The text as a JSON-like value; None if its format is not one of these."""
+    start = text.lstrip()
+    if start.startswith("{") and "opencv-matrix" not in text:
+        return _parse_json(text)
+    if start.lower().startswith("[stereo") or "\n[stereo" in text.lower():
+        return _parse_ini(text)
+    return None
+
+
+def _parse_json(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
+    assert isinstance(value, dict)  # it starts with a brace
+    return value
+
+
+def _parse_ini(text: str) -> dict[str, Any]:
+    """StereoMIS and SCARED: [StereoLeft], [StereoRight] with res, fc, cc, kc; the right one's R and T (mm) count."""
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(_BLANKS.sub(" ", text))  # its patterns are slow on many blanks
+        left, right = parser["StereoLeft"], parser["StereoRight"]
+        value = {
+            "model": "raw",
+            "width": round(float(left["res_x"])),
+            "height": round(float(left["res_y"])),
+            "left": _ini_eye(left),
+            "right": _ini_eye(right),
+            "right_from_left_rotation": [[float(right[f"R_{3 * i + j}"]) for j in range(3)] for i in range(3)],
+            "right_from_left_translation_mm": [float(right[f"T_{i}"]) for i in range(3)],
+        }
+    except (configparser.Error, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(FIELD, f"the ini lacks a number or a section: {error}.", FORMATS_REMEDY) from None
+    if any(left[key] != right[key] for key in ("res_x", "res_y") if key in right):
+        raise InputError(FIELD, "left and right eye differ in res_x or res_y.", "Give eyes of one size.")
+    return value
+
+
+def _ini_eye(section: configparser.SectionProxy) -> dict[str, Any]:
+    names = {"fx_px": "fc_x", "fy_px": "fc_y", "cx_px": "cc_x", "cy_px": "cc_y"}
+    eye: dict[str, Any] = {ours: float(section[theirs]) for ours, theirs in names.items()}
+    coefficients = [float(section.get(f"kc_{i}", "0")) for i in range(8)]
+    return eye | {"distortion": coefficients if any(coefficients[5:]) else coefficients[:5]}

@@ -1,0 +1,69 @@
+"""Options that cannot go with the files of an upload, found without a decoder.
+
+The worker refuses the same, and more; a caller who hears it at once need not wait for the job to fail.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path, PurePosixPath
+
+from intrasplat.errors import InputError
+from intrasplat.intake.sniff import ZIP_SUFFIX
+from intrasplat.names import POSES_FILE
+from intrasplat.options import ReconstructionOptions
+
+_OF_MANY_FILES = ("endonerf", "stereomis", "frames")
+"""Layouts whose clip is a zip."""
+STEREO_VIDEOS = ("sbs", "tb")
+"""Layouts whose clip shows both eyes: a video of these, unlike a zip, can bring no calibration."""
+
+
+def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: Collection[str]) -> None:
+    """Return if the options can go with the files.
+
+    Args:
+        files: an upload's, by part, each of which has passed check_file().
+        sent: the parts that came with the options; the others are those of an earlier job's clip.
+
+    Raises:
+        InputError: names the option, the clip if it lacks a file of the layout that was asked for, or the calibration
+            if a video is sure to be of two eyes and came without one.
+    """
+    layout, clip = options.layout, files.get("clip")
+    if clip is None and layout != "auto":
+        raise InputError("options.layout", f'layout "{layout}" does not go with two files.', "Leave it out.")
+    is_zip = clip is not None and _is_zip(clip)
+    if clip is not None and layout in _OF_MANY_FILES and not is_zip:
+        problem = f'layout "{layout}" needs a zip, {clip.name} is none.'
+        raise InputError("options.layout", problem, "Leave it out, or send the files in a zip.")
+    shows_two_eyes = clip is None or layout in STEREO_VIDEOS
+    if shows_two_eyes and "calibration" not in files and not _is_zip(clip or files["left"]):
+        raise calibration_missing()
+    has_poses = clip is not None and is_zip and _holds(clip, POSES_FILE)
+    if layout == "endonerf" and not has_poses:
+        raise InputError("clip", f"the zip has no {POSES_FILE}.", "Put it beside images/, or leave the layout out.")
+    if options.poses == "given" and not (has_poses and layout in ("auto", "endonerf")):
+        problem = "it asks for poses that come with the clip, and only the EndoNeRF layout brings poses."
+        raise InputError("options.poses", problem, f'Say "auto" or "estimate", or send a zip with {POSES_FILE}.')
+    if options.mask_source == "none" and "masks" in sent:
+        problem = '"none" uses no masks, and masks came with it.'
+        raise InputError("options.mask_source", problem, "Leave out either of them.")
+
+
+def calibration_missing() -> InputError:
+    """What is said of a video of two eyes that came without a calibration."""
+    return InputError(
+        "calibration", "a video of two eyes needs a calibration.", "Add the calibration of this endoscope."
+    )
+
+
+def _is_zip(path: Path) -> bool:
+    return path.suffix.lower() == ZIP_SUFFIX
+
+
+def _holds(path: Path, name: str) -> bool:
+    """Whether a zip holds a file of that name, in whatever folder."""
+    with zipfile.ZipFile(path) as archive:
+        return any(PurePosixPath(each).name == name for each in archive.namelist())

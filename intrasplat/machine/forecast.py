@@ -1,0 +1,105 @@
+"""How long a reconstruction still takes: what its stages usually take, corrected by what they have taken so far.
+
+Seconds are those of two cores of the machine that docs/results/post.csv names, and of both eyes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from intrasplat.machine.hooks import Progress
+
+USUAL_S = {
+    "decode": (1.0, 0.0),
+    "stereo": (0.8, 0.09),
+    "masks": (0.0, 0.0),
+    "poses": (0.1, 0.0),
+    "motion": (0.1, 0.03),
+    "fusion": (0.2, 0.02),
+    "start": (0.4, 0.01),
+    "calibrate": (0.8, 0.0),
+    "train": (0.0, 0.0),
+    "finish": (1.5, 0.02),
+    "publish": (0.7, 0.0),
+}
+"""In their order: seconds of a stage, and seconds for each megapixel of all frames of one eye."""
+COMPILATION = "compile"
+"""May come after any stage; kernels that are compiled already take no time."""
+IN_BUDGET = ("motion", "fusion", "start", "calibrate")
+"""Stages whose time a budget includes, besides training."""
+USUAL_MEGAPIXELS = 30.0
+"""Until the clip's size is known."""
+STEP_S = 0.12
+"""Of a step on both eyes, for each megapixel of a frame; until steps have been made."""
+LEAST_PACE, MOST_PACE = 0.5, 5.0
+TRUSTED_S = 1.5
+"""Of work at the usual pace that is believed in before any has been done: little work says little of the pace."""
+
+
+class Forecast:
+    """Adds seconds_left to each report of progress.
+
+    Args:
+        iterations, budget_s: how long training is; one of the two is None.
+        most_frames: to train on; None: all.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        iterations: int | None,
+        budget_s: float | None,
+        most_frames: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._iterations = iterations
+        self._budget_s = budget_s
+        self._most_frames = most_frames
+        self._clock = clock
+        self._started_s = clock()
+        self._reached = "decode", 0.0  # stage and fraction
+        self._frames = 0
+        self._megapixels = USUAL_MEGAPIXELS
+
+    def completed(self, progress: Progress) -> Progress:
+        """The report with the seconds that are left until the scene is finished."""
+        if progress.stage not in (*USUAL_S, COMPILATION):
+            return progress
+        if progress.frames:
+            self.learn(progress.frames, progress.megapixels)
+        if progress.stage != COMPILATION:
+            self._reached = progress.stage, progress.fraction
+        reached, fraction = self._reached
+        usual = self._usual_s()
+        stages = list(usual)
+        place = stages.index(reached)
+        rest_s = sum(usual[stage] for stage in stages[place + 1 :])
+        pace = self._pace(sum(usual[stage] for stage in stages[:place]) + fraction * usual[reached])
+        own_s = (1 - fraction) * usual[reached]
+        if progress.stage == "train" and progress.seconds_left is not None:
+            return replace(progress, seconds_left=progress.seconds_left + pace * rest_s)
+        # The seconds of a budget are no work: they pass at the same pace everywhere.
+        in_budget = self._budget_s is not None and place <= stages.index("train")
+        fixed_s = usual["train"] if in_budget else 0.0
+        return replace(progress, seconds_left=pace * (own_s + rest_s - fixed_s) + fixed_s)
+
+    def learn(self, frames: int, megapixels: float) -> None:
+        """The clip's frames, and the megapixels of all of them, of one eye."""
+        used = frames if self._most_frames is None else min(frames, self._most_frames)
+        self._frames, self._megapixels = used, megapixels * used / frames
+
+    def _usual_s(self) -> dict[str, float]:
+        usual = {stage: fixed + each * self._megapixels for stage, (fixed, each) in USUAL_S.items()}
+        if self._iterations is not None:
+            frame_megapixels = self._megapixels / self._frames if self._frames else 0.3
+            usual["train"] = self._iterations * STEP_S * frame_megapixels
+        elif self._budget_s is not None:
+            usual["train"] = max(1.0, self._budget_s - sum(usual[stage] for stage in IN_BUDGET))
+        return usual
+
+    def _pace(self, done_s: float) -> float:
+        """How much longer than usual the work takes here and now; done_s: what the work so far usually takes."""
+        pace = (self._clock() - self._started_s + TRUSTED_S) / (done_s + TRUSTED_S)
+        return min(max(pace, LEAST_PACE), MOST_PACE)

@@ -1,0 +1,62 @@
+"""How a stage of a reconstruction reports its progress to its caller, and learns that it must stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from intrasplat.errors import Cancelled
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One report of progress. fraction is of the stage, in [0, 1].
+
+    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye, if any. Some
+    reports tell the clip's frames, and the megapixels of all of them of one eye; else both are 0.
+    """
+
+    stage: str
+    fraction: float
+    iteration: int = 0
+    iterations: int = 0
+    psnr_db: float | None = None
+    psnr_right_db: float | None = None
+    seconds_left: float | None = None
+    frames: int = 0
+    megapixels: float = 0.0
+
+
+def ignore(*arguments: object) -> None:
+    """A callback that does nothing."""
+    del arguments
+
+
+def never() -> bool:
+    """A question that is always answered with no."""
+    return False
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """The caller's callbacks: both are called between two steps of the work (worker/hang.py
+    has the longest).
+
+    on_first_moment gets a DepthClip of one frame (intrasplat/clip/types.py), as soon as a training frame has depth:
+    long before the others have. It is called at most once, by the thread that calls the stage.
+    """
+
+    on_progress: Callable[[Progress], None] = ignore
+    should_stop: Callable[[], bool] = never
+    on_first_moment: Callable[[Any], None] = ignore
+
+    def report_stage(self, stage: str, fraction: float) -> None:
+        """Report how far a stage has come.
+
+        Raises:
+            Cancelled: the caller wants to stop.
+        """
+        self.on_progress(Progress(stage, fraction))
+        if self.should_stop():
+            raise Cancelled(f"Stopped during stage {stage!r}.")

@@ -1,0 +1,199 @@
+"""How large a model the scene needs: how many bases its motion has, and how far apart its Gaussians start.
+
+Both choices minimise the squared error of the picture that each is expected to leave, in squared grey levels (of 255) a
+channel of a tissue pixel. They are made before training, from training frames alone (docs/decisions/014, 018).
+
+Symbols: B bases.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+
+import cv2
+import numpy as np
+
+from intrasplat.clip import DepthClip
+from intrasplat.machine.cores import cores
+from intrasplat.motion.tracks import Tracks, resting
+from intrasplat.motion.trials import CELLS, BasisValues, FitError, Trial, mean_error, mean_picture_error
+
+BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161, 193)
+"""Numbers of bases to choose from, besides REST."""
+REST = 1
+"""One basis is a constant: the scene neither moves nor changes its light."""
+FRAMES_A_BASIS = 3
+"""Training frames per basis where too few tracks can be trusted to try numbers of bases."""
+MIN_FRAMES_A_BASIS = 2
+"""Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
+USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 4
+"""More than USUAL_BASES have so many training frames each: a model's memory grows with its bases."""
+MAX_MOTION_LEFT = 0.5
+"""No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
+MIN_GAIN_DB = 0.25
+"""More bases, or more points, have to lower the expected error of the picture by more than this."""
+MAX_COARSENING = 4
+"""Points are at most this many times as far apart as in the finest grid: light may reveal detail later."""
+MAX_POINTS = 80_000
+"""Points per image in the finest grid that was measured."""
+TRAINED_SHARE = 0.1
+"""Trained Gaussians leave about this share of the squared error of a grid of colours as fine as they start. Measured on
+a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
+MIN_TRIAL_CELLS = 30
+MIN_TRIAL_FRAMES = 8
+"""With fewer cells or frames, the error in validation frames says nothing."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A number and why, in words for the report."""
+
+    count: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Error of each number of bases in validation frames; empty where too few tracks can be trusted.
+
+    tracked  of the tracks
+    resting  of tracks at rest, if the pictures fit these as well as the tracks; else empty
+    """
+
+    tracked: Mapping[int, FitError]
+    resting: Mapping[int, FitError] = field(default_factory=dict)
+
+    @property
+    def decisive(self) -> Mapping[int, FitError]:
+        return self.resting or self.tracked
+
+
+# bases --------------------------------------------------------------------------------------------------------------
+
+
+def try_bases(
+    tracks: Sequence[Tracks],
+    clip: DepthClip,
+    train: Sequence[int],
+    basis_values: BasisValues,
+    max_bases: int | None = None,
+) -> Trials:
+    """The error of each number of bases up to max_bases, in validation frames. tracks: of each keyframe.
+
+    Every fourth training frame is a validation frame. The tracks in the others are fitted by three quarters of B bases;
+    the error is the fit's difference from the tracks in the validation frames. There are more than MIN_FRAMES_A_BASIS
+    training frames for each basis.
+
+    The tracks of a single keyframe are noise if moving along them brings the pictures of the validation frames no more
+    than MIN_GAIN_DB nearer than rest does, with the largest number of bases. The result then has `resting`.
+    """
+    if len(train) < MIN_TRIAL_FRAMES:
+        return Trials({})
+    cells = CELLS // len(tracks)
+    trials = [Trial.of(each, clip, train, basis_values, cells) for each in tracks]
+    if sum(len(each.places) for each in trials) < MIN_TRIAL_CELLS:
+        return Trials({})
+    limit = _bases_limit(len(train), max_bases).count
+    numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
+    with ThreadPoolExecutor(cores()) as pool:
+        tracked = dict(zip(numbers, pool.map(partial(mean_error, trials), numbers), strict=True))
+    if len(tracks) > 1:  # the camera moved on: no picture rests
+        return Trials(tracked)
+    at_rest = [Trial.of(resting(tracks[0], clip, train), clip, train, basis_values)]
+    if len(at_rest[0].places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
+        return Trials(tracked)
+    error, error_at_rest = (mean_picture_error(each, numbers[-1]) for each in (trials, at_rest))
+    if error_at_rest > error * 10 ** (MIN_GAIN_DB / 10):
+        return Trials(tracked)
+    return Trials(tracked, {bases: mean_error(at_rest, bases) for bases in numbers})
+
+
+def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | None = None) -> Choice:
+    """The smallest number of bases whose expected error is within MIN_GAIN_DB of the least.
+
+    The expected error is that in validation frames plus the floor, which the Gaussians leave whatever moves. `frames`
+    is the number of training frames.
+
+    The largest number tried, if none follows the motion: even the best leaves more of the motion than the floor and
+    more than MAX_MOTION_LEFT of what the smallest number leaves. Changes of light do not count here, because more bases
+    do not help against a lamp that flickers. Without trials, one basis for every FRAMES_A_BASIS frames.
+    """
+    errors = trials.tracked
+    if not errors:
+        most = max_bases or min(BASES[-1], max(USUAL_BASES, _most_bases(frames)))
+        bases = min(frames, most, max(BASES[0], -(-frames // FRAMES_A_BASIS)))
+        reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
+        return Choice(bases, reason)
+    smallest, limit = min(errors), _bases_limit(frames, max_bases)
+    if len(errors) == 1:
+        return Choice(smallest, limit.reason)
+    if min(each.motion for each in errors.values()) > max(floor, MAX_MOTION_LEFT * errors[smallest].motion):
+        return Choice(max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames")
+    total = {bases: each.total for bases, each in trials.decisive.items()}
+    best = min(total, key=lambda each: total[each])
+    allowed = (total[best] + floor) * 10 ** (MIN_GAIN_DB / 10)
+    bases = min(each for each, error in total.items() if error + floor <= allowed)
+    left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.2f}" for each in sorted({smallest, bases, best}))
+    seen = "no motion shows in the pictures; " if trials.resting else ""
+    reason = f"{seen}the fewest within {MIN_GAIN_DB} dB of the best; in validation frames {left} of 255 grey levels"
+    return Choice(bases, reason)
+
+
+def _bases_limit(frames: int, max_bases: int | None) -> Choice:
+    """The largest number of bases that may be tried, and what limits it."""
+    limits = [
+        Choice(BASES[-1], "the most there are to choose from"),
+        Choice(max_bases or BASES[-1], "the most that the preset allows"),
+        Choice(_most_bases(frames), f"the most that {frames} training frames bear"),
+    ]
+    return min(limits, key=lambda each: each.count)
+
+
+def _most_bases(frames: int) -> int:
+    """The largest number of bases that so many training frames bear."""
+    return min((frames - 1) // MIN_FRAMES_A_BASIS, max(USUAL_BASES, frames // LONG_FRAMES_A_BASIS))
+
+
+# points -------------------------------------------------------------------------------------------------------------
+
+
+def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_error: float) -> Choice:
+    """Pixels between points: the largest stride whose expected error in these frames is within MIN_GAIN_DB of the
+    finest's.
+
+    It is at most MAX_COARSENING times the finest. motion_error is what the motion leaves whatever the points, in
+    squared grey levels.
+    """
+    errors = {stride: mean_floor_error(clip, keys, stride) for stride in range(finest, MAX_COARSENING * finest + 1)}
+    allowed = (errors[finest] + motion_error) * 10 ** (MIN_GAIN_DB / 10)
+    stride = max(each for each, error in errors.items() if error + motion_error <= allowed)
+    left = ", ".join(
+        f"{each} would leave {math.sqrt(errors[each] + motion_error):.1f}"
+        for each in (stride, stride + 1)
+        if each in errors
+    )
+    return Choice(stride, f"the most within {MIN_GAIN_DB} dB of {finest}; of 255 grey levels {left}")
+
+
+def floor_error(clip: DepthClip, index: int, stride: int) -> float:
+    """The error, in squared grey levels, that Gaussians which start stride px apart leave in one frame's tissue.
+
+    It is TRAINED_SHARE of the error of a grid of mean colours with linear interpolation between them.
+    """
+    height, width = clip.tissue.shape[1:]
+    few = (max(1, round(width / stride)), max(1, round(height / stride)))
+    tissue = clip.tissue[index].astype(np.float32)
+    weight = np.maximum(cv2.resize(tissue, few, interpolation=cv2.INTER_AREA), 1e-6)
+    image = clip.rgb[index].astype(np.float32)
+    mean = cv2.resize(image * tissue[..., None], few, interpolation=cv2.INTER_AREA) / weight[..., None]
+    missed = (cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR) - image)[clip.tissue[index]]
+    return TRAINED_SHARE * float(np.square(missed).mean()) if missed.size else 0.0
+
+
+def mean_floor_error(clip: DepthClip, keys: Sequence[int], stride: int) -> float:
+    """Mean of floor_error over these frames."""
+    return sum(floor_error(clip, index, stride) for index in keys) / len(keys)

@@ -1,0 +1,206 @@
+"""A clip's frames on the coarse grid, and the flow between two of them lifted to 3D.
+
+Symbols: h w cells of the coarse grid.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import unproject
+from intrasplat.clip import DepthClip
+from intrasplat.motion.complete import complete_depth
+
+Floats = NDArray[np.float32]
+
+ROUND_TRIP_PX = 1.0
+"""A difference of this much between forward and backward flow, in px of the coarse grid, halves the confidence."""
+SMOOTH_PX = 4.0
+"""Standard deviation of the Gaussian mean of displacements, in px of the coarse grid: depth is noisy."""
+COLOUR_SMOOTH_PX = 2.0
+"""The same for changes of colour: light varies over smaller patches than motion does."""
+SURROUNDINGS = 0.1
+"""Weight of the wider surroundings' mean in an average; full trust has 1."""
+LOST, LOST_SMOOTH_PX = 0.1, 1.0
+"""A track of less confidence ends on the surface that surrounds it; px of the coarse grid over which that eases in."""
+PARALLAX_SMOOTH_PX = 4.0
+"""Standard deviation of the Gaussian mean of what the camera's motion does to the picture, px of the coarse grid."""
+MIN_DEPTH_MM = 1e-3
+
+
+def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
+    """[h, w, ...] means of the cells of step by step pixels. Cell (i, j) starts at pixel (step i, step j).
+
+    Pixels beyond the last whole cell are ignored.
+    """
+    h, w = image.shape[0] // step, image.shape[1] // step
+    means: NDArray[Any] = cv2.resize(image[: h * step, : w * step], (w, h), interpolation=cv2.INTER_AREA)
+    return means
+
+
+class Grid:
+    """The coarse grid: the pixels that it samples and their rays. h w cells, step pixels apart."""
+
+    def __init__(self, clip: DepthClip, step: int) -> None:
+        height, width = clip.tissue.shape[1:]
+        self.step, self.size = step, (width // step, height // step)
+        rows, columns = np.mgrid[0 : self.size[1], 0 : self.size[0]] * step + step // 2
+        pixels = (rows * width + columns).ravel()
+        rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
+        self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
+        """[h, w, 3] points at depth 1, camera axes."""
+
+    def cells_at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Column and row in the grid, not rounded, of what lies at (x, y) at depth 1, camera axes."""
+        height, width = self.rays.shape[:2]
+        (left, top, _), (right, bottom, _) = self.rays[0, 0], self.rays[-1, -1]
+        return (x - left) * ((width - 1) / (right - left)), (y - top) * ((height - 1) / (bottom - top))
+
+    def sample(self, values: NDArray[Any]) -> NDArray[Any]:
+        """[h, w] the cells' middle pixels of an image; a view."""
+        return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
+
+
+class CoarseFrame:
+    """A frame on the coarse grid: colour, grey, depth, points (world, mm), and the confidence of depth and mask.
+
+    Where no tissue is measured, depth is completed from around; it is 0 in a frame without any.
+    """
+
+    def __init__(self, clip: DepthClip, index: int, grid: Grid) -> None:
+        self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
+        self.rgb = np.asarray(cell_means(clip.rgb[index], grid.step) / np.float32(255), np.float32)
+        depth_mm = grid.sample(clip.depth_mm[index])
+        usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
+        pose = clip.world_from_camera[index].astype(np.float32)
+        self.grid, self.axes, self.place_mm = grid, pose[:3, :3], pose[:3, 3]
+        self.depth_mm = complete_depth(depth_mm, usable, np.ones_like(usable))
+        self.points_mm: Floats = (grid.rays * self.depth_mm[..., None]) @ self.axes.T + self.place_mm
+        confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
+        self.trust = np.where(usable, confidence, np.float32(0))
+        clip.let_go(index)
+
+    def stands_at(self, other: CoarseFrame) -> bool:
+        """Whether both frames have the same camera pose."""
+        return np.array_equal(self.axes, other.axes) and np.array_equal(self.place_mm, other.place_mm)
+
+    def parallax(self, other: CoarseFrame) -> Floats:
+        """[h, w, 2] the flow to the other frame if the tissue rested, smoothed: depth is noisy."""
+        x, y, z = np.moveaxis((self.points_mm - other.place_mm) @ other.axes, -1, 0)
+        z = np.maximum(z, MIN_DEPTH_MM)
+        column, row = self.grid.cells_at(x / z, y / z)
+        rows, columns = np.mgrid[0 : row.shape[0], 0 : row.shape[1]]
+        exact = np.stack([column - columns, row - rows], axis=-1).astype(np.float32)
+        return np.asarray(cv2.GaussianBlur(exact, (0, 0), PARALLAX_SMOOTH_PX), np.float32)
+
+
+class Flows:
+    """Optical flow (DIS) from one frame to others and back. In order of time: the last flow starts the next.
+
+    What the camera's motion explains is taken out of the pictures first, for flow finds no patches that are turned,
+    larger or far away.
+    """
+
+    def __init__(self, start: CoarseFrame) -> None:
+        self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._start = start
+        self._left: Floats | None = None
+        """[h, w, 2] the last flow without the parallax."""
+
+    def to(self, target: CoarseFrame) -> tuple[Floats, Floats]:
+        """[h, w, 2] the flow to another frame, and from there."""
+        start, last = self._start, None if self._left is None else self._left.copy()
+        if target.stands_at(start):
+            self._left = self._solver.calc(start.grey, target.grey, last)
+            return self._left, self._solver.calc(target.grey, start.grey, -self._left)
+        there, back = start.parallax(target), target.parallax(start)
+        self._left = self._solver.calc(start.grey, _seen_along(target.grey, there, start.grey), last)
+        left = self._solver.calc(target.grey, _seen_along(start.grey, back, target.grey), -_at_end(self._left, back))
+        return _joined(self._left, there), _joined(left, back)
+
+
+def _seen_along(grey: NDArray[np.uint8], flow: Floats, outside: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[h, w] the picture at the ends of the flow; beyond its edges, that of `outside`."""
+    height, width = grey.shape
+    inside = ((_ends(flow) >= 0) & (_ends(flow) <= (width - 1, height - 1))).all(-1)
+    return np.where(inside, _at_end(grey, flow), outside)
+
+
+def _joined(left: Floats, parallax: Floats) -> Floats:
+    """[h, w, 2] the flow of which `left` remained beside the parallax."""
+    return np.asarray(left + _at_end(parallax, left), np.float32)
+
+
+def _at_end(values: NDArray[Any], flow: Floats) -> NDArray[Any]:
+    """values [h, w, ...] at the ends of the flow."""
+    return np.asarray(cv2.remap(values, _ends(flow), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _ends(flow: Floats) -> Floats:
+    """[h, w, 2] column and row to which the flow leads."""
+    height, width = flow.shape[:2]
+    return flow + np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+
+
+def lifted(
+    reference: CoarseFrame, target: CoarseFrame, forward: Floats, backward: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Displacement (mm), change of colour and confidence of every reference cell, from the flows there and back."""
+    rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
+    x, y = columns + forward[..., 0], rows + forward[..., 1]
+
+    def at_target(values: Floats) -> Floats:
+        moved: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return moved
+
+    round_trip = forward + at_target(backward)
+    trust = at_target(target.trust)
+    agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
+    confidence = reference.trust * trust * (trust > 0.5) * agree
+    point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
+    displacement = averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
+    if target.depth_mm.any():  # else nobody knows its surface
+        displacement = _onto_surface(reference, target, displacement, confidence)
+    colour = averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
+    return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
+
+
+def _onto_surface(reference: CoarseFrame, target: CoarseFrame, displacement: Floats, confidence: Floats) -> Floats:
+    """The displacement [h, w, 3] with the ends of lost tracks on target's surface, along the line of sight.
+
+    What hides stays on the surface around it: a displacement that is guessed from farther away, where tissue may be
+    pulled towards the camera, would lift it into free space.
+    """
+    end_mm = (reference.points_mm + displacement - target.place_mm) @ target.axes
+    z = np.maximum(end_mm[..., 2], MIN_DEPTH_MM)
+    x, y = target.grid.cells_at(end_mm[..., 0] / z, end_mm[..., 1] / z)
+    surface_mm = cv2.remap(target.depth_mm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    lost = cv2.GaussianBlur((confidence < LOST).astype(np.float32), (0, 0), LOST_SMOOTH_PX)
+    if not target.stands_at(reference):  # what left the view is on no surface that is known
+        lost *= (x >= 0) & (y >= 0) & (x <= lost.shape[1] - 1) & (y <= lost.shape[0] - 1)
+    along_mm = end_mm * (lost * (surface_mm / z - 1))[..., None]
+    return np.asarray(displacement + along_mm @ target.axes.T, np.float32)
+
+
+def averaged(values: Floats, confidence: Floats, over_px: float) -> Floats:
+    """Normalised convolution: Gaussian mean [h, w, 3] weighted by confidence.
+
+    Where no neighbour is trusted, wider surroundings fill in.
+    """
+    weight = np.asarray(cv2.GaussianBlur(confidence, (0, 0), over_px), np.float32)
+    return _completed(cv2.GaussianBlur(values * confidence[..., None], (0, 0), over_px), weight)
+
+
+def _completed(total: Floats, weight: Floats) -> Floats:
+    """total [h, w, 3] / weight [h, w]; the result on a grid half as fine counts as one more observation (pull-push)."""
+    height, width = weight.shape
+    if min(height, width) < 2:
+        return np.broadcast_to(total.sum((0, 1)) / max(float(weight.sum()), 1e-9), total.shape).astype(np.float32)
+    half = ((width + 1) // 2, (height + 1) // 2)
+    coarse = _completed(*(np.asarray(cv2.resize(x, half, interpolation=cv2.INTER_AREA)) for x in (total, weight)))
+    wider = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((total + SURROUNDINGS * wider) / (weight + SURROUNDINGS)[..., None], np.float32)

@@ -1,0 +1,130 @@
+"""What a report or a picture says about itself: warnings, assumptions and doubts, each with a code.
+
+Programs decide by code and severity; the text is for people, and its words may change. docs/codes.md explains every
+code.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict
+
+from intrasplat.codes import known_code
+
+
+class Severity(StrEnum):
+    """info: good to know; warning: a reason to distrust the result."""
+
+    INFO = "info"
+    WARNING = "warning"
+
+
+class NoticeCode(StrEnum):
+    """The kind of a notice. Two notices of one code differ in their numbers and names only."""
+
+    # what was assumed about the input
+    BASELINE = "baseline"
+    CALIBRATION = "calibration"
+    DECODING = "decoding"
+    DEPTH_UNIT = "depth_unit"
+    FRAME_TIMES = "frame_times"
+    IMPORTED = "imported"
+    INTRINSICS = "intrinsics"
+    LAYOUT = "layout"
+    MASKS = "masks"
+    MIDDLE_LINE_UNUSED = "middle_line_unused"
+    POSES = "poses"
+    RECTIFICATION = "rectification"
+    SYNTHETIC = "synthetic"
+    # what the training chose
+    BASES = "bases"
+    EARLY_STOPPING = "early_stopping"
+    SPACING = "spacing"
+    STORED_PRECISION = "stored_precision"
+    # what in the clip makes the result doubtful
+    ALIGNMENT_UNKNOWN = "alignment_unknown"
+    BLOOD = "blood"
+    BLURRED_FRAMES = "blurred_frames"
+    BRIGHTNESS_CHANGES = "brightness_changes"
+    CAMERA_OR_TISSUE = "camera_or_tissue"
+    CALIBRATION_SCALED = "calibration_scaled"
+    COLOURS_UNKNOWN = "colours_unknown"
+    COLOUR_CHANGES = "colour_changes"
+    DEPTH_JUMPS = "depth_jumps"
+    DEPTH_OUT_OF_RANGE = "depth_out_of_range"
+    DEPTH_UNUSUAL = "depth_unusual"
+    EYES_COLOURED_APART = "eyes_coloured_apart"
+    EYES_DISAGREE = "eyes_disagree"
+    FEW_FRAMES = "few_frames"
+    FIELD_OF_VIEW_UNUSUAL = "field_of_view_unusual"
+    FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
+    FRAME_COUNT_UNKNOWN = "frame_count_unknown"
+    HIDDEN_AT_FIRST = "hidden_at_first"
+    LITTLE_DEPTH = "little_depth"
+    LITTLE_STEREO_DEPTH = "little_stereo_depth"
+    LITTLE_TISSUE = "little_tissue"
+    MAGNIFIED = "magnified"
+    MASKS_MARK_NOTHING = "masks_mark_nothing"
+    MASKS_UNSURE = "masks_unsure"
+    MASK_GAPS = "mask_gaps"
+    NO_INSTRUMENT_MASKED = "no_instrument_masked"
+    NO_TEXTURE = "no_texture"
+    NO_TIME = "no_time"
+    NOTHING_NEW = "nothing_new"
+    OUT_OF_FOCUS = "out_of_focus"
+    POSES_UNSURE = "poses_unsure"
+    POSE_JITTER = "pose_jitter"
+    REPEATED_FRAMES = "repeated_frames"
+    ROWS_MISALIGNED = "rows_misaligned"
+    STEREO_UNSURE = "stereo_unsure"
+    VEILED = "veiled"
+    # what the training and its scores say
+    SCORES_FAILED = "scores_failed"
+    SCORES_PENDING = "scores_pending"
+    COPYING_SCORES_MORE = "copying_scores_more"
+    DEPTH_DISAGREES = "depth_disagrees"
+    DEPTH_NOT_COMPARED = "depth_not_compared"
+    GENERALISATION_GAP = "generalisation_gap"
+    RIGHT_EYE_LOW = "right_eye_low"
+    GPU_IDLE = "gpu_idle"
+    HELD_OUT_REPEATED = "held_out_repeated"
+    HELD_OUT_SCORE_LOW = "held_out_score_low"
+    HELD_OUT_WITHOUT_TISSUE = "held_out_without_tissue"
+    HOLES = "holes"
+    NOTHING_HELD_OUT = "nothing_held_out"
+    OUTLIER_FRAMES = "outlier_frames"
+    TIME_TOO_SHORT = "time_too_short"
+    TRAINING_SCORE_LOW = "training_score_low"
+    # what to know of one render
+    COARSE = "coarse"
+    HARDLY_SEEN = "hardly_seen"
+    HIGHLIGHTS_UNKNOWN = "highlights_unknown"
+    POSE_FAR = "pose_far"
+    TIME_OUTSIDE_CLIP = "time_outside_clip"
+    FIRST_PICTURE = "first_picture"
+    TRAINING_GOES_ON = "training_goes_on"
+    UNSEEN = "unseen"
+    # a report written before notices had codes
+    UNCLASSIFIED = "unclassified"
+
+
+class Notice(BaseModel):
+    """One thing to know about a scene or a picture."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    code: Annotated[NoticeCode, known_code(NoticeCode)]
+    severity: Severity
+    text: str
+
+    @classmethod
+    def info(cls, code: NoticeCode, text: str) -> Notice:
+        """A notice that is good to know."""
+        return cls(code=code, severity=Severity.INFO, text=text)
+
+    @classmethod
+    def warning(cls, code: NoticeCode, text: str) -> Notice:
+        """A notice that gives a reason to distrust the result."""
+        return cls(code=code, severity=Severity.WARNING, text=text)

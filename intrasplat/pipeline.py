@@ -1,0 +1,272 @@
+"""The table of contents: a clip becomes a scene, one stage per line. Read the modules in the order of the calls."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from intrasplat.clip import DepthClip, FrameSplit, split_frames, training_frames
+from intrasplat.clip.sampling import most_frames, sampled
+from intrasplat.errors import Cancelled, InputError, TrainingDiverged
+from intrasplat.instruments import zipped_masks
+from intrasplat.machine.cores import cores
+from intrasplat.machine.forecast import Forecast
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
+from intrasplat.machine.timing import Timings
+from intrasplat.names import CURVE, MASKS, RECORDED, REPORT
+from intrasplat.notices import Notice
+from intrasplat.outcome import scene_of, snapshot_of, training_of
+from intrasplat.poses import placed, with_poses
+from intrasplat.quality.checks import clip_warnings
+from intrasplat.quality.judge import judged
+from intrasplat.quality.report import first_report
+from intrasplat.report import Recorded, Report
+from intrasplat.scene.checkpoint import load_scene, save_scene
+from intrasplat.scene.compact import compile_coder
+from intrasplat.scene.results import add_scores, without_scores
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
+from intrasplat.splat.cpu import compile_kernels
+from intrasplat.splat.deformation import HexPlane
+from intrasplat.stereo import ClipPaths
+from intrasplat.stereo import open_with_depth as open_paths
+from intrasplat.train.first_picture import first_picture
+from intrasplat.train.hooks import TrainingHooks
+from intrasplat.train.keep import Keeper, keeping
+from intrasplat.train.loop import train
+from intrasplat.train.prepare import prepare
+from intrasplat.train.rate_distortion import QuantizedScene, round_model
+from intrasplat.train.request import ReconstructionRequest
+from intrasplat.train.resume import resume
+from intrasplat.train.run import Run, write_curve
+from intrasplat.train.scoring import held_out_score
+from intrasplat.train.setup import Setup, length_of
+from intrasplat.view.frame import SceneRenderer
+from intrasplat.view.recorded import EYES, kept_frames
+
+FINISHING_STEPS = 7
+"""Of finish(), when three steps of rounding are tried."""
+
+
+@dataclass(eq=False)
+class Made:
+    """A scene that is finished, and all that judging it needs. Judging uses the scene up."""
+
+    clip: DepthClip
+    split: FrameSplit
+    scene: TrainedScene
+    report: Report
+    device: Device
+
+
+def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
+    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out. Beside them recorded.zip, unless the
+    options say no, and masks.zip if masks were found.
+
+    A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
+
+    Raises:
+        InputError: the clip, its calibration, masks or an option cannot be used.
+        UnavailableError: the device is not there, or something it takes.
+        TrainingDiverged: training left the finite numbers.
+        Cancelled: hooks.should_stop said so. While scoring it leaves the finished scene, without scores.
+    """
+    made = make(request, out_dir, hooks)
+    try:
+        report = judge(made, hooks)
+    except (Cancelled, TrainingDiverged) as error:
+        add_scores(out_dir, without_scores(made.report, error.code))
+        raise
+    add_scores(out_dir, report)
+    return report
+
+
+def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, kept_dir: Path | None = None) -> Made:
+    """As reconstruct, without the scores: the scene in out_dir is whole and can be viewed.
+
+    kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
+    """
+    length, tell = length_of(request.options, request.preset), hooks.on_progress
+    forecast = Forecast(*length, most_frames(request.options))
+    hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
+    with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
+        setup = begin(request, out_dir, hooks, keeper)
+        used = len(setup.clip.used)
+        forecast.learn(used, used * setup.clip.tissue[0].size / 1e6)
+        run = resume(keeper.folder, setup) or prepare(setup)
+        optimise(run, keeper)
+        with ThreadPoolExecutor(1) as aside:
+            doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
+            masks, recorded = aside.submit(zipped_masks, setup.clip), aside.submit(recorded_frames, run)
+            scene, quantized = finish(run)
+        frames, told = recorded.result()
+        beside = {name: each for name, each in {MASKS: masks.result(), RECORDED: frames}.items() if each is not None}
+        report = publish(out_dir, run, scene, quantized, doubts.result(), beside, told)
+    return Made(setup.clip, setup.split, scene, report, setup.device)
+
+
+def judge(made: Made, hooks: Hooks) -> Report:
+    """The report with the scores of the scene as it is kept.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+        Cancelled: hooks.should_stop said so.
+    """
+    renderer = SceneRenderer(made.scene, made.device)
+    del made.scene  # the renderer has the weights, and they take much memory
+    return judged(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
+
+
+def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
+    """As judge, of the finished scene in a directory: its clip is opened anew, and seen from the scene's poses.
+
+    Raises:
+        InputError: the clip, its calibration, masks or an option cannot be used.
+        SceneError: the scene is missing or damaged.
+    """
+    device = device_for(request.preset.deformation, request.device)
+    scene, unplaced = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
+    clip = open_with_depth(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
+    clip = placed(clip, scene.world_from_camera)
+    split = split_frames(clip, request.options.holdout)
+    report = Report.model_validate_json((directory / REPORT).read_bytes())
+    return judge(Made(clip, split, scene, report, device), hooks)
+
+
+def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:
+    """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
+    accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
+    timings.seconds |= request.seconds
+    keep_free_memory(USUAL_BYTES)
+    options, preset = request.options, request.preset
+    device = device_for(preset.deformation, request.device)
+    out_dir.mkdir(parents=True, exist_ok=True)
+
+    def show(moment: DepthClip) -> None:
+        with suppress(InputError):  # no depth: the stages to come say so, if no frame has any
+            if hooks.on_first_picture is not None:
+                hooks.on_first_picture(first_picture(moment))
+            timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
+
+    showing = dataclasses.replace(hooks, on_first_moment=show)
+    clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
+    if "t_first_view_s" not in timings.seconds:  # it was kept with its depth, or the first moment has none
+        frames = training_frames(clip.frame_count, options.holdout)
+        moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
+        show(clip.moment(moment))
+    hooks.on_clip(clip)
+    split = split_frames(clip, options.holdout)
+    keep_free_memory(USUAL_BYTES)
+    timings.add("compile_s", compile_coder())
+    if device == CPU:
+        timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
+    torch.set_num_threads(cores() if preset.deformation == HexPlane.kind else 1)  # else kernels do what takes time
+    idle = device != choose_device(request.device)
+    return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
+
+
+def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
+    """The clip of a request with depth (intrasplat/stereo/opening.py) and its camera's poses (intrasplat/poses/posed.py).
+
+    A GPU's kernels are examined before it matches anything.
+    """
+    if isinstance(request.clip, DepthClip):
+        clip = request.clip if request.clip.left_out else sampled(request.clip, request.options)
+        return with_poses(clip, request.options, hooks, timings)
+
+    def examined() -> None:
+        if device != CPU:
+            hooks.report_stage("compile", 0.0)
+            timings.add("compile_s", examine(device))
+
+    paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
+    clip = open_paths(
+        paths,
+        request.options,
+        hooks,
+        timings,
+        limits=request.limits,
+        device=device.kind,
+        before_matching=examined,
+        segmenter=request.segmenter,
+    )
+    return with_poses(clip, request.options, hooks, timings)
+
+
+def optimise(run: Run, keeper: Keeper) -> None:
+    """Train run to its last iteration; score held-out frames, keep its state and offer snapshots on the way."""
+    clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
+    timings.seconds.setdefault("t_first_view_s", time.time() - run.setup.accepted_at_s)
+    scored, shown = partial(held_out_score, run), partial(snapshot_of, run, as_it_lies=True)
+    try:
+        train(run, clock, scored, run.setup.hooks, copy_scene=shown, keep=keeper.keep_if_due)
+    except Cancelled:
+        keeper.keep(run)
+        raise
+    timings.seconds |= {"optimise_s": clock.elapsed_s - started_s, "t_train_s": clock.elapsed_s}
+    keeper.keep(run)
+    keep_free_memory(LITTLE_BYTES)
+
+
+def finish(run: Run) -> tuple[TrainedScene, QuantizedScene | None]:
+    """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up.
+
+    Raises:
+        Cancelled: hooks.should_stop said so.
+    """
+    timings, reached = run.setup.timings, itertools.count()
+
+    def report() -> None:
+        run.setup.hooks.on_progress(run.progress("finish", min(next(reached) / FINISHING_STEPS, 1.0)))
+        if run.setup.hooks.should_stop():
+            raise Cancelled("Stopped while the scene was finished.")
+
+    report()
+    with timings.measure("finish_s"):
+        scene = scene_of(run, report).without_motion()  # the model has the weights, and they take much memory
+    with timings.measure("shrink_s"):
+        rounded = round_model(run.model, scene, run.eyes, device=run.device, on_step=report)
+        keep_free_memory(LITTLE_BYTES)
+        if rounded is None:
+            return dataclasses.replace(scene, deformation=run.model.export()[1]), None
+        del run.model  # its weights would lie beside the stored ones
+        quantized = rounded.stored(scene)
+    return quantized.scene, quantized
+
+
+def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
+    """The zip of recorded frames of the eyes that taught, and what the report says of it; nothing where that is off."""
+    if run.setup.options.keep_recorded == "off":
+        return None, None
+    with run.setup.timings.measure("recorded_s"):
+        return kept_frames(run.setup.clip, EYES[: len(run.eyes)])
+
+
+def publish(
+    out_dir: Path,
+    run: Run,
+    scene: TrainedScene,
+    quantized: QuantizedScene | None,
+    doubts: Sequence[Notice],
+    beside: Mapping[str, bytes],
+    recorded: Recorded | None,
+) -> Report:
+    """Write the report, the curve, and the scene with the files beside it. The report has no scores yet."""
+    setup = run.setup
+    setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
+    report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)
+    report = report.model_copy(update={"recorded": recorded})
+    (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
+    write_curve(out_dir / CURVE, run)
+    save_scene(out_dir, scene, beside)
+    return report

@@ -1,0 +1,111 @@
+"""Keyframes, the links between frames, and a first guess of every camera from them.
+
+A keyframe is followed while most of it stays in view; the next one starts where less than KEY_OVERLAP of it is left.
+Each frame is linked to the keyframe before it and to the one after it; keyframes that show the same tissue at other
+times are linked, too, so that a camera that returns ends where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from intrasplat.clip import spread
+from intrasplat.poses.links import Frames, Link
+from intrasplat.poses.rigid import Reals, align, exp, inverse, log
+
+KEY_OVERLAP = 0.6
+KEY_FRAMES = 16
+"""Frames after which the next keyframe starts at the latest: the noise of one frame's depth is not in all poses."""
+LOOP_OVERLAP, MIN_OVERLAP = 0.5, 0.25
+"""Predicted share of a keyframe in another one's view for a link; the share found below which a link is dropped."""
+
+MAX_LOOKS, MAX_LOOPS = 32, 64
+"""Keyframes among which such pairs are sought, and the most links between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Frames that are linked, and where their cameras are if all tissue were rigid.
+
+    frames             [K]       indices in the clip, rising
+    world_from_camera  [K, 4, 4] mm; the world is the first one's camera
+    links                        a and b are indices in the clip
+    keys                         the keyframes' indices
+    """
+
+    frames: Sequence[int]
+    world_from_camera: Reals
+    links: list[Link]
+    keys: list[int]
+
+
+def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
+    """Follow the training frames, link by link."""
+    poses, links, keys = {train[0]: np.eye(4)}, list[Link](), [train[0]]
+    flow = None
+
+    def linked(i: int, last: int) -> tuple[Link, float]:
+        """The link from the present keyframe, which places frame i, and the share of the keyframe that it explains."""
+        key, start = keys[-1], inverse(_ahead(poses, last, i)) @ poses[keys[-1]]
+        link = frames.link(key, i, frames.predicted(key, start)[0] if flow is None else flow)
+        aligned = align(frames.camera, link.before, link.after, link.trust, start)
+        poses[i] = poses[key] @ inverse(aligned.motion)
+        return link, link.agreeing(aligned.residual_px)
+
+    def turn_to(i: int) -> None:
+        """Make frame i the present keyframe."""
+        links.extend(_from_behind(frames, i, [each for each in train if keys[-1] < each < i]))
+        keys.append(i)
+
+    for last, i in pairwise(train):
+        link, share = linked(i, last)
+        if share < MIN_OVERLAP and keys[-1] != last:  # most was lost: the last frame shows more of it
+            turn_to(last)
+            flow = None
+            link, _ = linked(i, last)
+        links.append(link)
+        flow = link.flow
+        if link.overlap < KEY_OVERLAP or train.index(i) - train.index(keys[-1]) == KEY_FRAMES:
+            turn_to(i)
+            flow = None
+        on_progress(train.index(i) / (len(train) - 1))
+    links += _loops(frames, keys, poses)
+    return Chain(
+        train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP], keys
+    )
+
+
+def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:
+    """Where the camera is in a frame after the last one if it goes on as it went."""
+    before = max((each for each in poses if each < last), default=last)
+    if before == last:
+        return poses[last]
+    step = log(poses[last] @ inverse(poses[before]))
+    return exp(step * (index - last) / (last - before)) @ poses[last]
+
+
+def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]:
+    """Links from a keyframe back to the frames before it."""
+    found, flow = list[Link](), None
+    for i in reversed(between):
+        link = frames.link(key, i, flow)
+        flow = link.flow
+        found.append(link)
+    return found
+
+
+def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[Link]:
+    """Links between keyframes that are no neighbours and see the same tissue: those that should see most of it."""
+    some = spread(keys, MAX_LOOKS)
+    pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]
+    shares = {(a, b): frames.predicted(a, inverse(poses[b]) @ poses[a])[1] for a, b in pairs}
+    chosen = sorted((pair for pair in pairs if shares[pair] > LOOP_OVERLAP), key=lambda pair: -shares[pair])
+    found = []
+    for a, b in sorted(chosen[:MAX_LOOPS], key=pairs.index):
+        flow, _ = frames.predicted(a, inverse(poses[b]) @ poses[a])
+        found.append(frames.link(a, b, flow))
+    return found

@@ -1,0 +1,225 @@
+"""The camera's path, estimated from a stereo clip.
+
+Training frames alone decide on the path and on what the tissue does. Any other frame, a held-out one above all, gets
+its pose from its own picture against them, one by one, and changes nothing else.
+
+Symbols: T frames of the clip, K frames that are fitted together, S courses of the tissue's deformation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from intrasplat.clip import DepthClip, spread
+from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
+from intrasplat.poses.chain import chained
+from intrasplat.poses.fitting import Fit, fitted
+from intrasplat.poses.gauge import RIGID_PER_BENT, Gauged, gauged
+from intrasplat.poses.links import Frames, Link
+from intrasplat.poses.rigid import Reals, align, between, inverse, log
+
+MAX_FITTED = 128
+"""Frames that are fitted together; in a longer clip the others are placed between them."""
+CHAINING, FITTING = 0.45, 0.45
+"""Shares of the progress."""
+MIN_AGREEING, GOOD = 0.15, 0.4
+"""A frame is sure if such a share of a keyframe's tissue is found in it where the fit expects it.
+A frame that is placed asks no second one with the last share."""
+MOVED_MM, MOVED_DEG = 1.2, 0.6
+"""Root mean square about its mean below which a camera counts as fixed."""
+UNSURE_MM, UNSURE_DEG = 1.25, 1.0
+"""Standard deviations beyond which camera and tissue may have been confused."""
+LARGE_MM, LARGE_DEG = 12.0, 6.0
+"""Without a course to go by, such tissue may be all that moves, up to these sizes."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPath:
+    """The camera's path.
+
+    world_from_camera  [T, 4, 4] mm; the world is the first training frame's camera
+    sigma_mm, sigma_deg  standard deviation that is expected of it, after one rigid motion laid it on the truth
+    alone_mm, alone_deg  the same without what follows the tissue's courses
+    extent_mm, extent_deg  largest distance and angle between two cameras; path_mm: length of the path
+    spread_mm, spread_deg  root mean square about the mean
+    rigid_fit_mm  median distance by which tissue that moves as the fit says misses its place
+    tissue_mm   root mean square of the common motion that was given to the tissue
+    period_frames  of the tissue's motion, or None
+    unsure      frames whose pose is not to be relied on
+    """
+
+    world_from_camera: Reals
+    sigma_mm: float
+    sigma_deg: float
+    path_mm: float
+    extent_mm: float
+    extent_deg: float
+    spread_mm: float
+    spread_deg: float
+    alone_mm: float
+    alone_deg: float
+    rigid_fit_mm: float
+    tissue_mm: float
+    period_frames: float | None
+    unsure: tuple[int, ...]
+
+    @property
+    def confused(self) -> bool:
+        """Whether the tissue's motion may have been taken for the camera's, or the camera's for the tissue's."""
+        return self.sigma_mm > UNSURE_MM or self.sigma_deg > UNSURE_DEG
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moved, beyond doubt."""
+        large = self.extent_mm > LARGE_MM or self.extent_deg > LARGE_DEG
+        return self.seems_to_move and (self.period_frames is not None or large or not self.confused)
+
+    @property
+    def seems_to_move(self) -> bool:
+        """Whether camera or tissue moved as a whole."""
+        sure = self.spread_mm > max(MOVED_MM, 2 * self.sigma_mm), self.spread_deg > max(MOVED_DEG, 2 * self.sigma_deg)
+        return any(sure) or self.alone_mm > MOVED_MM or self.alone_deg > MOVED_DEG
+
+
+def find_path(
+    clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None
+) -> FoundPath:
+    """The path of the clip's camera.
+
+    Args:
+        train: rising; the frames that decide. All others are placed against them.
+    """
+    with one_opencv_thread():
+        return _found(clip, train, on_progress)
+
+
+def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None]) -> FoundPath:
+    frames = Frames(clip)
+    used = spread(train, MAX_FITTED)
+    chain = chained(frames, used, lambda share: on_progress(CHAINING * share))
+    if not chain.links:
+        return _unknown(clip.frame_count)
+    fit = fitted(frames.camera, chain, lambda share: on_progress(CHAINING + FITTING * share))
+    on_progress(CHAINING + FITTING)
+    t = np.asarray(used, np.float64)
+    k = clip.intrinsics
+    half_mm = fit.middle_mm[2] * k.width / k.fx / 2
+    gauge = gauged(fit.poses, t, fit.field.courses, fit.field.sizes_mm(float(fit.middle_mm[2])), fit.middle_mm, half_mm)
+    path = np.tile(np.eye(4), (clip.frame_count, 1, 1))
+    path[list(used)] = gauge.poses
+    unsure = _apart(used, fit, chain.links)
+    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.left_out))
+    for done, i in enumerate(others):
+        pose, share = _placed(frames, used, fit, gauge, i)
+        path[i] = pose
+        frames.forget(i)
+        unsure += [i] if share < MIN_AGREEING else []
+        on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
+    known = sorted({*used, *others})
+    for i in clip.left_out:
+        path[i] = between(known, path[known], i)
+    return _told(path, used, fit, gauge, half_mm, frames, unsure)
+
+
+def _unknown(count: int) -> FoundPath:
+    """No path: no two frames show the same tissue."""
+    still = np.tile(np.eye(4), (count, 1, 1))
+    nothing = dict.fromkeys((each.name for each in fields(FoundPath) if each.type == "float"), 0.0)
+    return FoundPath(still, period_frames=None, unsure=tuple(range(count)), **nothing)
+
+
+def _apart(used: Sequence[int], fit: Fit, links: Sequence[Link]) -> list[int]:
+    """The frames that no chain of links, each of which finds enough tissue where the fit expects it, ties to most."""
+    place = {index: k for k, index in enumerate(used)}
+    tied = [
+        (place[link.a], place[link.b])
+        for link, residual_px in zip(links, fit.residual_px, strict=True)
+        if link.agreeing(residual_px) >= MIN_AGREEING
+    ]
+    ends = np.array(tied, np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(tied)), (ends[0], ends[1])), shape=(len(used), len(used)))
+    _, piece = connected_components(graph, directed=False)
+    most = np.bincount(piece).argmax()
+    return [index for index, each in zip(used, piece, strict=True) if each != most]
+
+
+def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index: int) -> tuple[Reals, float]:
+    """A frame's camera, from its own picture against the nearest fitted frames; the share that agrees."""
+    course, guess = fit.field.course_at(index, used), between(used, fit.poses, index)
+    found = []
+    for number in np.argsort(np.abs(np.asarray(used) - index), kind="stable")[:2]:
+        pose = fit.poses[number]
+        link = frames.link(used[number], index, frames.predicted(used[number], inverse(guess) @ pose)[0])
+        points = frames.camera.points_mm(link.before)
+        world = points @ pose[:3, :3].T + pose[:3, 3]
+        moved = world + fit.field.displacement(world, course - fit.field.courses[number])
+        seen = frames.camera.seen((moved - pose[:3, 3]) @ pose[:3, :3])  # as that frame would see it
+        aligned = align(frames.camera, seen, link.after, link.trust, np.eye(4))
+        share = link.agreeing(aligned.residual_px)
+        found.append((share, gauge.tissue_at(course) @ pose @ inverse(aligned.motion)))
+        if share > GOOD:
+            break
+    share, pose = max(found, key=lambda each: each[0])
+    return pose, share
+
+
+def _told(
+    path: Reals, used: Sequence[int], fit: Fit, gauge: Gauged, half_mm: float, frames: Frames, unsure: Sequence[int]
+) -> FoundPath:
+    mine = path[list(used)]
+    places = mine[:, :3, 3]
+    turns = np.degrees([log(inverse(mine[0]) @ each)[3:] for each in mine])
+    residual, weight = np.concatenate(fit.residual_px), np.concatenate(fit.weight)
+    px = float(np.median(residual[weight > 0.25])) if (weight > 0.25).any() else float("inf")
+    twists = np.stack([log(each) for each in gauge.tissue])
+    shifts = twists[:, :3] + np.cross(twists[:, 3:], fit.middle_mm)
+    sure = [k for k, index in enumerate(used) if index not in unsure]
+    sigma_mm, sigma_deg = _sigma(fit, gauge, half_mm, sure)
+    return FoundPath(
+        world_from_camera=path,
+        sigma_mm=sigma_mm,
+        sigma_deg=sigma_deg,
+        path_mm=float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()),
+        extent_mm=_extent(places),
+        extent_deg=_extent(turns),
+        spread_mm=float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean())),
+        spread_deg=float(np.sqrt(np.square(turns - turns.mean(0)).sum(1).mean())),
+        alone_mm=_alone(places, fit.field.courses),
+        alone_deg=_alone(turns, fit.field.courses),
+        rigid_fit_mm=px * float(fit.middle_mm[2]) / frames.camera.fx,
+        tissue_mm=float(np.sqrt(np.square(shifts - shifts.mean(0)).sum(1).mean())),
+        period_frames=fit.field.period,
+        unsure=tuple(sorted(unsure)),
+    )
+
+
+def _sigma(fit: Fit, gauge: Gauged, half_mm: float, sure: Sequence[int]) -> tuple[float, float]:
+    """(mm, degrees) expected of the path where it is sure: by the noise of the links, and by the choice of the gauge.
+
+    If no course explains what deforms, nothing tells the tissue's rigid motion, of the size usual for such a
+    deformation, from the camera's.
+    """
+    covariance = by_place_and_turn(fit.grams.covariance(fit.field), fit.poses) + gauge.covariance
+    mm, deg = aligned_sigma(covariance, fit.poses, sure)
+    if fit.field.period is None:
+        common_mm = RIGID_PER_BENT * np.sqrt(3) * fit.grams.bent_mm(fit.field, float(fit.middle_mm[2]))
+        mm, deg = np.hypot(mm, common_mm), np.hypot(deg, np.degrees(common_mm / half_mm))
+    return float(mm), float(deg)
+
+
+def _alone(values: Reals, courses: Reals) -> float:
+    """Root mean square of [K, 3] without what follows the tissue's courses [K, S]."""
+    known = np.concatenate([np.ones((len(values), 1)), courses], axis=1)
+    rest = values - known @ np.linalg.lstsq(known, values, rcond=None)[0]
+    return float(np.sqrt(np.square(rest).sum(1).mean()))
+
+
+def _extent(values: Reals) -> float:
+    """The largest distance between two of [K, 3]."""
+    return float(max(np.linalg.norm(values - each, axis=1).max() for each in values))

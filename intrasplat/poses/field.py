@@ -1,0 +1,109 @@
+"""A smooth motion of the tissue: u(x, t) = sum_s A_s phi(x) h_s(t), with polynomials phi of the place, courses h_s in
+time.
+
+What of u is a rigid motion of all tissue may as well be the camera's (intrasplat/poses/gauge.py).
+
+Symbols: K frames, M places, F polynomials, S courses. Lengths in mm, in the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.poses.rigid import Reals, cross
+
+HARMONICS = 2
+USUAL_MM, SMOOTH = 6.0, 1.4
+"""Standard deviation that a coefficient is expected to have: of degree d it is USUAL_MM / SMOOTH^d."""
+SAMPLED = 5
+"""Places along each axis at which the size of a deformation is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A motion of the tissue.
+
+    degree   of the polynomials in x and y
+    middle, half  [2] mm: the middle and half the extent of the tissue seen, by which places are scaled
+    weight   [S, 3 F]
+    courses  [K, S] of any unit
+    period   in frames, of courses that are sines and cosines or came from them; None: there is no motion
+    """
+
+    degree: int
+    middle: Reals
+    half: Reals
+    weight: Reals
+    courses: Reals
+    period: float | None = None
+
+    @classmethod
+    def at_rest(cls, degree: int, middle: Reals, half: Reals, frames: int) -> Field:
+        """No motion in so many frames."""
+        return cls(degree, middle, half, np.zeros((0, 3 * powers_of(degree))), np.zeros((frames, 0)))
+
+    @property
+    def degrees(self) -> NDArray[np.intp]:
+        """[3 F] the degree of each coefficient."""
+        return np.asarray(np.repeat([total for total in range(self.degree + 1) for _ in range(total + 1)], 3))
+
+    @property
+    def ridge(self) -> Reals:
+        """[3 F] inverse variance that each coefficient is expected to have."""
+        return np.asarray(np.square(SMOOTH**self.degrees / USUAL_MM))
+
+    @property
+    def rigid(self) -> Reals:
+        """[3 F, 6] the coefficients of six motions that move a flat tissue rigidly: along the axes, and about them."""
+        found = np.zeros((3 * powers_of(self.degree), 6))
+        found[:3, :3] = np.eye(3)
+        for axis, turn in enumerate(np.eye(3)):  # the polynomials 1, y, x
+            found[3:6, 3 + axis] = np.cross(turn, [0, self.half[1], 0])
+            found[6:9, 3 + axis] = np.cross(turn, [self.half[0], 0, 0])
+        return found
+
+    def powers(self, places_mm: Reals) -> Reals:
+        """[M, F] the polynomials: 1, y, x, y^2, x y, x^2, ..."""
+        x, y = ((places_mm[:, :2] - self.middle) / self.half).T
+        all_of = [(i, total - i) for total in range(self.degree + 1) for i in range(total + 1)]
+        across, down = np.ones((2, self.degree + 1, len(places_mm)))
+        for power in range(1, self.degree + 1):
+            across[power], down[power] = across[power - 1] * x, down[power - 1] * y
+        return np.stack([across[i] * down[j] for i, j in all_of], axis=1)
+
+    def displacement(self, places_mm: Reals, change: Reals) -> Reals:
+        """[M, 3] mm by which tissue moves while the courses change by [S]."""
+        if not len(change):
+            return np.zeros_like(places_mm)
+        return np.asarray(self.powers(places_mm) @ (change @ self.weight).reshape(-1, 3))
+
+    def course_at(self, frame: float, frames: Sequence[int]) -> Reals:
+        """[S] the courses at a frame beside those fitted [K]."""
+        return np.array([np.interp(frame, frames, course) for course in self.courses.T])
+
+    def sizes_mm(self, depth_mm: float) -> Reals:
+        """[S] root mean square of the deformation by a course of 1; a rigid motion is no deformation."""
+        sides = np.linspace(-0.8, 0.8, SAMPLED)
+        flat = np.stack(np.meshgrid(sides, sides), axis=-1).reshape(-1, 2) * self.half + self.middle
+        places = np.concatenate([flat, np.full((len(flat), 1), depth_mm)], axis=1)
+        turns = np.stack([-cross(place) for place in places - places.mean(0)])
+        rigid = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), turns], axis=2).reshape(-1, 6)
+        moved = np.array([self.displacement(places, course).ravel() for course in np.eye(len(self.weight))])
+        moved = moved.reshape(len(self.weight), len(rigid))
+        bent = moved.T - rigid @ np.linalg.lstsq(rigid, moved.T, rcond=None)[0]
+        return np.asarray(np.sqrt(np.square(bent).sum(0) / len(places)))
+
+
+def powers_of(degree: int) -> int:
+    """F, the polynomials of a degree."""
+    return (degree + 1) * (degree + 2) // 2
+
+
+def waves(frames: Reals, period: float) -> Reals:
+    """[K, 2 HARMONICS] cosines and sines of a period, both in frames."""
+    angle = 2 * np.pi * np.asarray(frames, np.float64)[:, None] * np.arange(1, HARMONICS + 1) / period
+    return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)

@@ -1,0 +1,196 @@
+"""Cameras and the tissue's motion, fitted together to all links.
+
+Whatever moves unlike the rest loses weight: a match by its residual, a piece of tissue by those of all its links (its
+rigidity). The tissue's motion starts from sines and cosines of the period that explains the links best, if one does;
+where free courses in time explain the links better, as of a pull, they are taken.
+
+Symbols: K frames, L links, M matches of a link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from intrasplat.poses.chain import Chain
+from intrasplat.poses.field import HARMONICS, Field, waves
+from intrasplat.poses.grams import Grams, link_gram
+from intrasplat.poses.links import Link
+from intrasplat.poses.rigid import Reals, StereoCamera, exp
+
+ROUGH_PX, FINE_PX = (4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 0.8, 0.8)
+"""Largest residual at which a match has a quarter of its weight, round by round: before the tissue's motion is known,
+and with it."""
+SETTLING = 4
+"""Rounds with the last of them until a wide pan has settled: without them it is 0.1 degrees farther off."""
+TUNED, FOLLOWED = (2, 4), (1, 2, 3)
+"""Of the fine rounds: those that tune the period, and those that follow the courses where they are free."""
+DEGREE, WIDE_DEGREE, WIDE = 3, 5, 1.5
+"""Of the polynomials; the second where the clip shows tissue so many times as wide or as high as a view."""
+PERIODS, MIN_PERIOD_FRAMES, MIN_PERIODS = 48, 8.0, 1.25
+"""Periods that are tried; the shortest; how often the longest fits into the clip."""
+NEAR = np.linspace(0.94, 1.06, 25)
+"""Times the last period: those that are tried to tune it."""
+MIN_EXPLAINED = 0.08
+"""Share of what rigid tissue leaves unexplained that a period must explain: of still tissue it is below 0.01."""
+MIN_GAIN = 0.05
+"""Share of the loss that free courses must save: of breathing they cost 0.01, of a pull they save 0.06."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Cameras and motion that explain the links.
+
+    poses        [K, 4, 4] world_from_camera; the world is the first frame's camera
+    field        the tissue's motion
+    middle_mm    [3] the middle of the tissue seen
+    residual_px, weight  of each link [M]: lengths of the residuals, robust weights
+    grams        what the links say of what is left to explain
+    """
+
+    poses: Reals
+    field: Field
+    middle_mm: Reals
+    residual_px: Sequence[Reals]
+    weight: Sequence[Reals]
+    grams: Grams
+
+
+def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], None] = lambda share: None) -> Fit:
+    """Cameras and the tissue's motion. on_progress gets the share of the rounds done, and what it raises is raised."""
+    fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX) + SETTLING
+    for done, scale_px in enumerate(ROUGH_PX):
+        on_progress(done / rounds)
+        fitting.improve(scale_px)
+    best, periodic = fitting, fitting.find_period(FINE_PX[0])
+    free = copy(fitting)  # nothing is changed in place
+    for place, scale_px in enumerate(FINE_PX):
+        on_progress((len(ROUGH_PX) + place) / rounds)
+        (fitting.tune if periodic and place in TUNED else fitting.improve)(scale_px)
+        if periodic:
+            (free.follow if place in FOLLOWED else free.improve)(scale_px)
+    if periodic and free.loss() < (1 - MIN_GAIN) * fitting.loss():
+        best = free
+    for place in range(SETTLING):
+        on_progress((len(ROUGH_PX) + len(FINE_PX) + place) / rounds)
+        best.improve(FINE_PX[-1])
+    return best.result()
+
+
+class _Fitting:
+    """A fit that is still being improved."""
+
+    def __init__(self, camera: StereoCamera, chain: Chain) -> None:
+        self.camera, self.links, self.poses = camera, chain.links, chain.world_from_camera
+        place = {index: k for k, index in enumerate(chain.frames)}
+        self.ends = [(place[each.a], place[each.b]) for each in chain.links]
+        self.frames = np.asarray(chain.frames, np.float64)
+        self.incidence = np.zeros((len(self.ends), len(self.frames)))
+        for row, (a, b) in zip(self.incidence, self.ends, strict=True):
+            row[a], row[b] = 1, -1
+        seen = [self._some(link, self.poses[a]) for link, (a, _) in zip(self.links, self.ends, strict=True)]
+        places = np.concatenate(seen)
+        self.middle_mm = np.median(places, axis=0)
+        low, high = np.percentile(places[:, :2], [1, 99], axis=0)
+        half = (high - low) / 2 + 1e-6
+        view = np.median([np.ptp(each[:, :2], axis=0) for each in seen], axis=0) / 2
+        degree = WIDE_DEGREE if (half > WIDE * view).any() else DEGREE
+        self.field = Field.at_rest(degree, (low + high) / 2, half, len(self.frames))
+        self.rigidity: dict[int, Reals] = {}
+        self.residual_px: list[Reals] = []
+        self.weight: list[Reals] = []
+
+    def improve(self, scale_px: float) -> None:
+        """One step of cameras and field."""
+        twists, bend = self._measured(scale_px).solved(self.field)
+        self._move(twists, replace(self.field, weight=self.field.weight + bend))
+
+    def follow(self, scale_px: float) -> None:
+        """One step of cameras and field, and then of cameras and courses."""
+        grams = self._measured(scale_px)
+        _, bend = grams.solved(self.field)
+        field = replace(self.field, weight=self.field.weight + bend)
+        twists, change = grams.with_weights(field, bend).followed(field)
+        courses = field.courses + change
+        even, size = np.linalg.qr(courses - courses.mean(0))
+        root = np.sqrt(len(self.frames))
+        self._move(twists, replace(field, courses=even * root, weight=size / root @ field.weight))
+
+    def tune(self, scale_px: float) -> None:
+        """One step of cameras and field with the best period near the present one."""
+        assert self.field.period is not None
+        self._start_with(self._measured(scale_px).without(self.field), self.field.period * NEAR)
+
+    def find_period(self, scale_px: float) -> bool:
+        """Whether some period explains enough; if so, one step of cameras and field with it."""
+        grams = self._measured(scale_px)
+        span = self.frames[-1] - self.frames[0]
+        if span < MIN_PERIODS * MIN_PERIOD_FRAMES:
+            return False
+        periods = np.geomspace(MIN_PERIOD_FRAMES, span / MIN_PERIODS, PERIODS)
+        gains = grams.explained(self.field, periods.tolist())
+        best = int(np.argmax(gains))
+        if gains[best] < MIN_EXPLAINED * grams.unexplained():
+            return False
+        self._start_with(grams, periods[best] * NEAR)
+        return True
+
+    def loss(self) -> float:
+        """Mean of r^2 / (1 + r^2) over the matches before the last step."""
+        squared = np.square(np.concatenate(self.residual_px))
+        trust = np.concatenate([each.trust for each in self.links])
+        return float((trust * squared / (1 + squared)).sum() / trust.sum())
+
+    def result(self) -> Fit:
+        """The fit as it is now."""
+        grams = self._measured(FINE_PX[-1])
+        return Fit(self.poses, self.field, self.middle_mm, self.residual_px, self.weight, grams)
+
+    def _start_with(self, grams: Grams, periods: Reals) -> None:
+        """Take the best of the periods and solve for the field anew. grams: as without any field."""
+        period = float(periods[np.argmax(grams.explained(self.field, periods.tolist()))])
+        courses, count = waves(self.frames, period), self.field.weight.shape[1]
+        field = replace(self.field, period=period, courses=courses, weight=np.zeros((2 * HARMONICS, count)))
+        twists, bend = grams.solved(field)
+        self._move(twists, replace(field, weight=bend))
+
+    def _move(self, twists: Reals, field: Field) -> None:
+        self.field = field
+        self.poses = np.stack([exp(each) @ pose for each, pose in zip(twists, self.poses, strict=True)])
+
+    def _measured(self, scale_px: float) -> Grams:
+        """What the links say now; notes residuals, weights and rigidity."""
+        courses = self.field.courses
+        found = [
+            link_gram(
+                self.camera,
+                link,
+                (self.poses[a], self.poses[b]),
+                self.field,
+                courses[b] - courses[a],
+                scale_px,
+                self.rigidity.get(link.a),
+            )
+            for link, (a, b) in zip(self.links, self.ends, strict=True)
+        ]
+        self.residual_px, self.weight = [each.residual_px for each in found], [each.weight for each in found]
+        self.rigidity = rigidity(self.links, self.weight)
+        return Grams(np.stack([each.gram for each in found]), self.incidence, self.frames)
+
+    def _some(self, link: Link, pose: Reals) -> Reals:
+        """Every sixteenth match of a link in the world."""
+        return self.camera.points_mm(link.before[::16]) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def rigidity(links: Sequence[Link], weight: Sequence[Reals]) -> dict[int, Reals]:
+    """By first frame: of each of its cells the squared mean of the weights in all its links; a half counts beside."""
+    cells = 1 + max(int(link.cells.max(initial=0)) for link in links)
+    total = {link.a: np.full(cells, 0.5) for link in links}
+    count = {link.a: np.ones(cells) for link in links}
+    for link, each in zip(links, weight, strict=True):
+        total[link.a][link.cells] += each
+        count[link.a][link.cells] += 1
+    return {a: np.square(total[a] / count[a]) for a in total}

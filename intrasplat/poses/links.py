@@ -1,0 +1,202 @@
+"""Matches between two frames of a clip: optical flow on a coarse grid, with stereo disparity at both ends.
+
+Symbols: h w cells of the coarse grid, M matches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip
+from intrasplat.motion.lifted import cell_means
+from intrasplat.poses.rigid import Reals, StereoCamera
+
+Floats = NDArray[np.float32]
+
+FLOW_WIDTH = 320
+"""Maximum width in px at which flow is computed: the clip is reduced by the smallest whole factor that fits."""
+MATCH_STEP = 5
+"""Cells of the grid between neighbouring matches."""
+PATCH_PX = 11
+"""Side of the patches by which the flow is refined: dense flow is smoother than the tissue's, and takes 4 % of the
+parallax for a turn of the camera. Wider patches are too smooth, too."""
+SHADE_PX, CONTRAST, MIN_SPREAD = 10.0, 40.0, 10.0
+"""Width over which shades are taken out before patches are compared; the standard deviation that textures get then,
+levels of 255; what is added to theirs, so that noise does not grow."""
+MAX_OFF = 25.0
+"""Mean difference of two patches in levels of those; unrelated textures have 27 or more, most matches 5 to 20."""
+LOST = -1e4
+"""The place of a patch that was not found."""
+ROUND_TRIP_PX = 1.0
+"""A difference of this much between a patch's way there and back halves the trust in its match."""
+MIN_TRUST, MIN_MATCH_TRUST = 0.5, 0.1
+"""Confidence of depth that a match needs at both ends; what is left of it for a match to count."""
+AGREES_PX = 1.5
+"""Residual below which a match is where it is expected."""
+PSEUDO_BASELINE_MM = 4.3
+"""Where depth was given: as of a stereo camera whose eyes stand so far apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame on the coarse grid.
+
+    grey, even  [h, w] grey levels, and those without shades
+    disparity   [h, w] px of the grid, 0 where there is none
+    trust       [h, w] in it, 0 to 1; 0 off tissue
+    """
+
+    grey: NDArray[np.uint8]
+    even: NDArray[np.uint8]
+    disparity: Floats
+    trust: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Matches from frame a to frame b.
+
+    cells  [M]     which of a's cells with depth; a has the same in all links
+    before [M, 3]  (column, row, disparity) in a, px of the coarse grid
+    after  [M, 3]  in b
+    trust  [M]     in [0, 1]
+    overlap        share of a's cells with depth that were found in b
+    flow [h, w, 2] to start another link's from
+    """
+
+    a: int
+    b: int
+    cells: NDArray[np.intp]
+    before: Reals
+    after: Reals
+    trust: Reals
+    overlap: float
+    flow: Floats = field(repr=False)
+
+    def agreeing(self, residual_px: Reals) -> float:
+        """The share of a's cells with depth found where they were expected; residual_px [M] of the matches."""
+        return self.overlap * float(np.mean(residual_px < AGREES_PX)) if len(residual_px) else 0.0
+
+
+class Frames:
+    """The clip's frames on the coarse grid, made on demand and kept, and links between them."""
+
+    def __init__(self, clip: DepthClip) -> None:
+        k = clip.intrinsics
+        step = -(-k.width // FLOW_WIDTH)
+        self._clip, self._step = clip, step
+        right = clip.right
+        baseline_mm = PSEUDO_BASELINE_MM
+        if right is not None:
+            baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
+        self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
+        self._kept: dict[int, Frame] = {}
+        self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def frame(self, index: int) -> Frame:
+        """A frame of the clip."""
+        if index not in self._kept:
+            clip, step = self._clip, self._step
+            grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), step)
+            height, width = grey.shape
+            pick = slice(step // 2, None, step)
+            depth_mm = clip.depth_mm[index][pick, pick][:height, :width]
+            usable = clip.tissue[index][pick, pick][:height, :width] & (depth_mm > 0)
+            confidence = clip.depth_confidence[index][pick, pick][:height, :width] / np.float32(255)
+            ratio = np.float32(self.camera.fx * self.camera.baseline_mm)
+            disparity = np.where(usable, ratio / np.maximum(depth_mm, 1e-3), np.float32(0))
+            clip.let_go(index)
+            self._kept[index] = Frame(grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0)))
+        return self._kept[index]
+
+    def forget(self, index: int) -> None:
+        """Free a frame's memory."""
+        self._kept.pop(index, None)
+
+    def link(self, a: int, b: int, start: Floats | None = None) -> Link:
+        """Matches from frame a to frame b. start: a guess of the flow [h, w, 2], which is not changed."""
+        one, two = self.frame(a), self.frame(b)
+        flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
+        columns, rows = self._matched(one)
+        places = np.stack([columns, rows], axis=1).astype(np.float32)
+        height, width = one.grey.shape
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        warped = cv2.remap(
+            two.even, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128
+        )
+        near = _patches(one.even, warped, places, places)
+        back = _patches(warped, one.even, near, places)
+        moved = cv2.remap(
+            flow, near[:, :1], near[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=LOST
+        )
+        there = near + moved[:, 0]
+        x, y = there.T[:, :, None]
+
+        def at(values: Floats) -> Floats:
+            found: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+            return found[:, 0]
+
+        trust_a, trust_b = one.trust[rows, columns], at(two.trust)
+        agree = 1 / (1 + (np.square(back - places).sum(-1) / ROUND_TRIP_PX**2) ** 2)
+        disparity_b = at(two.disparity * two.trust) / np.maximum(trust_b, 1e-3)
+        trust = trust_a * trust_b * (trust_b > MIN_TRUST) * agree
+        found = (trust > MIN_MATCH_TRUST) & (disparity_b > 0.1)
+        cells = np.flatnonzero(found)
+        before = np.stack([columns, rows, one.disparity[rows, columns]], axis=1)[cells].astype(np.float64)
+        after = np.stack([x[:, 0], y[:, 0], disparity_b], axis=1)[cells].astype(np.float64)
+        overlap = len(cells) / max(len(found), 1)
+        return Link(a, b, cells, before, after, trust[cells].astype(np.float64), overlap, flow)
+
+    def predicted(self, a: int, b_from_a: Reals) -> tuple[Floats, float]:
+        """The flow [h, w, 2] of frame a's tissue if it were rigid, and the share of it that stays in view."""
+        one = self.frame(a)
+        height, width = one.disparity.shape
+        rows, columns = (each.ravel() for each in np.mgrid[0:height:8, 0:width:8])
+        disparity = one.disparity[rows, columns]
+        known = disparity > 0
+        if not known.any():
+            return np.zeros((height, width, 2), np.float32), 0.0
+        filled = np.where(known, disparity, np.median(disparity[known]))
+        seen = np.stack([columns, rows, filled], axis=1).astype(np.float64)
+        moved = self.camera.points_mm(seen) @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+        there = self.camera.seen(moved)
+        inside = (there[:, :2] >= 0).all(1) & (there[:, 0] < width) & (there[:, 1] < height) & (moved[:, 2] > 1)
+        shift = (there - seen)[:, :2].reshape(-(-height // 8), -(-width // 8), 2).astype(np.float32)
+        flow: Floats = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
+        return flow, float((inside & known).sum() / known.sum())
+
+    def _matched(self, frame: Frame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns and rows [M'] of the frame's cells that are matched: those with a depth to rely on."""
+        height, width = frame.grey.shape
+        rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
+        known = frame.trust[rows, columns] > MIN_TRUST
+        return columns[known], rows[known]
+
+
+def _patches(one: NDArray[np.uint8], two: NDArray[np.uint8], places: Floats, guess: Floats) -> Floats:
+    """Where the patches at places [M, 2] of one picture are in another, from a guess; not smoothed, as flow is."""
+    if not len(places):
+        return guess
+    found, status, off = cv2.calcOpticalFlowPyrLK(
+        one,
+        two,
+        places[:, None].copy(),
+        guess[:, None].copy(),
+        winSize=(PATCH_PX, PATCH_PX),
+        maxLevel=0,
+        criteria=(3, 10, 0.02),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    return np.where((status == 1) & (off < MAX_OFF), found[:, 0], np.float32(LOST)).astype(np.float32)
+
+
+def even_contrast(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture without what the lamp does: it moves with the camera, and so do shades."""
+    off = grey - cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SHADE_PX)
+    spread = np.sqrt(cv2.GaussianBlur(off * off, (0, 0), SHADE_PX))
+    return np.asarray(np.clip(128 + CONTRAST * off / (spread + MIN_SPREAD), 0, 255), np.uint8)

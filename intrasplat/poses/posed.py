@@ -1,0 +1,173 @@
+"""A clip gets its camera's poses: those it brought, a fixed camera's, or an estimated path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip, training_frames
+from intrasplat.errors import InputError
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.timing import Timings
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.options import ReconstructionOptions
+from intrasplat.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
+from intrasplat.poses.still import camera_rests
+from intrasplat.report import CameraPoses
+
+if TYPE_CHECKING:  # a fixed camera needs none of it
+    from intrasplat.poses.estimate import FoundPath
+
+STAGE = "poses"
+MIN_FRAMES = 2
+WORTH = 0.7
+"""Share of the jumps that steadied poses may still be off by; with more, the given ones stay."""
+MAX_UNSURE = 0.5
+"""Share of a clip's frames whose pose may be unsure; with more, there is no path."""
+
+
+def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings) -> DepthClip:
+    """The clip with its poses and what the report says of them; a clip that has been here stays as it is.
+
+    A camera that is fixed leaves all arrays as they are. timings get poses_s.
+
+    Raises:
+        InputError: options.poses asks for given poses, and the clip brought none.
+        Cancelled: hooks.should_stop said so.
+    """
+    brought = clip.right is None  # only layouts with depth bring poses
+    if clip.poses is not None:
+        return clip
+    if options.poses == "given" and not brought:
+        problem = '"given" asks for poses that come with the clip, and stereo clips bring none.'
+        raise InputError("options.poses", problem, 'Say "auto" or "estimate", or give the EndoNeRF layout.')
+    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
+    with timings.measure("poses_s"):
+        if options.poses == "given":
+            return _as_given(clip, *jitter_mm(clip, train))
+        if options.poses == "auto" and brought:
+            return _steadied(clip, train, hooks)
+        hooks.report_stage(STAGE, 0.0)
+        if len(train) < MIN_FRAMES:
+            return _fixed(clip, "was taken as fixed")
+        if options.poses == "fixed":
+            moves = ", though most of the picture moves: all of that counts as the tissue's motion"
+            return _fixed(clip, f"was taken as fixed, as asked{'' if camera_rests(clip, train) else moves}")
+        if options.poses == "auto" and camera_rests(clip, train):
+            return _fixed(clip, "is fixed: most of the picture rests")
+        from intrasplat.poses.estimate import find_path
+
+        return _settled(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
+
+
+def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
+    """The clip with the poses that it brought, and a warning if they jump by so much that the model suffers."""
+    clip = replace(clip, poses=CameraPoses(source="given"))
+    if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
+        return clip
+    text = (
+        f"The camera's poses jump to and fro by about {jumps_mm:.1f} mm at the tissue from frame to frame: they seem "
+        "to be inexact, and the model takes their errors for motion."
+    )
+    return replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
+
+
+def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
+    """The clip with the poses that it brought, without their jumps if they jump to and fro and the pictures tell."""
+    jumps_mm, depth_mm = jitter_mm(clip, train)
+    if clip.intrinsics.fx * jumps_mm <= MIN_JITTER * clip.intrinsics.width * depth_mm:
+        return _as_given(clip, 0.0, depth_mm)
+    from intrasplat.poses.estimate import find_path
+
+    found = find_path(clip, train, lambda share: hooks.report_stage(STAGE, share))
+    steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure)
+    if steady.jumps_mm < WORTH * jumps_mm:  # the pictures show the same: the camera itself shakes
+        return _as_given(clip, 0.0, depth_mm)
+    text = f"poses: the given ones jump to and fro by about {jumps_mm:.2f} mm at the tissue from frame to frame; "
+    if len(found.unsure) > MAX_UNSURE * clip.frame_count or steady.left_mm > WORTH * jumps_mm:
+        notice = Notice.info(NoticeCode.POSES, f"{text}the pictures do not place the frames better, so they stay")
+        return _as_given(replace(clip, assumptions=(*clip.assumptions, notice)), jumps_mm, depth_mm)
+    text += "each frame was moved to where its picture places it between its neighbours, which may leave "
+    notice = Notice.info(NoticeCode.POSES, f"{text}{steady.left_mm:.2f} mm")
+    clip = replace(placed(clip, steady.world_from_camera), assumptions=(*clip.assumptions, notice))
+    clip = replace(clip, poses=CameraPoses(source="given", steadied_mm=jumps_mm))
+    if clip.intrinsics.fx * steady.left_mm > MAX_JITTER * clip.intrinsics.width * depth_mm:
+        text = f"The camera's poses, once steadied, may still be off by {steady.left_mm:.1f} mm at the tissue."
+        clip = replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
+    return clip
+
+
+def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
+    """The clip with the path, or at rest if that explains it as well."""
+    if len(found.unsure) > MAX_UNSURE * clip.frame_count:
+        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "
+        text += "tissue with texture and depth is common to them. The camera was taken as fixed."
+        return _fixed(clip, "was taken as fixed", None, Notice.warning(NoticeCode.POSES_UNSURE, text))
+    if not found.seems_to_move and not found.confused:
+        how = f"is fixed: placed frame by frame, it stays within about {found.spread_mm:.1f} mm of one place"
+        return _fixed(clip, how, found)
+    if options.poses == "auto" and not found.moves:
+        text = (
+            f"Camera or tissue moved as a whole, by up to {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; "
+            "the clip does not tell which. The camera was taken as fixed, and the motion as the tissue's."
+        )
+        return _fixed(clip, "was taken as fixed", found, Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
+    warnings = []
+    if found.confused:
+        text = (
+            "The clip hardly tells the camera's motion from the tissue's: poses may be off by "
+            f"{found.sigma_mm:.1f} mm and {found.sigma_deg:.1f} degrees, and the tissue's motion by as much."
+        )
+        warnings.append(Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
+    if found.unsure:
+        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames."
+        warnings.append(Notice.warning(NoticeCode.POSES_UNSURE, text))
+    text = (
+        f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; its path fits the "
+        f"rigid parts within {found.rigid_fit_mm:.2f} mm, and is good to {found.sigma_mm:.1f} mm and "
+        f"{found.sigma_deg:.1f} degrees"
+    )
+    told = _told(clip, "estimated", found)
+    clip = placed(clip, found.world_from_camera)
+    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
+    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+
+
+def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings: Notice) -> DepthClip:
+    told = CameraPoses(source="fixed")
+    if found is not None:
+        told = _told(clip, "fixed", found).model_copy(update={"path_mm": None, "extent_mm": None, "extent_deg": None})
+    if not (clip.world_from_camera == np.eye(4)).all():
+        clip = placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
+    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
+    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+
+
+def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
+    """The clip with both eyes at these poses [T, 4, 4] of the left one, mm."""
+    right = clip.right
+    if right is not None:
+        left_from_right = np.linalg.inv(clip.world_from_camera[0]) @ right.world_from_camera[0]
+        right = replace(right, world_from_camera=world_from_camera @ left_from_right)
+    return replace(clip, world_from_camera=world_from_camera, right=right)
+
+
+def _told(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
+    """What the report repeats of a path."""
+    frame_s = float(np.median(np.diff(clip.frame_times_s)))
+    return CameraPoses(
+        source=source,
+        path_mm=found.path_mm,
+        extent_mm=found.extent_mm,
+        extent_deg=found.extent_deg,
+        sigma_mm=found.sigma_mm,
+        sigma_deg=found.sigma_deg,
+        rigid_fit_mm=found.rigid_fit_mm,
+        tissue_mm=found.tissue_mm,
+        tissue_period_s=None if found.period_frames is None else found.period_frames * frame_s,
+        unsure_frames=found.unsure,
+    )

@@ -1,0 +1,119 @@
+"""Camera paths as TUM files, and how far one path is from another.
+
+A TUM file has a line `timestamp tx ty tz qx qy qz qw` a frame: seconds, metres, world_from_camera. Lines that begin
+with # are comments.
+
+Symbols: T frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intrasplat.errors import InputError
+from intrasplat.poses.rigid import Reals, between, inverse
+
+MM_PER_M = 1000.0
+ARM_MM = 60.0
+"""How much a turn counts beside a place when two paths are laid on each other: as much as it moves what is so far away.
+Places alone do not fix the turn of a path that only turns, or that runs along a line."""
+LATE_S, MAX_GAP_S = 0.02, 0.25
+"""How far a frame may lie from the nearest pose of a path, unless it lies between two that are no farther apart."""
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """Absolute trajectory error, root mean square after one rigid motion laid one path on the other."""
+
+    mm: float
+    deg: float
+
+
+def trajectory_error(found: Reals, true: Reals) -> TrajectoryError:
+    """The error of a path [T, 4, 4] against the true one, world_from_camera in mm.
+
+    The rigid motion is that of least squares over places and, ARM_MM away, axes. Stereo knows
+    the scale, so it is not fitted.
+    """
+    centred = [path[:, :3, 3] - path[:, :3, 3].mean(0) for path in (found, true)]
+    spread = np.einsum("ti,tj->ij", centred[1], centred[0])
+    spread += ARM_MM**2 * np.einsum("tij,tkj->ik", true[:, :3, :3], found[:, :3, :3])
+    u, _, vt = np.linalg.svd(spread)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    off_mm = centred[0] @ turn.T - centred[1]
+    off = np.swapaxes(true[:, :3, :3], 1, 2) @ turn @ found[:, :3, :3]
+    angles_deg = np.degrees(Rotation.from_matrix(off).magnitude())
+    return TrajectoryError(*(float(np.sqrt(np.mean(each))) for each in (np.square(off_mm).sum(1), angles_deg**2)))
+
+
+def write_tum(path: Path, times_s: Reals, world_from_camera: Reals) -> None:
+    """Write a path [T, 4, 4] in mm with its times [T] as a TUM file."""
+    path.write_text(tum_lines(times_s, world_from_camera))
+
+
+def tum_lines(times_s: Reals, world_from_camera: Reals) -> str:
+    """A path [T, 4, 4] in mm as the text of a TUM file."""
+    turns = Rotation.from_matrix(world_from_camera[:, :3, :3]).as_quat()  # x, y, z, w
+    rows = np.column_stack([times_s, world_from_camera[:, :3, 3] / MM_PER_M, turns])
+    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows)
+
+
+def read_tum(path: Path) -> tuple[Reals, Reals]:
+    """Times [T] in seconds and poses [T, 4, 4] in mm of a TUM file.
+
+    Raises:
+        InputError: it cannot be read, or is no TUM file.
+    """
+    remedy = "Give lines `timestamp tx ty tz qx qy qz qw`, in seconds and metres."
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("--against", f"{path} cannot be read as a TUM file ({error}).", remedy) from error
+    told = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if not told:
+        raise InputError("--against", f"{path} holds no pose.", remedy)
+    for number, words in told:
+        if len(words) != 8 or not all(_is_number(word) for word in words):
+            raise InputError("--against", f"line {number} of {path} does not hold 8 finite numbers.", remedy)
+    rows = np.array([words for _, words in told], np.float64)
+    lengths = np.linalg.norm(rows[:, 4:], axis=1)
+    if not np.allclose(lengths, 1, atol=0.01):
+        raise InputError("--against", f"{path} holds quaternions that are not of length 1.", remedy)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = MM_PER_M * rows[:, 1:4]
+    return rows[:, 0], poses
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def at_times(times_s: Reals, poses: Reals, wanted_s: Reals) -> Reals:
+    """The poses [T, 4, 4] of a path at the times wanted, which both count from one moment: evenly between its own.
+
+    Raises:
+        InputError: the path's times do not rise, or it has no poses about a time.
+    """
+    remedy = "Give a pose for each frame, or a path that begins with the clip and lasts as long, with 5 poses a second."
+    if not (np.diff(times_s) > 0).all():
+        raise InputError("--against", "the times of the path do not rise from line to line.", remedy)
+    gap_s = np.diff(times_s, prepend=-math.inf, append=math.inf)[np.searchsorted(times_s, wanted_s)]
+    nearest_s = np.abs(np.asarray(wanted_s)[:, None] - times_s).min(1)
+    if (unknown := (gap_s > MAX_GAP_S) & (nearest_s > LATE_S)).any():
+        about = f"{len(times_s)} poses from {times_s[0]:.2f} to {times_s[-1]:.2f} s"
+        raise InputError("--against", f"the path has {about}, and none about {wanted_s[unknown][0]:.2f} s.", remedy)
+    return np.stack([between(times_s, poses, wanted) for wanted in wanted_s])
+
+
+def from_first(poses: Reals) -> Reals:
+    """The same path in the world of its first camera."""
+    return np.asarray(inverse(poses[0]) @ poses)

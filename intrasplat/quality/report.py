@@ -1,0 +1,345 @@
+"""The quality report: held-out scores, copy baselines, and in plain words whatever looks wrong.
+
+Symbols: T frames, H W pixels. A scene that fails silently is the defect this module exists for: a doubt becomes a
+sentence in the report, and what is not finite is never published.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import FrameSplit
+from intrasplat.clip.types import DepthClip
+from intrasplat.errors import TrainingDiverged
+from intrasplat.names import Eyes
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.quality.baselines import CopyBaselines
+from intrasplat.quality.right_eye import RightScores
+from intrasplat.report import FrameScore, Report
+from intrasplat.splat.metrics import (
+    clear_of_highlights,
+    coverage,
+    depth_agreement_mm,
+    depth_errors_mm,
+    psnr_paper,
+    psnr_tissue,
+    ssim,
+)
+from intrasplat.train.scoring import FrameRenderer, Mapping
+
+MIN_COVERAGE = 0.98
+MIN_TRAIN_DB = 25.0
+"""A model that does not even reproduce its own frames this well has not learnt them; good ones reach 30 to 38."""
+MIN_HELD_OUT_DB = 24.0
+"""An error of 6 % of white: clean clips come to 25 within a hundred iterations, what cuts or jumps stays below."""
+MAX_GAP_DB = 3.0
+"""Between training and held-out frames: more means frames were memorised, or the gap between frames is not bridged."""
+MAX_RIGHT_GAP_DB = 4.0
+"""Between the left eye and the right eye, some degrees beside it."""
+OUTLIER_DB = 6.0
+"""A held-out frame this far below the mean is named."""
+MAX_DEPTH_SHARE = 0.03
+"""Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of some frames; a list holds one number per frame, NaN where there was no tissue.
+
+    depth_mm is the stereo's median depth where it was compared, to judge depth_agreement_mm by; both NaN without any.
+    """
+
+    frames: tuple[int, ...]
+    psnr_tissue_db: tuple[float, ...]
+    psnr_clear_db: tuple[float, ...]
+    psnr_paper_db: tuple[float, ...]
+    ssim: tuple[float, ...]
+    coverage: tuple[float, ...]
+    depth_agreement_mm: float
+    depth_mm: float
+
+
+@dataclass(frozen=True)
+class Training:
+    """What the pipeline knows of a run and the report repeats (intrasplat.report.Report has their meaning)."""
+
+    preset: str
+    eyes: Eyes
+    seed: int
+    device: str
+    iterations: int
+    frames_seen: int
+    gaussians: int
+    bases: int
+    scene_bytes: int
+    units_per_mm: float
+    seconds: dict[str, float]
+    versions: dict[str, str]
+    assumptions: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+    measurements: dict[str, float] = field(default_factory=dict)
+
+
+SCORES_PENDING = Notice.info(
+    NoticeCode.SCORES_PENDING, "The scores are still being measured: ask for the report again in some seconds."
+)
+_MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
+
+
+Errors = NDArray[np.float32]
+NOTHING: Errors = np.zeros(0, np.float32)
+
+
+def measure(
+    clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map, *, compared: bool = True
+) -> Scores:
+    """Scores the renders of these frames (clip indices) against the clip, by mapping, which may use several threads.
+
+    compared: whether the figures are wanted that compare one scene with another; else psnr_tissue_db alone is no NaN.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+    """
+
+    def score(index: int) -> tuple[tuple[float, float, float, float, float], Errors, Errors]:
+        shown, truth, tissue = render(index), clip.rgb[index], clip.tissue[index]
+        if not (np.isfinite(shown.rgb).all() and np.isfinite(shown.depth_mm).all() and np.isfinite(shown.alpha).all()):
+            raise TrainingDiverged(f"Frame {index} renders as NaN or infinity: training has diverged.")
+        tissue_db = psnr_tissue(shown.rgb, truth, tissue)
+        if not compared:
+            clip.let_go(index)
+            return (tissue_db, math.nan, math.nan, math.nan, math.nan), NOTHING, NOTHING
+        clear_db = psnr_tissue(shown.rgb, truth, tissue & clear_of_highlights(shown.rgb, truth))
+        paper_db, similarity = psnr_paper(shown.rgb, truth, tissue), ssim(shown.rgb, truth, tissue)
+        figures = (tissue_db, clear_db, paper_db, similarity, coverage(shown.alpha, tissue))
+        depth_mm = clip.depth_mm[index]
+        found = figures, depth_errors_mm(shown.depth_mm, depth_mm, tissue), depth_mm[tissue & (depth_mm > 0)]
+        clip.let_go(index)
+        return found
+
+    found = list(mapping(score, frames))
+    figures, errors_mm, depths_mm = zip(*found, strict=True) if found else ((), (), ())
+    tissue_db, clear_db, paper_db, similarity, covered = zip(*figures, strict=True) if figures else ((),) * 5
+    return Scores(
+        frames=tuple(frames),
+        psnr_tissue_db=tissue_db,
+        psnr_clear_db=clear_db,
+        psnr_paper_db=paper_db,
+        ssim=similarity,
+        coverage=covered,
+        depth_agreement_mm=depth_agreement_mm(list(errors_mm)),
+        depth_mm=depth_agreement_mm(list(depths_mm)),
+    )
+
+
+def first_report(clip: DepthClip, split: FrameSplit, training: Training, doubts: Sequence[Notice] = ()) -> Report:
+    """The report of a finished scene before it is scored. doubts: clip_warnings() of the clip."""
+    found = [*clip.warnings, *split.warnings, *training.warnings, *doubts, SCORES_PENDING]
+    return Report(
+        scored=False,
+        psnr_tissue_db=None,
+        psnr_paper_db=None,
+        ssim=None,
+        baseline_blend_db=None,
+        baseline_flow_db=None,
+        depth_agreement_mm=None,
+        coverage=None,
+        train_psnr_tissue_db=None,
+        warnings=tuple(dict.fromkeys(found)),
+        assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
+        right_eye=clip.registration,
+        masks=clip.masks,
+        poses=clip.poses,
+        measurements={**clip.measurements, **training.measurements},
+        **{name: value for name, value in vars(training).items() if name not in _MERGED_FIELDS},
+        width=clip.intrinsics.width,
+        height=clip.intrinsics.height,
+        frame_count=clip.frame_count,
+        train_count=len(split.train),
+        held_out=tuple(split.held_out),
+        repeated=tuple(split.repeated),
+        frame_times_s=tuple(clip.frame_times_s.tolist()),
+    )
+
+
+def scored_report(
+    first: Report, held_out: Scores, right: RightScores, trained: Scores, baselines: CopyBaselines
+) -> Report:
+    """The report with its scores.
+
+    Args:
+        first: first_report() of the scene.
+        held_out: measure(clip, first.held_out, ...); of no frames if none was held out.
+        right: measure_right(clip, first.held_out, ...).
+        trained: measure(clip, sample_frames(train), ...), for the comparison.
+        baselines: copy_baselines(clip, train, first.held_out).
+    """
+    known = [each for each in first.warnings if each.code is not NoticeCode.SCORES_PENDING]
+    found = score_warnings(held_out, trained, baselines) + right_eye_warnings(held_out, right)
+    scores = {
+        "psnr_tissue_db": _mean(held_out.psnr_tissue_db),
+        "psnr_clear_db": _mean(held_out.psnr_clear_db),
+        "psnr_right_db": _mean(right.psnr_db),
+        "psnr_right_clear_db": _mean(right.clear_db),
+        "baseline_warp_db": _mean(right.warp_db),
+        "baseline_warp_clear_db": _mean(right.warp_clear_db),
+        "psnr_paper_db": _mean(held_out.psnr_paper_db),
+        "ssim": _mean(held_out.ssim),
+        "baseline_blend_db": _mean(baselines.blend_db),
+        "baseline_flow_db": _mean(baselines.flow_db),
+        "depth_agreement_mm": _known(held_out.depth_agreement_mm),
+        "coverage": _mean(held_out.coverage),
+        "train_psnr_tissue_db": _mean(trained.psnr_tissue_db),
+        "frames": _frame_scores(held_out, right, baselines),
+    }
+    return first.model_copy(update={**scores, "scored": True, "warnings": tuple(dict.fromkeys([*known, *found]))})
+
+
+def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[Notice]:
+    """What the scores say against the model; and why a figure is missing, where one is."""
+    model_db = _mean(held_out.psnr_tissue_db)
+    train_db = _mean(trained.psnr_tissue_db)
+    found = _missing(held_out, model_db)
+    found += _worse_than_copying(model_db, baselines)
+    if train_db is not None and train_db < MIN_TRAIN_DB:
+        found.append(
+            Notice.warning(
+                NoticeCode.TRAINING_SCORE_LOW,
+                f"Even frames it was trained on are reproduced at only {train_db:.1f} dB: do not rely on this scene. "
+                "Look for inverted masks, a wrong layout or calibration, or a clip in which everything moves.",
+            )
+        )
+    elif model_db is not None and model_db < MIN_HELD_OUT_DB:
+        found.append(
+            Notice.warning(
+                NoticeCode.HELD_OUT_SCORE_LOW,
+                f"Held-out frames are reproduced at only {model_db:.1f} dB: do not rely on this scene between the "
+                "trained frames. Tissue that is cut, or moves far from one frame to the next, cannot be followed.",
+            )
+        )
+    if model_db is not None and train_db is not None and train_db - model_db > MAX_GAP_DB:
+        found.append(
+            Notice.warning(
+                NoticeCode.GENERALISATION_GAP,
+                f"Held-out frames score {train_db - model_db:.1f} dB less than trained ones ({model_db:.1f} and "
+                f"{train_db:.1f} dB): between the trained frames the motion is not to be trusted.",
+            )
+        )
+    found += _bad_frames(held_out, model_db)
+    judged = held_out if held_out.frames else trained
+    covered = _mean(judged.coverage)
+    if covered is not None and covered < MIN_COVERAGE:
+        found.append(
+            Notice.warning(
+                NoticeCode.HOLES,
+                f"The model leaves {1 - covered:.1%} of the tissue uncovered: renders have holes there.",
+            )
+        )
+    if judged.depth_agreement_mm > MAX_DEPTH_SHARE * judged.depth_mm:
+        found.append(
+            Notice.warning(
+                NoticeCode.DEPTH_DISAGREES,
+                f"Rendered and stereo depth differ by {judged.depth_agreement_mm:.1f} mm (median) at a depth of "
+                f"{judged.depth_mm:.0f} mm: distances in this scene are not to be trusted.",
+            )
+        )
+    return found
+
+
+def right_eye_warnings(held_out: Scores, right: RightScores) -> list[Notice]:
+    """What the right eye says against poses beside the left one."""
+    left_db, right_db = _mean(held_out.psnr_tissue_db), _mean(right.psnr_db)
+    if left_db is None or right_db is None or left_db - right_db <= MAX_RIGHT_GAP_DB:
+        return []
+    return [
+        Notice.warning(
+            NoticeCode.RIGHT_EYE_LOW,
+            f"Held-out frames of the right eye score {right_db:.1f} dB, {left_db - right_db:.1f} dB less than those of "
+            "the left eye: views from other places are less true than the endoscope's own.",
+        )
+    ]
+
+
+def _missing(held_out: Scores, model_db: float | None) -> list[Notice]:
+    if not held_out.frames:
+        return [
+            Notice.warning(
+                NoticeCode.NOTHING_HELD_OUT,
+                "No frames were held out, so the quality between trained frames, where it matters, is not measured.",
+            )
+        ]
+    if model_db is None:
+        return [
+            Notice.warning(
+                NoticeCode.HELD_OUT_WITHOUT_TISSUE, "The held-out frames show no tissue, so quality is not measured."
+            )
+        ]
+    if math.isnan(held_out.depth_agreement_mm):
+        return [
+            Notice.warning(
+                NoticeCode.DEPTH_NOT_COMPARED,
+                "No held-out tissue has both rendered and stereo depth, so depth agreement is not measured.",
+            )
+        ]
+    return []
+
+
+def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> list[Notice]:
+    """Says plainly that copying frames would have done better; a model earns its place only elsewhere then."""
+    copies = {"blending": _mean(baselines.blend_db), "warping (optical flow)": _mean(baselines.flow_db)}
+    better = {name: score for name, score in copies.items() if score is not None and model_db is not None}
+    better = {name: score for name, score in better.items() if score > (model_db or 0.0)}
+    if not better:
+        return []
+    named = " and ".join(f"{name} at {score:.1f} dB" for name, score in better.items())
+    return [
+        Notice.info(
+            NoticeCode.COPYING_SCORES_MORE,
+            f"On held-out frames the model scores {model_db:.1f} dB; copying the neighbouring frames scores more: "
+            f"{named}. Seen from the endoscope itself, the recorded frames are the better picture; the model adds "
+            "other views, depth and what the instrument hides.",
+        )
+    ]
+
+
+def _bad_frames(held_out: Scores, model_db: float | None) -> list[Notice]:
+    if model_db is None:
+        return []
+    scores = zip(held_out.frames, held_out.psnr_tissue_db, strict=True)
+    bad = [f"{frame} ({score:.1f} dB)" for frame, score in scores if score < model_db - OUTLIER_DB]
+    return (
+        [Notice.warning(NoticeCode.OUTLIER_FRAMES, f"Far below the others are held-out frames {', '.join(bad)}.")]
+        if bad
+        else []
+    )
+
+
+def _frame_scores(scores: Scores, right: RightScores, baselines: CopyBaselines) -> tuple[FrameScore, ...]:
+    columns = {
+        "psnr_tissue_db": scores.psnr_tissue_db,
+        **({"psnr_right_db": right.psnr_db} if right.psnr_db else {}),
+        "psnr_paper_db": scores.psnr_paper_db,
+        "ssim": scores.ssim,
+        "coverage": scores.coverage,
+        "baseline_blend_db": baselines.blend_db,
+        "baseline_flow_db": baselines.flow_db,
+    }
+    return tuple(
+        FrameScore.model_validate({"frame": frame} | {name: _known(each[row]) for name, each in columns.items()})
+        for row, frame in enumerate(scores.frames)
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Mean of those that are known."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else None

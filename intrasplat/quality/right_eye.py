@@ -1,0 +1,86 @@
+"""The right eye as a judge: a real view, some degrees beside the left eye, at every held-out moment.
+
+Judged are the right eye's tissue pixels that the left eye sees, too. Warping the left eye's picture of the same moment
+by its stereo depth is the baseline; no model has that picture.
+
+Symbols: H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip
+from intrasplat.errors import TrainingDiverged
+from intrasplat.splat.metrics import Image, clear_of_highlights, psnr_tissue
+from intrasplat.stereo.right_eye import nearest_known
+from intrasplat.train.scoring import FrameRenderer, Mapping, judged_pixels
+
+FAR_MM = 1e6
+"""Depth at which the eyes see the same."""
+
+
+@dataclass(frozen=True)
+class RightScores:
+    """Scores of the right eye's pictures of some frames, in dB, a number per frame; NaN where there was no tissue.
+
+    psnr_db, warp_db    of the model, and of the warped left eye
+    clear_db, warp_clear_db  the same without highlights
+    """
+
+    psnr_db: tuple[float, ...] = ()
+    clear_db: tuple[float, ...] = ()
+    warp_db: tuple[float, ...] = ()
+    warp_clear_db: tuple[float, ...] = ()
+
+
+def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map) -> RightScores:
+    """Scores the renders of these frames (clip indices) from the right eye's pose; nothing for a clip of one eye.
+
+    By mapping, which may use several threads.
+
+    Raises:
+        TrainingDiverged: a render holds NaN or infinity.
+    """
+    right = clip.right
+    if right is None:
+        return RightScores()
+
+    def score(index: int) -> list[float]:
+        shown = render(index).rgb
+        if not np.isfinite(shown).all():
+            raise TrainingDiverged(f"Frame {index} renders as NaN or infinity from the right eye: training diverged.")
+        truth, judged = right.rgb[index], judged_pixels(right, index)
+        found = [figure for image in (shown, warped_left(clip, index)) for figure in _scores(image, truth, judged)]
+        for eye in clip.eyes:
+            eye.let_go(index)
+        return found
+
+    rows = list(mapping(score, frames))
+    model, clear, warp, warp_clear = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return RightScores(model, clear, warp, warp_clear)
+
+
+def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
+    """The left eye's picture [H, W, 3] warped to the right eye by the right eye's depth; gaps take a neighbour's."""
+    assert clip.right is not None
+    right, left_k = clip.right, clip.intrinsics
+    found_mm = nearest_known(right.depth_mm[index], right.depth_mm[index] > 0)
+    depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # no pixel has any
+    left_from_right = np.linalg.inv(clip.world_from_camera[index]) @ right.world_from_camera[index]
+    across = (np.arange(depth_mm.shape[1], dtype=np.float32) + 0.5 - right.intrinsics.cx) / right.intrinsics.fx
+    down = (np.arange(depth_mm.shape[0], dtype=np.float32)[:, None] + 0.5 - right.intrinsics.cy) / right.intrinsics.fy
+    x, y, z = (depth_mm * (a * across + b * down + c) + d for a, b, c, d in left_from_right[:3].tolist())
+    column, row = left_k.fx * x / z + left_k.cx - 0.5, left_k.fy * y / z + left_k.cy - 0.5
+    warped = cv2.remap(clip.rgb[index], column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, np.uint8)
+
+
+def _scores(image: Image, truth: NDArray[np.uint8], judged: NDArray[np.bool_]) -> tuple[float, float]:
+    """psnr_tissue in dB over the judged pixels, and without highlights."""
+    return psnr_tissue(image, truth, judged), psnr_tissue(image, truth, judged & clear_of_highlights(image, truth))

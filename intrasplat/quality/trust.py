@@ -1,0 +1,97 @@
+"""How likely each Gaussian shows what is right, from what training frames show of it.
+
+Symbols: N Gaussians, H W pixels.
+
+Two things that the training frames know explain the errors of other views (docs/decisions/031): how many of them saw
+the Gaussian, and how far off the pixels are that it has a part in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import spread
+from intrasplat.splat.constants import SH_C0
+from intrasplat.splat.layout import COLOUR
+from intrasplat.splat.model import Model
+from intrasplat.train.targets import TrainingFrames
+
+SAMPLED_PICTURES = 24
+"""Training frames of all eyes looked at, evenly spread: the share is known to a few per cent."""
+MIN_TISSUE_PX = 0.5
+"""A frame sees a Gaussian if its weights on tissue add up to so many pixels; of what is hidden less shines through."""
+MIN_TISSUE_SHARE = 0.2
+"""And to this share of all its weights there. Behind an instrument's edge the rest of it is held by what shows."""
+
+RIGHT_COLOUR, RIGHT_DEPTH = 0.03, 0.02
+"""What counts as right: a mean error of R G B, 1 being white, and a relative error of depth."""
+MAX_DEPTH_ERROR = 10 * RIGHT_DEPTH
+"""Beyond it depth is simply wrong."""
+LEAST = np.array([0.03, 0.05])
+"""Added to share and error before the logarithm: differences below these say nothing."""
+WEIGHTS = np.array([0.66, -1.22])
+"""Of the logarithms of share and error. `python -m lab.benchmarks.bm_confidence --fit` finds them."""
+BIAS = 2.3
+LEAST_TRUST = 1 / 63
+"""Of a Gaussian that was seen at all, so that it differs from one that was not."""
+
+
+def trust(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float32]:
+    """[N] in [0, 1]: the probability that what a Gaussian shows is right; 0 if no training frame saw it."""
+    found = evidence(model, eyes)
+    likely = 1 / (1 + np.exp(-(WEIGHTS @ logarithms(found) + BIAS)))
+    return np.where(found[0] > 0, np.clip(likely, LEAST_TRUST, 1), 0).astype(np.float32)
+
+
+def logarithms(found: NDArray[np.floating]) -> NDArray[np.floating]:
+    """[2, N] of the evidence: what trust is a logistic function of."""
+    return np.asarray(np.log(found + LEAST[:, None]))
+
+
+def evidence(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float64]:
+    """[2, N]: share of training frames that saw the Gaussian, of the eye that saw it oftener; and mean error of the
+    pixels that showed it, in which 1 is what counts as right.
+    """
+    sampled = spread(eyes[0].indices, max(SAMPLED_PICTURES // len(eyes), 1))
+    seen = np.zeros((len(eyes), model.count))
+    on_tissue, error = np.zeros((2, model.count))
+    for index in sampled:
+        for place, frames in enumerate(eyes):
+            here, drawn, wrong = _weights(model, frames, index)
+            sees = (here >= MIN_TISSUE_PX) & (here >= MIN_TISSUE_SHARE * drawn)
+            seen[place] += np.where(sees, np.minimum(here / np.where(sees, drawn, 1), 1), 0)
+            on_tissue += here
+            error += wrong
+            frames.eye.let_go(index)
+    mean_error = np.maximum(error, 0) / np.maximum(on_tissue, 1e-6)
+    return np.stack([seen.max(0) / len(sampled), mean_error])
+
+
+def _weights(model: Model, frames: TrainingFrames, index: int) -> NDArray[np.floating]:
+    """[3, N]: each Gaussian's blending weights in frame `index`, summed over tissue, over all pixels, and over tissue
+    times the pixel's error.
+
+    A Gaussian's weights, summed over chosen pixels, are the gradient of a colour summed over them.
+    """
+    camera, t = frames.cameras[index], float(frames.t[index])
+    tissue = frames.eye.tissue[index]
+    cotangents = np.zeros((5, *tissue.shape), np.float32)
+    cotangents[2] = tissue * _errors(frames, index, model.render(camera, t))
+    cotangents[0], cotangents[1] = tissue, 1
+    return np.asarray(model.image_gradient(camera, t, cotangents)[COLOUR] / np.float32(SH_C0))
+
+
+def _errors(frames: TrainingFrames, index: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W] the sum of colour's and depth's errors, each over what counts as right. Depth that stereo did not measure
+    is a guess: it counts as just wrong.
+    """
+    eye = frames.eye
+    colour = np.abs(np.clip(image[:3], 0, 1) - eye.rgb[index].transpose(2, 0, 1) / np.float32(255)).mean(0)
+    shown_mm = image[3] / np.maximum(image[4], 1e-3) / np.float32(frames.scale)
+    measured = eye.depth_mm[index] > 0
+    relative = np.abs(shown_mm / np.where(measured, eye.depth_mm[index], 1) - 1)
+    depth = np.where(measured, np.minimum(relative, MAX_DEPTH_ERROR), RIGHT_DEPTH)
+    return np.asarray(colour / RIGHT_COLOUR + depth / RIGHT_DEPTH, np.float32)

@@ -1,0 +1,247 @@
+"""The quality report of a finished scene (report.json): what was measured, what was assumed, what to distrust."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from intrasplat.names import JOB_ID_PATTERN, Eye, Eyes
+from intrasplat.notices import Notice, NoticeCode, Severity
+
+REPORT_VERSION = 2
+"""Raised when a field changes its meaning; new fields do not raise it."""
+VersionText = Annotated[str, Field(pattern=r"^[0-9A-Za-z.+-]{1,40}$")]
+"""A version of intrasplat."""
+RESEARCH_USE = "Research use only. Not a medical device; it must not guide treatment."
+
+
+class FrameScore(BaseModel):
+    """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    frame: int = Field(ge=0)
+    scored: bool = Field(
+        default=True, description="False: the scores, and what they warn of, are still being measured; ask again"
+    )
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    ssim: float | None
+    coverage: float | None
+    baseline_blend_db: float | None
+    baseline_flow_db: float | None
+    psnr_right_db: float | None = Field(default=None, description="None for a clip of one eye, too")
+
+
+class RightEye(BaseModel):
+    """What the right eye differs by from its calibration and from the left eye, measured on training frames.
+
+    Its camera was corrected by the turn, its pictures by the colours. What an error of the calibration does along the
+    rows looks like depth, and is not known.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    moved_px: float = Field(ge=0, description="largest shift of any pixel by the turn and the zoom")
+    lower_px: float = Field(description="rows by which the right picture lies lower at its principal point")
+    pitch_deg: float = Field(description="rotation of the right eye about its x axis, as the left eye sees it")
+    yaw_deg: float = Field(description="about its y axis; the principal point keeps its column")
+    roll_deg: float = Field(description="about its z axis")
+    zoom: float = Field(gt=-1, description="focal length over the calibrated one, minus 1")
+    left_from_right: tuple[float, ...] = Field(
+        min_length=16, max_length=16, description="4x4, row-major, mm: its pose seen from the left eye"
+    )
+    fx_px: float = Field(description="focal length of the corrected camera, in columns")
+    fy_px: float = Field(description="and in rows")
+    cx_px: float = Field(description="column of its principal point")
+    cy_px: float = Field(description="and its row")
+    matches: int | None = Field(
+        default=None,
+        ge=0,
+        description="features by which the turn was measured. 0: nothing was measured, and turn and zoom are 0; fewer "
+        "than 150: lower_px alone. None: a report of before they were counted",
+    )
+    residual_px: float = Field(ge=0, description="median distance of the rows of matching features after that")
+    gain: tuple[float, ...] = Field(
+        min_length=3,
+        max_length=3,
+        description="right = gain * left + offset, by channel; 1 and 0: nothing was corrected",
+    )
+    offset: tuple[float, ...] = Field(min_length=3, max_length=3, description="in levels of 255")
+    colour_correlation: float | None = Field(
+        ge=-1.001, le=1.001, description="of the eyes where they match, the least of channels; None: too little matches"
+    )
+
+
+class Masks(BaseModel):
+    """How instruments were told from tissue."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    source: Literal["given", "found", "segmenter", "none"] = Field(
+        description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
+        "pixel counts as tissue"
+    )
+    share: float = Field(default=0.0, ge=0, le=1, description="of the left eye's pixels that are no tissue")
+    sure: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="how clearly instruments were told from tissue, where masks were found; None: they were not",
+    )
+
+    @property
+    def are_found(self) -> bool:
+        """Whether this program, or a segmenter, found them in the pictures."""
+        return self.source in ("found", "segmenter")
+
+
+class CameraPoses(BaseModel):
+    """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of the
+    common motion follows the course of the tissue's own deformation was taken to be the tissue's.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    source: Literal["given", "fixed", "estimated"] = Field(
+        description="given with the clip; fixed: asked for or recognised; estimated from the pictures"
+    )
+    path_mm: float | None = Field(
+        default=None, ge=0, description="length of the path; None: it was not estimated, or the camera is fixed"
+    )
+    extent_mm: float | None = Field(default=None, ge=0, description="largest distance between two frames' cameras")
+    extent_deg: float | None = Field(default=None, ge=0, description="largest turn between two frames' cameras")
+    steadied_mm: float | None = Field(
+        default=None,
+        ge=0,
+        description="how far given poses jumped at the tissue before they were steadied; None: they were not",
+    )
+    sigma_mm: float | None = Field(
+        default=None, ge=0, description="standard deviation that is expected of the path, laid on the true one"
+    )
+    sigma_deg: float | None = Field(default=None, ge=0, description="the same of the turn")
+    rigid_fit_mm: float | None = Field(
+        default=None, ge=0, description="median distance at the tissue by which matches miss what the path predicts"
+    )
+    tissue_mm: float | None = Field(
+        default=None, ge=0, description="root mean square of the common motion that was taken to be the tissue's"
+    )
+    tissue_period_s: float | None = Field(default=None, ge=0, description="of that motion, if it has one")
+    unsure_frames: tuple[int, ...] = Field(default=(), description="frames whose pose is not to be relied on")
+
+
+class Recorded(BaseModel):
+    """Which recorded frames a scene keeps, as its cameras see them: rectified, with corrected colours."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frames: tuple[int, ...] = Field(min_length=1, description="the clip's frames that are kept, rising")
+    eyes: tuple[Eye, ...] = Field(min_length=1, description="of which they are kept")
+    width: int = Field(gt=0, description="of a picture, in pixels")
+    height: int = Field(gt=0, description="the same")
+    masks: bool = Field(description="whether masks are kept with them; False: every pixel counts as tissue")
+    size_bytes: int = Field(ge=0, description="what they take on the disk")
+
+
+class Imported(BaseModel):
+    """Where a scene came from that was made by another installation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    scene_id: str | None = Field(
+        default=None, pattern=JOB_ID_PATTERN, description="its id there; None: it was exported from a folder"
+    )
+    version: VersionText = Field(description="of the intrasplat that exported it")
+    exported_at_s: float = Field(ge=0, description="when it was exported, UNIX s, by the clock there")
+    imported_at_s: float = Field(ge=0, description="when it was imported, UNIX s")
+
+
+class Report(BaseModel):
+    """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
+    while `scored` is False: a scene is finished before its scores are.
+
+    Scores are means over the held-out frames, which took no part in training (docs/conventions.md, "Scores").
+    psnr_tissue_db is the one to go by; psnr_paper_db is what papers print, and higher. When psnr_tissue_db does not
+    exceed the two baselines, copying the neighbouring frames would have served as well.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    report_version: int = REPORT_VERSION
+    notice: str = RESEARCH_USE
+    imported: Imported | None = Field(default=None, description="where the scene came from; None: it was made here")
+    versions: dict[str, str] = Field(default={}, description="versions of intrasplat and of what it computes with")
+
+    scored: bool = Field(
+        default=True, description="False: the scores, and what they warn of, are still being measured; ask again"
+    )
+    psnr_tissue_db: float | None
+    psnr_paper_db: float | None
+    psnr_clear_db: float | None = Field(default=None, description="psnr_tissue_db without highlights")
+    psnr_right_db: float | None = Field(
+        default=None,
+        description="psnr_tissue_db of the right eye's frames, over what the left eye sees, too; None for one eye",
+    )
+    psnr_right_clear_db: float | None = Field(default=None, description="the same without highlights")
+    baseline_warp_db: float | None = Field(
+        default=None, description="psnr_right_db of the left eye's picture warped by stereo depth"
+    )
+    baseline_warp_clear_db: float | None = Field(default=None, description="the same without highlights")
+    ssim: float | None
+    baseline_blend_db: float | None = Field(description="psnr_tissue_db of blending the nearest training frames")
+    baseline_flow_db: float | None = Field(description="the same, each warped half-way by optical flow first")
+    depth_agreement_mm: float | None = Field(description="median |rendered - stereo depth| on held-out tissue")
+    coverage: float | None = Field(description="share of tissue pixels the model covers")
+    train_psnr_tissue_db: float | None = Field(description="psnr_tissue_db over some training frames, to compare")
+    frames: tuple[FrameScore, ...] = ()
+
+    warnings: tuple[Notice, ...] = Field(description="what to distrust; empty if nothing was found")
+    assumptions: tuple[Notice, ...] = Field(description="what was taken for granted about the input")
+    right_eye: RightEye | None = Field(
+        default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
+    )
+    masks: Masks | None = Field(default=None, description="of instruments; None: a report of version 0.2")
+    poses: CameraPoses | None = Field(default=None, description="of the endoscope; None: a report of version 0.2")
+    recorded: Recorded | None = Field(
+        default=None, description="recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"
+    )
+    measurements: dict[str, float] = Field(default={}, description="measured on the input, such as misalignment in px")
+
+    preset: str
+    eyes: Eyes | None = Field(default=None, description="that taught the model; None: a report of version 0.2")
+    seed: int
+    device: str
+    iterations: int = Field(ge=0)
+    frames_seen: int | None = Field(default=None, ge=0, description="training frames in all steps, repeats counted")
+    seconds: dict[str, float] = Field(description="by stage; docs/conventions.md defines t_train_s and t_post_s")
+    gaussians: int = Field(ge=0)
+    bases: int = Field(ge=0, description="bases per channel of motion; 0 if the model has none")
+    scene_bytes: int = Field(ge=0)
+    units_per_mm: float = Field(gt=0)
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    frame_count: int = Field(gt=0)
+    train_count: int = Field(ge=0)
+    held_out: tuple[int, ...]
+    repeated: tuple[int, ...] = Field(
+        description="frames in neither set: they repeat a held-out one, show nothing new, or there is no time for them"
+    )
+    frame_times_s: tuple[float, ...]
+
+    @field_validator("report_version")
+    @classmethod
+    def _as_it_is_read(cls, written: int) -> int:
+        return max(written, REPORT_VERSION)
+
+    @field_validator("warnings", "assumptions", mode="before")
+    @classmethod
+    def _of_plain_text(cls, notices: object, info: ValidationInfo) -> object:
+        """Reports of version 1 hold texts without codes."""
+        if not isinstance(notices, Iterable) or isinstance(notices, str):
+            return notices
+        severity = Severity.WARNING if info.field_name == "warnings" else Severity.INFO
+        plain = {"code": NoticeCode.UNCLASSIFIED, "severity": severity}
+        return tuple(plain | {"text": each} if isinstance(each, str) else each for each in notices)

@@ -1,0 +1,177 @@
+"""Which splats touch which tile, in depth order, and where the gradients of a splat are summed.
+
+A tile is LANES pixels wide and TILE_ROWS tall: as narrow as a vector, tall to keep the number of tiles a splat touches
+low. A slot is one (splat, tile) pair with its range of rows.
+
+    slot_start, slot_count [N]   slots of splat g: slot_count[g] from slot_start[g];  slot_info [M]: tile and rows
+    tile_start [tiles + 1], entries [M]   the slots of a tile, nearest splat first: splat and rows
+
+Rows [top, end) inside the tile are exact for the ellipse within the tile's columns; (top, end - 1) are the low
+2 x ROW_BITS bits of slot_info and entries, and the rest is the tile or the splat: with half the memory, sorting takes
+half the time.
+
+A block is BLOCK_TILES tiles side by side, blended one after the other by one thread. A splat has a home, GRADIENT
+floats, for each block it may touch, and each of its tiles adds its gradients there: few places, still in the cache when
+the next tile comes; no atomics; and always the same order of addition, whichever thread took the block.
+
+    homes [N, 4]   first home, number of homes, offset and step: the home in a block is
+                   offset + step x (the block's row) + (the block's column)
+
+Each thread has a region of the M slots and one of the homes for its splats, so one pass over the splats is enough.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from intrasplat.machine.cache import kernel
+from intrasplat.splat.cpu.simd import ceil, floor, iota, maximum, minimum, splat, sqrt, store
+from intrasplat.splat.cpu.vectors import LANES
+
+ROW_BITS = 6
+TILE_ROWS = 1 << ROW_BITS
+"""Rows of a tile. 8 x 64 pixels x 5 planes of float32 are 10 kB: they and the tile's alphas stay in L1 and L2."""
+BLOCK_TILES = 16
+GRADIENT = 12
+"""Floats of a home: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
+EXTENT = 6
+"""What project tells of the ellipse of a splat, a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx where it
+is lowest, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
+MAX_GAUSSIANS = 1 << (32 - 2 * ROW_BITS)
+"""A million: more would not fit beside the rows in an entry. As many tiles are an image of 23000 x 23000."""
+ROUNDING = np.float32(2e-3)
+"""Pixels by which row bounds are widened, against rounding; the exact test is made on every pixel anyway."""
+_ZERO, _HALF, _WIDTH = np.float32(0.0), np.float32(0.5), np.float32(LANES)
+_RADIX_BITS = 11
+_INFO_SHIFT = np.uint32(2 * ROW_BITS)
+_ROWS_MASK = np.uint32((1 << 2 * ROW_BITS) - 1)
+
+
+@kernel(inline="always")
+def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
+    """Image rows [top, end) that the ellipse covers in LANES columns of tiles from this one on: bounds [2 * LANES].
+
+    The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in dx, so its maximum over a column's
+    pixel centres is at the ellipse's own extreme point clamped to them; the upper one is its mirror image.
+    """
+    zero, width, extreme = splat(_ZERO), splat(extent[g, 0]), splat(extent[g, 1])
+    lean, height2, fall = splat(extent[g, 2]), splat(extent[g, 3]), splat(extent[g, 4])
+    first_dx = (iota() + splat(np.float32(column))) * splat(_WIDTH) + splat(_HALF - x)
+    low, high = maximum(first_dx, zero - width), minimum(first_dx + splat(_WIDTH - np.float32(1)), width)
+    at = minimum(maximum(extreme, low), high)
+    bottom = lean * at + sqrt(maximum(zero, height2 - fall * at * at))
+    at = minimum(maximum(zero - extreme, low), high)
+    top = lean * at - sqrt(maximum(zero, height2 - fall * at * at))
+    store(bounds, 0, ceil(top + splat(y - _HALF - ROUNDING)))
+    store(bounds, LANES, floor(bottom + splat(y + _HALF + ROUNDING)))
+
+
+@kernel(inline="always")
+def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
+    """Homes of splat g for tiles in columns first to last and bands highest to lowest, from this one on; the next."""
+    first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
+    step = last_block - first_block + 1
+    homes[g, 1] = step * (lowest - highest + 1)
+    homes[g, 2], homes[g, 3] = home - step * highest - first_block, step
+    return home + homes[g, 1]
+
+
+@kernel
+def fill_slots(  # type: ignore[no-untyped-def]
+    thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
+    slot_start, slot_count, slot_info, homes, region_end,
+):  # fmt: skip
+    """Write the slots of the thread's share of splats into its region, an equal share of slot_info; number its homes.
+
+    home_capacity: of all threads. region_end [threads, 2]: where both end; past the region's end they are only counted.
+    """
+    region = slot_info.shape[0] // threads
+    slot, full = thread * region, (thread + 1) * region
+    home = home_capacity // threads * thread
+    count, last_row = splats.shape[0], np.float32(height - 1)
+    bounds = np.empty(2 * LANES, np.float32)
+    for g in range(count * thread // threads, count * (thread + 1) // threads):
+        slot_start[g], slot_count[g], homes[g, 0], homes[g, 1] = slot, 0, home, 0
+        if not radius2[g] >= _ZERO:
+            continue
+        x, y, reach_x, reach_y = splats[g, 0], splats[g, 1], extent[g, 0], extent[g, 5]
+        first = max(math.floor((x - reach_x - _HALF) / _WIDTH), 0)
+        last = min(math.floor((x + reach_x - _HALF) / _WIDTH), tiles_x - 1)
+        highest = int(max(y - reach_y - _HALF, _ZERO)) >> ROW_BITS
+        lowest = int(min(y + reach_y + _HALF, last_row)) >> ROW_BITS
+        top_most, bottom_most = highest << ROW_BITS, min((lowest + 1) << ROW_BITS, height)
+        for column in range(first, last + 1):
+            lane = (column - first) % LANES
+            if lane == 0:
+                _rows(extent, g, x, y, column, bounds)
+            top, end = max(int(bounds[lane]), top_most), min(int(bounds[LANES + lane]), bottom_most)
+            if top >= end:
+                continue
+            for band in range(top >> ROW_BITS, ((end - 1) >> ROW_BITS) + 1):
+                if slot < full:
+                    above = band << ROW_BITS
+                    rows = max(top - above, 0) << ROW_BITS | min(end - 1 - above, TILE_ROWS - 1)
+                    slot_info[slot] = (band * tiles_x + column) << 2 * ROW_BITS | rows
+                slot += 1
+        slot_count[g] = slot - slot_start[g]
+        if slot_count[g] > 0:
+            home = _number_homes(homes, g, home, first, last, highest, lowest)
+    region_end[thread, 0], region_end[thread, 1] = slot, home
+
+
+@kernel
+def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type: ignore[no-untyped-def]
+    """Sort the visible splats, nearest first, ties by index; return how many there are and whether they are in order.
+
+    (Else they are in other_order.) Radix sort on the float's own bits above the nearest one's (depths are positive):
+    as many passes as the range of depths has digits. order, keys, other_* are scratch [N].
+    """
+    visible, nearest, farthest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
+    depth = splats[:, 9].copy().view(np.uint32)
+    for g in range(splats.shape[0]):
+        if radius2[g] >= _ZERO:
+            order[visible], keys[visible] = g, depth[g]
+            nearest, farthest = min(nearest, depth[g]), max(farthest, depth[g])
+            visible += 1
+    for i in range(visible):
+        keys[i] -= nearest
+    digits, shift, is_first = (1 << _RADIX_BITS) - 1, 0, True
+    while visible > 0 and (farthest - nearest) >> shift > 0:
+        cursor = np.zeros(digits + 2, np.int64)
+        for i in range(visible):
+            cursor[((keys[i] >> shift) & digits) + 1] += 1
+        for digit in range(digits):
+            cursor[digit + 1] += cursor[digit]
+        for i in range(visible):
+            digit = (keys[i] >> shift) & digits
+            at = cursor[digit]
+            cursor[digit] = at + 1
+            other_order[at], other_keys[at] = order[i], keys[i]
+        order, other_order, keys, other_keys = other_order, order, other_keys, keys
+        shift, is_first = shift + _RADIX_BITS, not is_first
+    return visible, is_first
+
+
+@kernel
+def sort_into_tiles(  # type: ignore[no-untyped-def]
+    order, visible, slot_start, slot_count, slot_info, region_end, tile_start, entries
+):
+    """Counting sort of the slots by tile, splats taken in depth order."""
+    tile_start[:] = 0
+    region = slot_info.shape[0] // region_end.shape[0]
+    for thread in range(region_end.shape[0]):
+        for slot in range(thread * region, region_end[thread, 0]):
+            tile_start[(slot_info[slot] >> _INFO_SHIFT) + np.uint32(1)] += 1
+    for tile in range(tile_start.shape[0] - 1):
+        tile_start[tile + 1] += tile_start[tile]
+    cursor = tile_start[:-1].copy()
+    for i in range(visible):
+        g = order[i]
+        splat_bits = np.uint32(g) << _INFO_SHIFT
+        for slot in range(slot_start[g], slot_start[g] + slot_count[g]):
+            info = slot_info[slot]
+            place = cursor[info >> _INFO_SHIFT]
+            cursor[info >> _INFO_SHIFT] = place + 1
+            entries[place] = splat_bits | info & _ROWS_MASK

@@ -1,0 +1,243 @@
+"""One image size, one set of buffers: project, bin, blend and their gradients by the kernels of this folder.
+
+N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays are NumPy, rows of N (project.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.splat.cpu import bins, project
+from intrasplat.splat.cpu.blend import COTANGENT, LOSS, PLANE, PLANES, RECORD, RENDER, STATISTICS, blend
+from intrasplat.splat.cpu.threads import run, thread_count
+from intrasplat.splat.cpu.vectors import LANES
+from intrasplat.splat.layout import ROWS
+from intrasplat.splat.step import Target
+
+Floats = NDArray[np.float32]
+_NO_LOSS = np.zeros(5, np.float32)
+PART_PIXELS = 1 << 19
+"""A render may pause after so many pixels are blended: some tens of milliseconds."""
+
+
+def _aligned(rows: int, columns: int) -> Floats:
+    """Zeros whose rows begin where cache lines begin, if columns is a multiple of 16: no vector straddles two."""
+    raw = np.zeros(rows * columns + 16, np.float32)
+    start = -(raw.ctypes.data // 4) % 16
+    return raw[start : start + rows * columns].reshape(rows, columns)
+
+
+def padded(count: int) -> int:
+    """The next multiple of LANES: rows of N are processed LANES at a time."""
+    return -(-count // LANES) * LANES
+
+
+@dataclass
+class Gradients:
+    """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|.
+
+    Of several frames, those of the state, of the opacity and the norm are of all; the others of the last.
+    """
+
+    state: Floats  # [ROWS, N]; COLOUR and GLOSS are the caller's to fill
+    opacity_logit: Floats  # [N]
+    colour: Floats  # [3, N]
+    mean2d_norm: Floats  # [N], in normalised device coordinates
+    pose: NDArray[np.float64]  # [threads, 12], to be summed
+
+    @classmethod
+    def room(cls, state: Floats) -> Gradients:
+        """Zeros for as many Gaussians as state has, [ROWS, N], which becomes a part of them."""
+        count = state.shape[1]
+        logit, norm = np.zeros((2, count), np.float32)
+        return cls(state, logit, np.zeros((3, count), np.float32), norm, np.zeros((thread_count(), 12)))
+
+
+class Rasterizer:
+    """Buffers for one image size; they grow with the scene and are reused from step to step. Not thread-safe."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height, self.threads = width, height, thread_count()
+        self.tiles_x, tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
+        self.tiles = self.tiles_x * tiles_y
+        self.stride = self.tiles_x * LANES
+        self.image = np.zeros(6 * height * self.stride, np.float32)
+        self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
+        self._planes = _aligned(self.threads, PLANES * PLANE)
+        self._trail, self._records = _aligned(self.threads, 0), _aligned(self.threads, 0)
+        self._spans = np.zeros((self.threads, 0, 3), np.int32)
+        self._tile_start = np.zeros(self.tiles + 1, np.int64)
+        self._region_end = np.zeros((self.threads, 2), np.int64)
+        self._next_block = np.zeros(1, np.int64)
+        self._no_target = Target(np.zeros(1, np.uint8), np.zeros(1, np.uint8), np.zeros(1, np.float32))
+        self._allocate_gaussians(0)
+        self._allocate_slots(0, 0)
+
+    def _allocate_gaussians(self, count: int) -> None:
+        if count > bins.MAX_GAUSSIANS:
+            raise ValueError(f"{count} Gaussians; these kernels number at most {bins.MAX_GAUSSIANS}")
+        self.splats = np.zeros((count, project.SPLAT), np.float32)
+        self.radius2 = np.full(count, -1.0, np.float32)
+        self.slot_start = np.zeros(count, np.int32)
+        self._slot_count = np.zeros(count, np.int32)
+        self._extent = np.zeros((count, bins.EXTENT), np.float32)
+        self._homes = np.zeros((count, 4), np.int32)
+        self._order = np.zeros((2, count), np.int32)
+        self._keys = np.zeros((2, count), np.uint32)
+        self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
+
+    def _allocate_slots(self, slots: int, homes: int) -> None:
+        """Room for so many per thread."""
+        self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
+        self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
+
+    def project(
+        self,
+        camera: NDArray[np.float64],
+        state: Floats,
+        opacity_logit: Floats,
+        colour: Floats,
+        pause: Callable[[], None] | None = None,
+    ) -> None:
+        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N].
+
+        pause: called between the thirds of a large image, as in render.
+        """
+        is_large = self.width * self.height > PART_PIXELS
+        self.place(camera, state, opacity_logit, colour)
+        if is_large and pause is not None:
+            pause()
+        self.bin()
+        if is_large and pause is not None:
+            pause()
+        self.sort()
+
+    def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """First third of project: the splats on the image."""
+        count = state.shape[1]
+        if self.splats.shape[0] != count:
+            self._allocate_gaussians(count)
+        self._camera, self._state, self._opacity_logit = camera, state, opacity_logit
+        run(
+            project.project, camera, state, opacity_logit, colour, self.splats.reshape(-1), self.radius2,
+            self._extent.reshape(-1),
+        )  # fmt: skip
+
+    def bin(self) -> None:
+        """Second third: the slots and homes of every splat."""
+        if not self._filled():
+            self._allocate_slots(*(self._needed() * 5 // 4).tolist())
+            self._filled()
+
+    def _filled(self) -> bool:
+        """Write the slots; False where a thread's region is too small for its own."""
+        run(
+            bins.fill_slots, self.splats, self.radius2, self._extent, self.height, self.tiles_x,
+            len(self._sums) // bins.GRADIENT, self.slot_start, self._slot_count, self._slot_info, self._homes,
+            self._region_end,
+        )  # fmt: skip
+        return bool((self._needed() <= self._regions()).all())
+
+    def _regions(self) -> NDArray[np.int64]:
+        """Slots and homes that a thread has room for."""
+        return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // self.threads
+
+    def _needed(self) -> NDArray[np.int64]:
+        """Slots and homes of the thread that has most."""
+        return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
+
+    def sort(self) -> None:
+        """Last third: the slots of every tile, nearest first."""
+        ranks, keys = self._order, self._keys
+        count, is_first = bins.depth_order(self.splats, self.radius2, ranks[0], keys[0], ranks[1], keys[1])
+        bins.sort_into_tiles(
+            ranks[0 if is_first else 1], count, self.slot_start, self._slot_count, self._slot_info, self._region_end,
+            self._tile_start, self._entries,
+        )  # fmt: skip
+
+    def _reserve(self) -> None:
+        """Room for what a thread keeps of the fullest tile; untouched memory costs nothing."""
+        most = int(np.diff(self._tile_start).max()) * bins.TILE_ROWS
+        if self._spans.shape[1] < most:
+            most = most * 5 // 4
+            self._spans = np.zeros((self.threads, most, 3), np.int32)
+            self._records = _aligned(self.threads, most * RECORD)
+            self._trail = _aligned(self.threads, most * 2 * LANES)
+
+    def _empty_homes(self) -> None:
+        """Zeros in what the gradients are added to."""
+        _, region = self._regions()
+        for thread, (_, end) in enumerate(self._region_end):
+            self._sums[thread * region * bins.GRADIENT : end * bins.GRADIENT] = 0
+
+    def blend(
+        self, mode: int, target: Target, loss_settings: Floats, image: Floats, bands: tuple[int, int] | None = None
+    ) -> None:
+        """The kernel in one of its modes (blend.py). bands: first and end of the rows of tiles; None: all."""
+        self._reserve()
+        if mode != RENDER:
+            self._empty_homes()
+        first, end = bands or (0, self.tiles // self.tiles_x)
+        self._next_block[0] = first * -(-self.tiles_x // bins.BLOCK_TILES)
+        run(
+            blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats,
+            self._tile_start[: end * self.tiles_x + 1], self._entries, self._homes, self._records, self._spans,
+            self._trail, self._planes, self._sums, self.statistics, target.rgb, target.weight, target.inverse_depth,
+            loss_settings, image,
+        )  # fmt: skip
+
+    def render(self, values: Floats | None = None, pause: Callable[[], None] | None = None) -> Floats:
+        """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites.
+
+        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
+        called after every PART_PIXELS but the last; it may use other rasterizers, and end the render by an exception.
+        """
+        if values is not None:
+            self.splats[: len(values), 11] = values
+        bands = self.tiles // self.tiles_x
+        part = bands if pause is None else max(1, PART_PIXELS // (self.stride * bins.TILE_ROWS))
+        for first in range(0, bands, part):
+            if pause is not None and first > 0:
+                pause()
+            end = min(first + part, bands)
+            self.blend(RENDER, self._no_target, _NO_LOSS, self.image, (first, end))
+        planes = 5 if values is None else 6
+        return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
+
+    def loss_backward(
+        self,
+        target: Target,
+        loss_settings: Floats,
+        out: Gradients | None = None,
+        *,
+        adds: bool = False,
+        adds_state: bool = False,
+    ) -> Gradients:
+        """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums per tile.
+
+        out: where they are written; None: where the next ones will be, too. adds: out holds those of other frames,
+        which these are added to; adds_state: those of the state, too.
+        """
+        self.blend(LOSS, target, loss_settings, self.image)
+        return self.carry_back(out, adds=adds, adds_state=adds_state)
+
+    def cotangent_backward(self, cotangents: Floats) -> Gradients:
+        """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
+        padded_cotangents = np.zeros((5, self.height, self.stride), np.float32)
+        padded_cotangents[:, :, : self.width] = cotangents
+        self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
+        return self.carry_back()
+
+    def carry_back(self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False) -> Gradients:
+        """The slots' gradients, left by blend, to the parameters of their Gaussians."""
+        out = out or self.gradients
+        run(
+            project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
+            self._homes, self._sums, adds, adds_state,
+            out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
+        )  # fmt: skip
+        return out

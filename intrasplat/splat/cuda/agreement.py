@@ -1,0 +1,80 @@
+"""Check once a process, before the first job, that the device splats as the reference does.
+
+Any GPU, driver or version of Triton may be wrong. So a small fixed scene is rendered and differentiated on the device,
+and by intrasplat/splat/reference.py in float64.
+
+Symbols: N Gaussians, H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from intrasplat.errors import UnavailableError
+from intrasplat.splat import reference
+from intrasplat.splat.camera import Camera, Rendered
+from intrasplat.splat.cuda.autograd import rasterize
+from intrasplat.splat.cuda.captured import one_at_a_time
+
+LIMIT = 1e-2
+"""Norm of a difference over the norm of what is right. Rounding gives 1e-5; a pixel where it decides about a faint
+Gaussian may give a hundred times that; what is wrong gives 1."""
+COUNT, WIDTH, HEIGHT = 32, 20, 13
+_PARTS = ("mean", "quaternion", "scale", "opacity", "colour")
+
+
+@cache
+def check(memory: str, name: str) -> None:
+    """Compare both once; memory: the device as torch calls it, name: the GPU's own.
+
+    Raises:
+        UnavailableError: they differ by more than LIMIT, so nothing that this device computes can be trusted.
+    """
+    with one_at_a_time:  # the first scene may be rendered while the first job begins
+        worst, part = disagreement(torch.device(memory))
+    if not worst <= LIMIT:  # so that NaN is wrong, too
+        raise UnavailableError(
+            f"{name or memory} is not to be trusted: its {part} of a test scene is off by {worst:.1e}.",
+            "Use the CPU (--device cpu, INTRASPLAT_DEVICE=cpu), and send what `make gpu-check` prints.",
+        )
+
+
+def disagreement(device: torch.device) -> tuple[float, str]:
+    """The largest relative difference, NaN if there is one, and of what: the image, or a gradient."""
+    right = _splatted(reference.rasterize, torch.device("cpu"), torch.float64)
+    found = _splatted(rasterize, device, torch.float32)
+    differences = {
+        part: float((found[part].cpu().double() - wanted).norm() / wanted.norm()) for part, wanted in right.items()
+    }
+    part = max(differences, key=lambda each: (differences[each] != differences[each], differences[each]))
+    return differences[part], part
+
+
+def _splatted(splat: Callable[..., Rendered], device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Image [H, W, 5] of the scene, and the gradients of its product with fixed cotangents."""
+    random = torch.Generator().manual_seed(1)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return (low + (high - low) * torch.rand(*shape, generator=random, dtype=torch.float64)).to(device, dtype)
+
+    mean = torch.cat([uniform(-10, 10, COUNT, 1), uniform(-6, 6, COUNT, 1), uniform(50, 70, COUNT, 1)], 1)
+    values = (
+        mean,
+        uniform(-1, 1, COUNT, 4),
+        uniform(0.5, 4, COUNT, 3),
+        uniform(0.1, 0.98, COUNT),
+        uniform(0, 1, COUNT, 3),
+    )
+    cotangents = uniform(-1, 1, HEIGHT, WIDTH, 5)
+    for each in values:
+        each.requires_grad_()
+    camera = Camera(60.0, 60.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, torch.eye(4, dtype=torch.float64).numpy())
+    seen = splat(*values, camera)
+    image = torch.cat([seen.rgb, seen.depth[..., None] / 60, seen.alpha[..., None]], -1)
+    gradients = torch.autograd.grad((image * cotangents).sum(), values)
+    named = {f"gradient of {name}": each for name, each in zip(_PARTS, gradients, strict=True)}
+    return {"image": image.detach(), **named}

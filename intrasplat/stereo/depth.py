@@ -1,0 +1,288 @@
+"""Depth of every frame of a rectified clip.
+
+Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. depth_mm = fx baseline_mm / (d - offset).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip.sampling import LeftOut, left_out
+from intrasplat.clip.split import spread
+from intrasplat.clip.types import DepthClip
+from intrasplat.errors import Cancelled, InputError
+from intrasplat.instruments import Finder, looked_at
+from intrasplat.machine.cores import cores
+from intrasplat.machine.hooks import Hooks, Progress
+from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
+from intrasplat.report import Masks
+from intrasplat.stereo.alignment import (
+    Agreed,
+    Features,
+    agreed_disparities,
+    choose_range,
+    find_features,
+    match_features,
+    measure_row_shift,
+    outside_share,
+)
+from intrasplat.stereo.frames import FrameWork, grey_of
+from intrasplat.stereo.matching import MatchPlan
+from intrasplat.stereo.nearness import nearness
+from intrasplat.stereo.registration import MatchedPair, Registration
+
+if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
+    from intrasplat.clip.calibration import RectifiedClip
+
+FinderOf = Callable[[Iterable[NDArray[np.uint8]]], Finder]
+
+STAGE = "stereo"
+COMPILATION = "compile"
+"""The stage until the GPU's kernels have run once: the first run may compile them."""
+DECODING_SHARE, MEASURING_SHARE = 0.2, 0.1  # of the stage's progress
+RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3
+"""Pairs, spread over the measured frames. A pair costs 10 ms for the range and 250 ms for the alignment."""
+WARN_OUTSIDE_SHARE = 0.1
+WARN_SURE_SHARE = 0.5
+MIN_SURE_SHARE = 0.005
+"""The share of tissue that must have sure depth: unrelated images have 0.0003 by chance."""
+
+
+def estimate_depth(
+    clip: RectifiedClip,
+    hooks: Hooks | None = None,
+    *,
+    measured_frames: Sequence[int] | None = None,
+    leave_out: bool = False,
+    most_frames: int | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    finder_of: FinderOf | None = None,
+) -> DepthClip:
+    """Depth and confidence of every frame. How the eyes differ in turn, rows (up to 8 px) and colour is corrected.
+
+    What the eyes differ by and the disparity range are common to all frames. They are measured on measured_frames alone
+    (None: on all); for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not
+    change the depth of others. With leave_out, those of measured_frames that show nothing new
+    (intrasplat/clip/sampling.py) get no depth. On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches
+    many pairs at once. finder_of makes what finds the instruments of a clip without masks, from some of its pictures;
+    each frame's are found by itself, before it is matched. None: `clip.tissue` is right.
+
+    `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
+    min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
+    depth_sure_share (those with confidence SURE or more). Nothing outside depth_range_mm is searched or becomes depth.
+
+    Raises:
+        ValueError: measured_frames is empty or names a frame that does not exist.
+        InputError: there is no depth, the frames are rectified already, the eyes look swapped, or their rows differ by
+            more than 8 px.
+        Cancelled: hooks.should_stop said so.
+    """
+    hooks = Hooks() if hooks is None else hooks
+    measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
+    if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
+        raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
+    aligned = spread(measured, ALIGNMENT_PAIRS)
+    with one_opencv_thread(), _pool() as pool:
+        rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
+        unused = left_out(rgb, measured, most_frames, pool.map) if leave_out else LeftOut()
+        if device == "cuda":
+            hooks.on_progress(Progress(COMPILATION, 0.0))
+        finder = None if finder_of is None else finder_of(rgb[i] for i in looked_at(measured))
+        registration, plan, outside = _plan(
+            clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder
+        )
+        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
+        first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
+        wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
+        order = sorted(wanted, key=lambda i: i != first)  # frame `first` may be shown at once
+        jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
+        for done, (i, job) in enumerate(jobs, start=1):
+            _check_stop(hooks)
+            job.result()
+            if i == first:
+                hooks.on_first_moment(work.matched.moment(i))
+            hooks.on_progress(Progress(STAGE, 1 - share * (len(wanted) - done) / len(wanted)))
+    pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
+    valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
+    _check_depth(sure_share)
+    share = 1 - pixels / (len(wanted) * clip.tissue[0].size)
+    masks, assumptions = Masks(source="given", share=share), clip.assumptions
+    doubts: tuple[Notice, ...] = ()
+    if finder is not None:
+        masks, told, doubts = finder.told(share, work.sure[wanted])
+        assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), told)
+    return replace(
+        work.matched,
+        left_out=unused.frames,
+        masks=masks,
+        rectification=clip.rectification,
+        assumptions=(*assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
+        warnings=clip.warnings
+        + doubts
+        + registration.notices
+        + _warnings(sure_share)
+        + _range_warnings(outside, depth_range_mm),
+        measurements={
+            "vertical_misalignment_px": registration.turn.lower_px,
+            "vertical_residual_px": registration.residual_px,
+            "vertical_matches": float(registration.matches),
+            "min_disparity_px": plan.min_disparity_px,
+            "max_disparity_px": plan.max_disparity_px,
+            "depth_valid_share": valid_share,
+            "depth_sure_share": sure_share,
+        },
+    )
+
+
+def _receive(
+    clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
+    """Left and right frames [T, H, W, 3], from one pass over the source, and the matching features of some [M, 4].
+
+    Features are searched while later frames arrive.
+    """
+    shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width, 3)
+    rgb, right = (mapped_zeros(shape, np.uint8) for _ in range(2))
+    features: list[Future[Features]] = []
+    decoded = 0
+    for i, (left_frame, right_frame) in enumerate(clip.pairs()):
+        if i >= clip.frame_count:
+            break
+        _check_stop(hooks)
+        for frames, frame in ((rgb, left_frame), (right, right_frame)):
+            frames[i] = frame
+            let_go(frames[i])
+        if i in aligned:
+            features += [pool.submit(find_features, grey_of(eye)) for eye in (left_frame, right_frame)]
+        decoded = i + 1
+        share = DECODING_SHARE * decoded / clip.frame_count
+        hooks.on_progress(Progress(STAGE, share, frames=clip.frame_count, megapixels=rgb.size / 3e6))
+    if decoded < clip.frame_count:
+        raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
+    found = [job.result() for job in features]
+    return rgb, right, np.concatenate(list(pool.map(match_features, found[::2], found[1::2])))
+
+
+def _plan(
+    clip: RectifiedClip,
+    rgb: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    measured: Sequence[int],
+    matches: NDArray[np.float64],
+    pool: ThreadPoolExecutor,
+    device: str,
+    depth_range_mm: tuple[float, float],
+    finder: Finder | None,
+) -> tuple[Registration, MatchPlan, float]:
+    """How the eyes differ, and the disparity range, from a few pairs spread over the measured frames; outside_share."""
+    shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
+    agreed: Agreed = partial(agreed_disparities, each=pool.map)
+    if device == "cuda":
+        from intrasplat.stereo.cuda import agreed_disparities as agreed
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    outside = outside_share(matches, shift, clip.disparity_offset_px, focal_baseline, depth_range_mm)
+    calibrated = replace(clip.intrinsics, cx=clip.intrinsics.cx - clip.disparity_offset_px)
+    coarse = Registration.of_matches(matches, shift, calibrated, clip.baseline_mm)
+    ranged = spread(measured, RANGE_PAIRS)
+    pairs = list(pool.map(lambda i: (grey_of(rgb[i]), coarse.rectified(grey_of(right[i]))), ranged))
+    plan = MatchPlan(
+        *choose_range(pairs, clip.disparity_offset_px, focal_baseline, depth_range_mm, agreed), depth_range_mm
+    )
+
+    def matched_pair(i: int) -> MatchedPair:
+        tissue, rectified = clip.tissue[i], coarse.rectified(right[i])
+        if finder is not None:
+            grey, offset_px = grey_of(rectified), clip.disparity_offset_px
+            tissue = tissue & ~finder(rgb[i], lambda picture: nearness(picture, grey, plan, offset_px)).tool
+        return MatchedPair.of(rgb[i], rectified, tissue, plan)
+
+    found = pool.map(matched_pair, spread(measured, ALIGNMENT_PAIRS))
+    return coarse.refined(list(found), matches, pool.map), plan, outside
+
+
+Jobs = Iterable[tuple[int, Future[None]]]
+"""Frames, each with the job after which it is finished."""
+
+
+def _match_all(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor) -> Jobs:
+    """Match the pairs side by side, begun in this order."""
+    return [(i, pool.submit(work.match, i)) for i in order]
+
+
+def _match_on_device(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
+    """Match the first pair alone, then as many at once as their cost volumes fit into memory; the pool finishes each
+    frame."""
+    from intrasplat.stereo.cuda import depth_of, frames_at_once
+
+    clip, matched = work.clip, work.matched
+    at_once = frames_at_once(clip.intrinsics.height, clip.intrinsics.width, work.plan)
+    focal_baseline = clip.intrinsics.fx * clip.baseline_mm
+    hooks.on_progress(Progress(COMPILATION, 0.5))
+    for batch in (order[:1], *(order[k : k + at_once] for k in range(1, len(order), at_once))):
+        _check_stop(hooks)
+        left, other = (np.stack(eye) for eye in zip(*pool.map(work.greys, batch), strict=True))
+        tissue = np.stack(list(pool.map(work.tell_tissue, batch, other)))
+        matched.depth_mm[batch], matched.depth_confidence[batch] = depth_of(
+            left, other, tissue, work.plan, focal_baseline, clip.disparity_offset_px
+        )
+        yield from [(i, pool.submit(work.finish, i)) for i in batch]
+
+
+def _check_depth(sure_share: float) -> None:
+    """Refuse a clip whose share of tissue with sure depth is below MIN_SURE_SHARE."""
+    if sure_share < MIN_SURE_SHARE:
+        raise InputError(
+            "clip",
+            f"{sure_share:.1%} of tissue pixels have a depth to rely on, as good as none.",
+            "Check focus, that left and right belong together, and that the calibration and masks fit the frames.",
+        )
+
+
+def _range_warnings(outside: float, depth_range_mm: tuple[float, float]) -> tuple[Notice, ...]:
+    if outside < WARN_OUTSIDE_SHARE:
+        return ()
+    text = (
+        f"{outside:.0%} of matching features are nearer than {depth_range_mm[0]:g} mm or farther than "
+        f"{depth_range_mm[1]:g} mm and get no depth: give min_depth_mm or max_depth_mm, or check the calibration"
+    )
+    return (Notice.warning(NoticeCode.DEPTH_OUT_OF_RANGE, text),)
+
+
+def _warnings(sure_share: float) -> tuple[Notice, ...]:
+    if sure_share >= WARN_SURE_SHARE:
+        return ()
+    text = f"only {sure_share:.0%} of tissue has stereo depth to rely on"
+    return (Notice.warning(NoticeCode.LITTLE_STEREO_DEPTH, text),)
+
+
+def _scale_assumption(clip: RectifiedClip) -> Notice:
+    """The assumption about the baseline: a wrong one scales every distance, and no picture shows it."""
+    text = f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
+    return Notice.info(NoticeCode.BASELINE, text)
+
+
+def _check_stop(hooks: Hooks) -> None:
+    if hooks.should_stop():
+        raise Cancelled("stopped while estimating depth")
+
+
+@contextmanager
+def _pool() -> Iterator[ThreadPoolExecutor]:
+    """One thread per core, one pair per thread: OpenCV releases the GIL, and two threads for one pair are slower."""
+    pool = ThreadPoolExecutor(cores(), thread_name_prefix=STAGE)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,173 @@
+"""One frame of both eyes at a time: matched, its depth moved to the right eye, dropped beside instruments.
+
+Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. depth_mm = fx baseline_mm / (d - offset).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip.types import DepthClip, Eye
+from intrasplat.instruments import Finder
+from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
+from intrasplat.stereo.nearness import nearness
+from intrasplat.stereo.registration import Registration
+from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over
+
+if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
+    from intrasplat.clip.calibration import RectifiedClip
+
+SURE = 128
+"""Of confidence's 255: at least so much is a depth to rely on."""
+BESIDE_PX = 6
+"""Tissue this near to an instrument gets no depth: matching windows reach over the edge and find the instrument."""
+
+
+def grey_of(rgb: NDArray[np.uint8]) -> Grey:
+    """Grey [H, W] of a picture [H, W, 3]."""
+    grey: Grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return grey
+
+
+@dataclass(frozen=True, eq=False)
+class FrameWork:
+    """What is common to the frames of a clip, and the clip that they fill, each by itself and in any order.
+
+    matched  the clip with both eyes; its pictures are there, and each frame's depth after finish(i)
+    label    [H, W] what is painted into both eyes' pictures
+    finder   finds the instruments of a clip without masks; None: the clip's own tell
+    counts   [T, 3] pixels of tissue, those with depth, those with sure depth
+    sure     [T, 3] `seen`, `clear` and `missed` of what the finder found
+    """
+
+    clip: RectifiedClip
+    plan: MatchPlan
+    registration: Registration
+    matched: DepthClip
+    right: Eye
+    label: NDArray[np.bool_]
+    finder: Finder | None = None
+    counts: NDArray[np.int64] = field(init=False)
+    sure: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "counts", np.zeros((self.clip.frame_count, 3), np.int64))
+        object.__setattr__(self, "sure", np.zeros((self.clip.frame_count, 3)))
+
+    @classmethod
+    def begin(
+        cls,
+        clip: RectifiedClip,
+        rgb: NDArray[np.uint8],
+        right_rgb: NDArray[np.uint8],
+        measured: Sequence[int],
+        registration: Registration,
+        plan: MatchPlan,
+        finder: Finder | None = None,
+    ) -> FrameWork:
+        """Before the first frame. The right eye lies on the calibrated baseline, turned as it was measured.
+
+        Labels are found in the measured frames alone.
+        """
+        count, shape = clip.frame_count, rgb.shape[:3]
+        middle, sometime_tissue = measured[len(measured) // 2], np.zeros(shape[1:], np.bool_)
+        for i in measured:
+            sometime_tissue |= clip.tissue[i]
+            let_go(clip.tissue[i])
+        label = painted_over(rgb[middle], right_rgb[middle], ~sometime_tissue)  # as recorded
+        right = Eye(
+            rgb=right_rgb,
+            tissue=mapped_zeros(shape, np.bool_) if clip.tissue_right is None else clip.tissue_right,
+            depth_mm=mapped_zeros(shape, np.float32),
+            depth_confidence=mapped_zeros(shape, np.uint8),
+            intrinsics=registration.camera,
+            world_from_camera=np.tile(registration.left_from_right, (count, 1, 1)),
+        )
+        matched = DepthClip(
+            rgb=rgb,
+            tissue=clip.tissue if clip.tissue.flags.writeable else mapped_zeros(shape, np.bool_),
+            depth_mm=mapped_zeros(shape, np.float32),
+            depth_confidence=mapped_zeros(shape, np.uint8),
+            intrinsics=clip.intrinsics,
+            world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
+            frame_times_s=clip.frame_times_s,
+            right=right,
+            registration=registration.told,
+        )
+        return cls(clip, plan, registration, matched, right, label, finder)
+
+    def greys(self, i: int) -> tuple[Grey, Grey]:
+        """The pair to match. The right picture has its final colours from here on."""
+        self.right.rgb[i] = self.registration.recoloured(self.right.rgb[i])
+        return grey_of(self.matched.rgb[i]), self.registration.rectified(grey_of(self.right.rgb[i]))
+
+    def tell_tissue(self, i: int, right: Grey) -> NDArray[np.bool_]:
+        """The tissue [H, W] of a frame's left eye, in the matched clip from here on. right: of greys(i)."""
+        tissue: NDArray[np.bool_] = self.matched.tissue[i]
+        if self.matched.tissue is not self.clip.tissue:
+            tissue[:] = self.clip.tissue[i]
+        if self.finder is not None:
+            rgb, offset_px = self.matched.rgb[i], self.clip.disparity_offset_px
+            found = self.finder(rgb, lambda coarse: nearness(coarse, right, self.plan, offset_px))
+            tissue &= ~found.tool
+            self.sure[i] = found.seen, found.clear, found.missed
+        return tissue
+
+    def match(self, i: int) -> None:
+        """Match a frame and finish it."""
+        left, right = self.greys(i)
+        disparity, trust = match(left, right, self.plan, self.tell_tissue(i, right))
+        beyond_infinity_px = disparity - np.float32(self.clip.disparity_offset_px)
+        focal_baseline = self.clip.intrinsics.fx * self.clip.baseline_mm
+        self.matched.depth_mm[i], self.matched.depth_confidence[i] = to_depth(
+            beyond_infinity_px, trust, focal_baseline, self.plan.depth_range_mm
+        )
+        self.finish(i)
+
+    def finish(self, i: int) -> None:
+        """Move a frame's depth to the right eye; drop it beside instruments; count."""
+        left, right, registration = self.matched, self.right, self.registration
+        focal_baseline, offset_px = self.clip.intrinsics.fx * self.clip.baseline_mm, self.clip.disparity_offset_px
+        moved_mm, moved_trust = moved_depth(left.depth_mm[i], left.depth_confidence[i], focal_baseline, offset_px)
+        right.depth_mm[i] = registration.recorded_depth(moved_mm)
+        right.depth_confidence[i] = registration.recorded(moved_trust)
+        if self.clip.tissue_right is None:
+            shown = moved_tissue(left.tissue[i] | self.label, left.depth_mm[i], focal_baseline, offset_px)
+            right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
+        for eye in (left, right):
+            drop_beside_instruments(eye.tissue[i], eye.depth_mm[i], eye.depth_confidence[i])
+        trust = left.depth_confidence[i][left.tissue[i]]
+        self.counts[i] = trust.size, np.count_nonzero(trust), np.count_nonzero(trust >= SURE)
+        for eye in (left, right):
+            eye.let_go(i)
+
+
+def to_depth(
+    beyond_infinity_px: NDArray[np.float32],
+    confidence: NDArray[np.uint8],
+    focal_baseline: float,
+    depth_range_mm: tuple[float, float],
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth in mm and confidence [H, W]; both are 0 at invalid pixels."""
+    nearest_mm, farthest_mm = depth_range_mm
+    valid = confidence >= MIN_CONFIDENCE
+    valid &= (beyond_infinity_px >= focal_baseline / farthest_mm) & (beyond_infinity_px <= focal_baseline / nearest_mm)
+    depth_mm = np.where(valid, focal_baseline / np.where(valid, beyond_infinity_px, 1.0), 0.0)
+    return depth_mm.astype(np.float32), np.where(valid, confidence, 0).astype(np.uint8)
+
+
+def drop_beside_instruments(
+    tissue: NDArray[np.bool_], depth_mm: NDArray[np.float32], confidence: NDArray[np.uint8]
+) -> None:
+    """Set depth and confidence [H, W] of the tissue within BESIDE_PX of what is not tissue to 0, in place."""
+    side = 2 * BESIDE_PX + 1
+    if not tissue.all():
+        beside = tissue & (cv2.dilate((~tissue).astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+        depth_mm[beside], confidence[beside] = 0, 0

@@ -1,0 +1,152 @@
+"""Files from outside become a clip with depth: decoded, rectified, matched. It needs no torch."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from intrasplat.clip import ClipLimits, DepthClip, StereoClip, training_frames
+from intrasplat.clip.calibration import rectify
+from intrasplat.clip.sampling import most_frames, sampled
+from intrasplat.decode import DecoderKilledError, decode_clip
+from intrasplat.instruments import Finder, load_segmenter, with_instruments_found
+from intrasplat.intake.calibration.types import StereoCalibration
+from intrasplat.machine.hooks import Hooks, ignore
+from intrasplat.machine.timing import Timings
+from intrasplat.names import MaskSource
+from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOptions
+from intrasplat.report import Masks
+from intrasplat.stereo.depth import estimate_depth
+
+TRIES = 3
+"""Of a clip whose decoding process is killed from outside."""
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+@dataclass(frozen=True)
+class ClipPaths:
+    """The files of one clip (intrasplat/clip/opening.py); clip may be of both eyes."""
+
+    clip: Path
+    right: Path | None = None
+    calibration: Path | None = None
+    masks: Path | None = None
+
+
+def open_with_depth(
+    paths: ClipPaths,
+    options: ReconstructionOptions,
+    hooks: Hooks,
+    timings: Timings,
+    *,
+    limits: ClipLimits | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    before_matching: Callable[[], None] = ignore,
+    segmenter: Path | None = None,
+) -> DepthClip:
+    """Decode, and for stereo input rectify and match: the left frames with depth, and the right ones.
+
+    timings get decode_s, until the size of a stereo clip is known, and stereo_s, which includes decoding its frames.
+
+    Without masks instruments are found (intrasplat/instruments) by the segmenter, an ONNX file, if there is one, else if
+    options.mask_source is auto.
+
+    When something outside kills the decoding process, it is tried again, TRIES times in all.
+
+    Raises:
+        InputError: the clip, its calibration, its masks or the holdout cannot be used.
+        UnavailableError: the disk is full; or before_matching raised it; or the segmenter cannot be used; or the
+            decoding process was killed every time.
+        Cancelled: hooks.should_stop said so.
+    """
+
+    def once() -> DepthClip:
+        hooks.report_stage("decode", 0.0)
+        with timings.measure("decode_s"):
+            decoded = decode_clip(
+                paths.clip,
+                paths.right,
+                calibration=paths.calibration,
+                masks=paths.masks,
+                options=options,
+                limits=limits,
+                hooks=hooks,
+            )
+        if isinstance(decoded, DepthClip):
+            measured = training_frames(decoded.frame_count, options.holdout)
+            hooks.on_first_moment(decoded.moment(measured[0]))
+            clip = sampled(decoded, options)
+            without = clip.masks is not None and clip.masks.source == "none"
+            if not without or not _finds(options.mask_source, segmenter):
+                return clip
+            network = None if segmenter is None else load_segmenter(segmenter)
+            with timings.measure("masks_s"):
+                return with_instruments_found(clip, measured, hooks, network)
+        with closing(decoded):
+            return match_eyes(
+                decoded.clip,
+                decoded.calibration,
+                options.holdout,
+                hooks,
+                timings,
+                leave_out=options.use_frames == "new",
+                most_frames=most_frames(options),
+                device=device,
+                before_matching=before_matching,
+                depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
+                mask_source=options.mask_source,
+                segmenter=segmenter,
+            )
+
+    for _ in range(TRIES - 1):
+        try:
+            return once()
+        except DecoderKilledError:
+            logger.warning("something killed the process that decodes the clip; it is tried again")
+    return once()
+
+
+def match_eyes(
+    clip: StereoClip,
+    calibration: StereoCalibration,
+    holdout: str,
+    hooks: Hooks,
+    timings: Timings,
+    *,
+    leave_out: bool = False,
+    most_frames: int | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    before_matching: Callable[[], None] = ignore,
+    depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    mask_source: MaskSource = "given",
+    segmenter: Path | None = None,
+) -> DepthClip:
+    """Rectify a stereo clip and match its eyes, as open_with_depth does."""
+    finds = clip.tissue is None and _finds(mask_source, segmenter)
+    network = load_segmenter(segmenter) if finds and segmenter is not None else None
+    rectified = rectify(clip, calibration)
+    measured = training_frames(clip.frame_count, holdout)
+    before_matching()
+    with timings.measure("stereo_s"):
+        matched = estimate_depth(
+            rectified,
+            hooks,
+            measured_frames=measured,
+            leave_out=leave_out,
+            most_frames=most_frames,
+            device=device,
+            depth_range_mm=depth_range_mm,
+            finder_of=partial(Finder.of, segmenter=network) if finds else None,
+        )
+    return replace(matched, masks=Masks(source="none")) if clip.tissue is None and not finds else matched
+
+
+def _finds(mask_source: MaskSource, segmenter: Path | None) -> bool:
+    """Whether instruments of a clip without masks are to be found."""
+    return mask_source == "auto" or (mask_source == "given" and segmenter is not None)

@@ -1,0 +1,173 @@
+"""Adaptive density, as published: Gaussians whose projection the loss pulls hard are split, transparent ones dropped.
+
+Symbols: N Gaussians. g_k = |dL/dmean2d| of step k in NDC, with the loss of intrasplat/splat/loss.py (tissue means).
+Source: Kerbl et al., 3D Gaussian Splatting (2023), section 5, with the settings Deform3DGS trains with.
+
+A Gaussian is split where the mean of g_k over the steps that saw it exceeds gradient_threshold. Kerbl et al. clone
+it instead if it is smaller than a hundredth of the cameras' extent. That extent is the cameras' greatest distance from
+their centre: 0 for an endoscope that stands still. Nothing is smaller than 0, so nothing is ever cloned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from intrasplat.errors import TrainingDiverged
+from intrasplat.splat.layout import LOG_SCALE, MEAN, QUATERNION
+from intrasplat.splat.model import Model
+
+SPLIT_SHRINK = 0.8
+"""Children of a Gaussian split into n are 1 / (0.8 n) as wide in every direction."""
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """When and what to split and prune.
+
+    from_iteration      the first iteration after which it happens; statistics are gathered from the first step on
+    every               iterations between two densifications
+    gradient_threshold  NDC; a Gaussian whose mean gradient is above it is split
+    split_into          children of one Gaussian
+    min_opacity         a Gaussian below it is dropped
+    max_count           no more Gaussians than this: with FDM's 17 bases and Adam's moments one takes 6.8 kB, these
+                        1.4 GB; the threshold alone bounds nothing on a clip that cannot be fitted
+    """
+
+    from_iteration: int = 600
+    every: int = 100
+    gradient_threshold: float = 2e-4
+    split_into: int = 2
+    min_opacity: float = 0.005
+    max_count: int = 200_000
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.split_into < 2 or self.max_count < 1:
+            raise ValueError(f"every, split_into and max_count must be at least 1, 2 and 1: {self}")
+        if not (0 < self.min_opacity < 1 and self.gradient_threshold > 0):
+            raise ValueError(f"min_opacity must lie in (0, 1), gradient_threshold above 0: {self}")
+
+    def due(self, iteration: int) -> bool:
+        """Whether to densify after this iteration (from 1)."""
+        return iteration >= self.from_iteration and iteration % self.every == 0
+
+
+class Densifier:
+    """Gathers every Gaussian's gradients on the model's device, and edits the model when the time has come."""
+
+    def __init__(self, settings: DensifySettings, count: int) -> None:
+        self.settings = settings
+        self._forget(count)
+
+    def _forget(self, count: int) -> None:
+        self._gradient_sum = torch.zeros(count, dtype=torch.float64)
+        self._steps_seen = torch.zeros(count, dtype=torch.int64)
+
+    @property
+    def mean_gradient(self) -> NDArray[np.float64]:
+        """[N] mean of g_k over the steps that saw each Gaussian since the last densification; 0 for those unseen."""
+        return (self._gradient_sum / self._steps_seen.clamp(min=1)).cpu().numpy()
+
+    def observe(self, model: Model) -> None:
+        """Add the model's last step to the statistics.
+
+        Raises:
+            ValueError: the model has another number of Gaussians than the statistics.
+        """
+        if model.count != len(self._steps_seen):
+            raise ValueError(f"statistics are of {len(self._steps_seen)} Gaussians, the model has {model.count}")
+        visible = model.visible
+        # New and stored statistics lie on the host.
+        self._gradient_sum, self._steps_seen = (
+            each.to(visible.device) for each in (self._gradient_sum, self._steps_seen)
+        )
+        self._gradient_sum += torch.where(visible, model.gradient_norm, 0.0)
+        self._steps_seen += visible
+
+    def apply(self, model: Model, iteration: int, random: np.random.Generator) -> None:
+        """Split and prune if that is due after this iteration, and reset the statistics.
+
+        Raises:
+            TrainingDiverged: a gradient is not finite, or no Gaussian would be left.
+        """
+        if not self.settings.due(iteration):
+            return
+        gradient = self.mean_gradient
+        if not np.isfinite(gradient).all():
+            broken = int((~np.isfinite(gradient)).sum())
+            raise TrainingDiverged(f"The gradients of {broken} Gaussians are not finite at iteration {iteration}.")
+        opacity_logit = model.parameters()["opacity_logit"].cpu().numpy()
+        columns, born = successors(self.settings, gradient, opacity_logit)
+        if len(columns) == 0:
+            raise TrainingDiverged(f"All {model.count} Gaussians have become transparent by iteration {iteration}.")
+        _replace(model, columns, born, self.settings.split_into, random)
+        self._forget(model.count)
+
+    def arrays(self) -> dict[str, Tensor]:
+        """The statistics, by name; views."""
+        return {"densify.gradient_sum": self._gradient_sum, "densify.steps_seen": self._steps_seen}
+
+    def load_arrays(self, stored: dict[str, Tensor]) -> None:
+        """Take back what arrays() gave; the number of Gaussians becomes the stored one.
+
+        Raises:
+            ValueError: the two arrays differ in length.
+        """
+        gradient_sum, steps_seen = stored["densify.gradient_sum"], stored["densify.steps_seen"]
+        if gradient_sum.ndim != 1 or gradient_sum.shape != steps_seen.shape:
+            shapes = tuple(gradient_sum.shape), tuple(steps_seen.shape)
+            raise ValueError(f"densify.* have shapes {shapes[0]} and {shapes[1]}, not the same [N]")
+        self._gradient_sum = gradient_sum.to(torch.float64, copy=True)
+        self._steps_seen = steps_seen.to(torch.int64, copy=True)
+
+
+def successors(
+    settings: DensifySettings, gradient: NDArray[np.floating], opacity_logit: NDArray[np.floating]
+) -> tuple[NDArray[np.int64], int]:
+    """Which Gaussians [M] the next ones are made of, parents split_into times; and how many, the last, are children.
+
+    The others keep their order. Empty if all are transparent.
+
+    Args:
+        gradient: [N], NDC; the mean gradient of each since the last densification.
+        opacity_logit: [N].
+    """
+    pruned = opacity_logit < math.log(settings.min_opacity / (1 - settings.min_opacity))
+    asked = np.flatnonzero((gradient > settings.gradient_threshold) & ~pruned)
+    room = max(0, settings.max_count - int((~pruned).sum())) // (settings.split_into - 1)
+    parents = _hardest_pulled(asked, gradient, room)
+    kept = ~pruned
+    kept[parents] = False
+    columns = np.concatenate([np.flatnonzero(kept), np.tile(parents, settings.split_into)])
+    return columns, len(parents) * settings.split_into
+
+
+def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.floating], room: int) -> NDArray[np.int64]:
+    """At most room of the candidates, those with the greatest gradients, ascending."""
+    order = np.argsort(-gradient[candidates], kind="stable")
+    return np.sort(candidates[order[:room]])
+
+
+def _replace(model: Model, columns: NDArray[np.int64], born: int, children: int, random: np.random.Generator) -> None:
+    """Make the Gaussians of these columns, the last so many children: smaller, drawn from the parent's own density.
+
+    Everything else is the parent's: rotation, opacity, colour, motion. Adam's moments of the children start at 0.
+    """
+    survivors = len(columns) - born
+    model.take(columns, np.arange(len(columns)) >= survivors)
+
+    if born == 0:
+        return
+    canonical = model.parameters()["canonical"][:, survivors:]
+    state = np.array(canonical.cpu())
+    mean, quaternion, log_scale = (state[rows] for rows in (MEAN, QUATERNION, LOG_SCALE))
+    along_axes = random.standard_normal(mean.T.shape) * np.exp(log_scale.T)
+    mean += Rotation.from_quat(quaternion.T[:, [1, 2, 3, 0]]).apply(along_axes).T.astype(np.float32)
+    log_scale -= np.float32(math.log(SPLIT_SHRINK * children))
+    canonical.copy_(torch.from_numpy(state))

@@ -1,0 +1,157 @@
+"""The one training loop. prepare.py builds what it needs; Run holds all of its state.
+
+Nothing in a schedule reads the clock: on one device the same seed and iterations give the same bits, and a resumed run
+gives those of an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from intrasplat.errors import Cancelled, TrainingDiverged
+from intrasplat.machine.hooks import ignore
+from intrasplat.machine.timing import Stopwatch
+from intrasplat.scene.scene import TrainedScene, is_finite
+from intrasplat.splat.model import state_of
+from intrasplat.splat.optimize import rates_at
+from intrasplat.splat.step import StepSums
+from intrasplat.train.hooks import TrainingHooks
+from intrasplat.train.run import CurvePoint, Run, frames_at
+from intrasplat.train.schedule import validation_frames
+from intrasplat.train.scoring import HeldOutScore
+
+CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600, 1200, 1800)
+"""Training times at which held-out frames are scored; the clock is paused meanwhile."""
+UNSCORED_S = 2.0
+"""After the first step: a score takes a third of a second of whoever waits, and would tell little so soon."""
+REPORT_EVERY_S = 0.25
+TOLD_AFTER_S = 1.0
+"""Of training: the first steps, beside which the state is kept, tell little of how long the others take."""
+
+
+def step(run: Run, iteration: int) -> None:
+    """One iteration of the model.
+
+    Raises:
+        TrainingDiverged: the loss is not finite, or no Gaussian is visible. A GPU model reports its losses some steps
+            late, so the error may come some steps later.
+    """
+    preset, frames = run.preset, [eye.frame(index) for index in frames_at(run, iteration) for eye in run.eyes]
+    sh_degree = min(preset.sh_degree, iteration // preset.sh_every) if preset.sh_degree else 0
+    rates = rates_at(preset.rates, run.schedule.progress(iteration))
+    check_sums(run.model.step(frames, preset.loss, rates, iteration, sh_degree), iteration)
+
+
+def check_sums(sums: StepSums | None, iteration: int) -> None:
+    """Check the losses of the steps that the model has answered for, if any.
+
+    Raises:
+        TrainingDiverged: a loss is not finite, or no Gaussian is visible.
+    """
+    if sums is None:
+        return
+    if not math.isfinite(sums.colour_l1 + sums.depth_l1):
+        raise TrainingDiverged(f"The loss is not finite by iteration {iteration}.")
+    if sums.visible == 0:
+        raise TrainingDiverged(f"No Gaussian is visible by iteration {iteration}.")
+
+
+def train(
+    run: Run,
+    clock: Stopwatch,
+    evaluate: Callable[[], HeldOutScore],
+    hooks: TrainingHooks,
+    copy_scene: Callable[[], TrainedScene] | None = None,
+    keep: Callable[[Run], None] = ignore,
+) -> None:
+    """Take run from its iteration to its last.
+
+    Args:
+        clock: t_train_s so far; paused while held-out frames are scored.
+        evaluate: the score of the held-out frames, NaN without any.
+        copy_scene: the scene as the model is now, for hooks.on_snapshot; None shows none.
+        keep: called before every step; may store the run, as it is after a full iteration.
+
+    Raises:
+        Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
+        TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
+    """
+    marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s + UNSCORED_S]
+    reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
+    hooks.on_progress(run.progress("train", run.iteration / run.iterations))
+    while run.iteration < run.iterations:
+        if hooks.should_stop():
+            raise Cancelled(f"Stopped after iteration {run.iteration} of {run.iterations}.")
+        keep(run)
+        if copy_scene is not None and hooks.wants_snapshot():
+            hooks.on_snapshot(copy_scene(), run.iteration)
+        iteration = _advance(run)
+        if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
+            marks = [mark for mark in marks if mark > clock.elapsed_s]
+            _score(run, clock, evaluate)
+        if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
+            reported = now
+            made_s = now - began
+            left_s = made_s / (iteration - begun_at) * (run.iterations - iteration) if made_s > TOLD_AFTER_S else None
+            hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
+    check_sums(run.model.wait(), run.iteration)
+    _check_finite(run)
+    if not run.curve or run.curve[-1].iteration < run.iteration:  # else it was stopped after its last score
+        _score(run, clock, evaluate)
+
+
+def _advance(run: Run) -> int:
+    """The next iteration and what follows it, densification or the end of a cycle; returns its number."""
+    iteration = run.iteration + 1
+    step(run, iteration)
+    run.iteration = iteration
+    if run.densifier is not None:
+        run.densifier.observe(run.model)
+        if iteration < run.iterations:  # children of the last iteration would get no step
+            run.densifier.apply(run.model, iteration, np.random.default_rng([run.seed, iteration, 1]))
+    _end_cycle(run, iteration)
+    return iteration
+
+
+def _end_cycle(run: Run, iteration: int) -> None:
+    """Average the last models of a cycle; their mean ends it, and is scored while early stopping may follow from it."""
+    if run.schedule.averages(iteration):
+        run.average.add(run.model.parameters())
+    if run.average.count and iteration in run.schedule.ends:
+        run.average.put(run.model.parameters())
+    if run.schedule.scores_validation(iteration):
+        run.schedule = run.schedule.with_score(_validation_psnr(run))
+
+
+def _validation_psnr(run: Run) -> float:
+    """Mean psnr_tissue in dB of the validation frames that show tissue; NaN if none does."""
+    scores = [
+        eye.psnr_tissue_db(index, run.model.render(eye.cameras[index], float(eye.t[index])))
+        for index in validation_frames(run.frames.indices)
+        for eye in run.eyes
+        if eye.picture(index)[1].any()
+    ]
+    return float(np.mean(scores)) if scores else math.nan
+
+
+def _check_finite(run: Run) -> None:
+    """Check the parameters themselves: a Gaussian that is not a number is not drawn, so the loss does not show it."""
+    arrays = state_of(run.model, run.preset.rates.beta1)
+    broken = [name for name, values in arrays.items() if not is_finite(values)]
+    if broken:
+        raise TrainingDiverged(f"After {run.iteration} iterations {', '.join(broken)} hold values that are not finite.")
+
+
+def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> None:
+    check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
+    t_train_s, t_post_s = clock.elapsed_s, time.time() - run.setup.accepted_at_s
+    with clock.paused():
+        score = evaluate()
+    if math.isnan(score.left_db):
+        return
+    right_db = None if math.isnan(score.right_db) else score.right_db
+    run.curve.append(CurvePoint(t_train_s, run.iteration, score.left_db, right_db, t_post_s))

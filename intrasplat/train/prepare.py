@@ -1,0 +1,110 @@
+"""A clip with depth becomes a run that can be trained: points, their motion, a model, its targets, its length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from intrasplat.fusion import fuse
+from intrasplat.machine.memory import LITTLE_BYTES, keep_free_memory
+from intrasplat.motion.keyframes import track_keyframes
+from intrasplat.motion.tracks import Tracks, moved_along
+from intrasplat.notices import Notice
+from intrasplat.splat.backend import CPU, examine
+from intrasplat.splat.deformation import SharedBasis
+from intrasplat.splat.model import Model
+from intrasplat.train.calibrate import measured_schedule, warm_up
+from intrasplat.train.densify import Densifier
+from intrasplat.train.presets import Preset
+from intrasplat.train.run import Box, Run
+from intrasplat.train.schedule import Schedule, validation_frames
+from intrasplat.train.setup import Setup
+from intrasplat.train.start import bounded, box_of, fusion_for, settled, start_model
+from intrasplat.train.targets import TrainingFrames, units_per_mm
+
+
+def prepare(setup: Setup) -> Run:
+    """The run before its first step, or after those that tell its length. Compiling a GPU's kernels does not count as
+    training: the clock is paused.
+
+    Raises:
+        InputError: no training frame has valid depth.
+        Cancelled: hooks.should_stop said so.
+    """
+    clip, train, timings = setup.clip, setup.split.train, setup.timings
+    scale = units_per_mm(clip, train)
+    examine_device(setup)
+    tracks = _tracks(setup)
+    setup.hooks.report_stage("fusion", 0.0)
+    with timings.measure("capacity_s"):
+        preset, chosen = settled(setup.preset, tracks, clip, train)
+    with timings.measure("fusion_s"):
+        moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
+        right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
+        fusion = fusion_for(preset, clip.intrinsics)
+        cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
+    preset, fewer = bounded(preset, len(cloud.points_mm))
+    setup.hooks.report_stage("start", 0.0)
+    with timings.measure("start_s"):
+        model = start_model(
+            cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
+        )
+    run = begun(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
+    keep_free_memory(LITTLE_BYTES)
+    run.schedule = _schedule(run)
+    return run
+
+
+def examine_device(setup: Setup) -> None:
+    """Compile a GPU's kernels and check them; the clock is paused. Raises UnavailableError if they do not work."""
+    if setup.device != CPU:
+        setup.hooks.report_stage("compile", 0.0)
+        with setup.clock.paused():
+            setup.timings.add("compile_s", examine(setup.device))
+
+
+def frames_of(setup: Setup, scale: float) -> list[TrainingFrames]:
+    """The targets of each eye that teaches, left first. scale: optimiser units a millimetre."""
+    with setup.timings.measure("targets_s"):
+        eyes = zip(setup.teaching_eyes, setup.sides, strict=False)
+        return [TrainingFrames(eye, setup.split.train, scale, side) for eye, side in eyes]
+
+
+def begun(
+    setup: Setup, frames: Sequence[TrainingFrames], model: Model, preset: Preset, chosen: tuple[Notice, ...], box: Box
+) -> Run:
+    """The run of a model that has made no step, and no schedule yet. A GPU compiles what this very model needs.
+
+    Args:
+        frames: of each eye that teaches.
+        preset: settled.
+    """
+    densifier = Densifier(preset.densify, model.count) if preset.densify else None
+    run = Run(setup, model, frames[0], preset, Schedule(planned=0), box, densifier=densifier, chosen=chosen)
+    run.right = frames[1] if len(frames) > 1 else None
+    if setup.device != CPU:
+        with setup.clock.paused():
+            setup.timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
+    return run
+
+
+def _tracks(setup: Setup) -> list[Tracks]:
+    """Optical-flow tracks of each keyframe, where the preset starts its motion with them."""
+    train = setup.split.train
+    if not setup.preset.tracks or setup.preset.deformation != SharedBasis.kind or len(train) < 2:
+        return []
+    with setup.timings.measure("motion_s"):
+        tracks = track_keyframes(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
+    keep_free_memory(LITTLE_BYTES)
+    return tracks
+
+
+def _schedule(run: Run) -> Schedule:
+    """How many iterations are made and how rates fall in them. Where a budget decides, the first are made here."""
+    setup, preset = run.setup, run.preset
+    fixed = setup.fixed_iterations
+    if fixed is not None:
+        return Schedule(fixed, preset.warm_restarts, epoch=run.steps_an_epoch)
+    setup.hooks.report_stage("calibrate", 0.0)
+    min_gain_db = preset.min_gain_db if validation_frames(run.frames.indices) else None
+    return measured_schedule(run, setup.budget_s, min_gain_db)

@@ -1,0 +1,143 @@
+"""A stored run resumes: a stopped or killed one goes on from its last state to the bits of an uninterrupted run.
+
+The state names no device: a run may be resumed on another one, but then reaches other bits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from intrasplat.errors import ResumeMismatch, SceneError
+from intrasplat.notices import Notice
+from intrasplat.scene.resume_file import RESUME_FILE, begin_resume, load_resume
+from intrasplat.splat.model import Model, state_of
+from intrasplat.train.prepare import begun, examine_device, frames_of
+from intrasplat.train.presets import Preset
+from intrasplat.train.run import CurvePoint, Run
+from intrasplat.train.schedule import Schedule
+from intrasplat.train.setup import Setup
+from intrasplat.train.start import resting_model
+from intrasplat.train.targets import TrainingFrames
+
+MISFITS = (KeyError, SceneError, TypeError, ValueError)
+"""What reading a state raises that is damaged or of another run."""
+
+
+def resume(directory: Path, setup: Setup) -> Run | None:
+    """The run that is stored in directory, with the setup's clock and timings as they were; None if there is none.
+
+    Points, tracks and the start are not made again: all that came of them is in the state.
+
+    Raises:
+        ResumeMismatch: it was started with another preset, seed, length or clip, or cannot be read.
+        UnavailableError: the GPU does not work.
+        Cancelled: hooks.should_stop said so.
+    """
+    if not (directory / RESUME_FILE).exists():
+        return None
+    try:
+        tensors, state = load_resume(directory)
+        preset = _settled(setup.preset, state["start"])
+        frames = frames_of(setup, float(state["start"]["units_per_mm"]))
+        _check(state, setup, preset, frames)
+        examine_device(setup)
+        low, high = state["start"]["box"]
+        model = resting_model(state["count"], (low, high), setup, preset)
+        _load_parameters(model, tensors)  # a GPU warms up on them
+        chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
+        run = begun(setup, frames, model, preset, chosen, (low, high))
+        _put(run, tensors, state)
+    except MISFITS as error:
+        problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
+        raise ResumeMismatch("--out", problem, "Give the options it was started with, or name a new folder.") from error
+    before = state["seconds"]
+    first_view = {name: before[name] for name in ("t_first_view_s",) if name in before}
+    setup.timings.seconds = before | setup.timings.seconds | first_view
+    setup.clock.restart(float(state["t_train_s"]))
+    return run
+
+
+def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
+    """Begin to write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
+
+    When this returns, the run may go on. What it returns ends the writing, as that of begin_resume.
+
+    Raises:
+        OSError: the disk is full or refuses; what was stored before is as it was.
+    """
+    trains = 0 < run.iteration < run.iterations
+    beta1 = run.preset.rates.beta1
+    arrays = state_of(run.model, beta1) if trains else run.model.parameters()  # else nobody asks for moments
+    arrays |= {**run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
+    state = {
+        "identity": _identity(run.setup, run.preset, run.eyes),
+        "start": {
+            "bases": run.preset.bases,
+            "stride": run.preset.fusion.stride,
+            "units_per_mm": run.frames.scale,
+            "box": run.box,
+            "chosen": [notice.model_dump() for notice in run.chosen],
+        },
+        "iteration": run.iteration,
+        "schedule": run.schedule.settings,
+        "count": run.model.count,
+        "averaged": run.average.count,
+        "t_train_s": t_train_s,
+        "seconds": run.setup.timings.seconds,
+        "curve": [astuple(point) for point in run.curve],
+    }
+    return begin_resume(directory, arrays, state, after_each=run.average.let_go)
+
+
+def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
+    """The preset with what the scene settled when the run began."""
+    fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
+    return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)
+
+
+def _load_parameters(model: Model, tensors: dict[str, Tensor]) -> None:
+    """Load the stored parameters into a model of as many Gaussians."""
+    names = model.parameters().keys()
+    lacking = names - tensors.keys()
+    if lacking:
+        raise ValueError(f"it holds no {', '.join(sorted(lacking))}")
+    model.load_arrays({name: tensors[name] for name in names})
+
+
+def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Put the stored state into a run that has made no step."""
+    run.model.load_arrays(tensors)
+    run.average.load_arrays(tensors, state["averaged"])
+    if run.densifier is not None:
+        run.densifier.load_arrays(tensors)
+    run.iteration = state["iteration"]
+    run.schedule = Schedule.of(state["schedule"])
+    run.curve = [CurvePoint(*row) for row in state["curve"]]
+
+
+def _check(state: Mapping[str, Any], setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> None:
+    """ValueError if a run with this state was started as something else."""
+    stored = state.get("identity", {})
+    own = _identity(setup, preset, eyes)
+    differing = [f"another {name}" for name, value in own.items() if stored.get(name) != value]
+    if differing:
+        raise ValueError(f"the stored run was started with {', '.join(differing)}")
+
+
+def _identity(setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> dict[str, str]:
+    """What a stored run must share with the one that resumes it, by the words of the error."""
+    fixed = setup.fixed_iterations
+    return {
+        "preset": preset.name,
+        "settings of the preset": hashlib.sha256(repr(preset).encode()).hexdigest(),
+        "seed": str(setup.options.seed),
+        "length": f"{fixed} iterations" if fixed is not None else f"{setup.budget_s} s",
+        "clip, other frames of it, or depth from another device": "".join(eye.digest() for eye in eyes),
+    }

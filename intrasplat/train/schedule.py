@@ -1,0 +1,145 @@
+"""How rates fall and rise again in the iterations of a run, and when early stopping ends it.
+
+A run is a row of cycles, each as long as all before it together: warm restarts, after Loshchilov and Hutter (2017).
+Rates fall within a cycle, and its last models are averaged (Polyak and Juditsky 1992), so the model at its end is a
+finished one. Validation frames, a few of the training frames, tell what the last doubling of the iterations gained;
+they are trained on once that is decided. The clock has no say: the same seed and iterations do the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from intrasplat.notices import Notice, NoticeCode
+
+MIN_CYCLE_ITERATIONS, MIN_CYCLE_EPOCHS = 250, 3
+"""Of a cycle, the larger of the two."""
+RESTART = 0.6
+"""How far rates have fallen already where every cycle but the first begins."""
+AVERAGED_SHARE, AVERAGED = 1 / 8, 6
+"""The last share of a cycle from which models are averaged, and how many of them."""
+CLOSING_SHARE, MIN_CLOSING_EPOCHS = 0.25, 2
+"""Iterations after early stopping, which train on the validation frames too: their share of those before, and the
+fewest epochs. Wherever in an epoch they begin, a whole one follows."""
+VALIDATION_EVERY = 14
+"""Of so many training frames one is a validation frame."""
+MIN_FRAMES_FOR_VALIDATION = 28
+"""With fewer training frames there are no validation frames, and a run uses its whole budget."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The cycles of a run; iterations count from 1.
+
+    planned        iterations without early stopping
+    warm_restarts  whether there are several cycles, if planned is long enough for two, and averages end them
+    min_gain_db    early stopping ends the run where doubling the iterations gains less on the validation frames; None:
+                   there are no validation frames and no early stopping
+    epoch          iterations that show every training frame once; a long clip needs long cycles
+    scores         psnr_tissue of the validation frames, dB, at the ends of the cycles so far
+    opening        first iterations, made before `planned` was known: at full rates, and on no validation frame
+    """
+
+    planned: int
+    warm_restarts: bool = False
+    min_gain_db: float | None = None
+    epoch: int = 1
+    scores: tuple[float, ...] = ()
+    opening: int = 0
+
+    @property
+    def _planned_ends(self) -> tuple[int, ...]:
+        ends = [self.planned]
+        shortest = max(MIN_CYCLE_ITERATIONS, MIN_CYCLE_EPOCHS * self.epoch)
+        while self.warm_restarts and ends[0] // 2 >= shortest:
+            ends.insert(0, ends[0] // 2)
+        return tuple(ends)
+
+    @property
+    def stopped_at(self) -> int | None:
+        """The end of the cycle that gained too little; None as long as there is none."""
+        if self.min_gain_db is None or len(self.scores) < 2:
+            return None
+        too_little = self.scores[-1] - self.scores[-2] < self.min_gain_db  # False if one is NaN
+        return self._planned_ends[len(self.scores) - 1] if too_little else None
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """The last iteration of every cycle, ascending."""
+        stopped_at = self.stopped_at
+        if stopped_at is None:
+            return self._planned_ends
+        closed_at = max(round(stopped_at * (1 + CLOSING_SHARE)), stopped_at + MIN_CLOSING_EPOCHS * self.epoch)
+        return (*self._planned_ends[: len(self.scores)], min(self.planned, closed_at))
+
+    @property
+    def iterations(self) -> int:
+        """Of the whole run, as far as is known."""
+        return self.ends[-1]
+
+    def cycle(self, iteration: int) -> tuple[int, int]:
+        """The iterations after which its cycle begins and ends."""
+        end = next(end for end in self.ends if iteration <= end)
+        return max((each for each in self.ends if each < end), default=0), end
+
+    def progress(self, iteration: int) -> float:
+        """How far rates have fallen, in [0, 1]: 1 at the end of every cycle, 0 in the opening."""
+        if iteration <= self.opening:
+            return 0.0
+        begun, end = self.cycle(iteration)
+        fallen = RESTART if begun else 0.0
+        return fallen + (1 - fallen) * (iteration - begun) / (end - begun)
+
+    def averages(self, iteration: int) -> bool:
+        """Whether the model after an iteration is one of those whose mean ends the cycle."""
+        begun, end = self.cycle(iteration)
+        apart = max(1, int((end - begun) * AVERAGED_SHARE / AVERAGED))
+        return self.warm_restarts and (end - iteration) % apart == 0 and (end - iteration) // apart < AVERAGED
+
+    def withholds_validation(self, iteration: int) -> bool:
+        """Whether an iteration trains on no validation frame: early stopping is still undecided."""
+        if iteration <= self.opening:
+            return self.min_gain_db is not None
+        may_stop = self.min_gain_db is not None and len(self._planned_ends) > 2  # two scores, and a cycle to be spared
+        return may_stop and iteration <= self.ends[-2]
+
+    def scores_validation(self, iteration: int) -> bool:
+        """Whether the validation frames are scored after an iteration; with_score then takes the score."""
+        return self.withholds_validation(iteration) and iteration == self._planned_ends[len(self.scores)]
+
+    def with_score(self, psnr_db: float) -> Schedule:
+        """The schedule after a cycle's end at which the validation frames scored psnr_db."""
+        return replace(self, scores=(*self.scores, psnr_db))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its fields as JSON; a score of NaN is null."""
+        return asdict(self) | {"scores": [None if math.isnan(score) else score for score in self.scores]}
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Schedule:
+        """The schedule with these settings. With all scores of a run, it repeats that run without any validation."""
+        scores = tuple(math.nan if score is None else float(score) for score in settings["scores"])
+        return cls(**{**settings, "scores": scores})
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What was decided, for the report."""
+        if self.stopped_at is None:
+            return ()
+        text = (
+            f"Training ended after {self.iterations} of {self.planned} iterations that the time allowed: doubling the "
+            f"first {self.stopped_at // 2} gained {self.scores[-1] - self.scores[-2]:.2f} dB on validation frames, "
+            f"less than {self.min_gain_db} dB."
+        )
+        return (Notice.info(NoticeCode.EARLY_STOPPING, text),)
+
+
+def validation_frames(frames: Sequence[int]) -> tuple[int, ...]:
+    """The inner split of the training frames: every VALIDATION_EVERY-th, never the first or the last."""
+    if len(frames) < MIN_FRAMES_FOR_VALIDATION:
+        return ()
+    return tuple(frames[VALIDATION_EVERY // 2 : -1 : VALIDATION_EVERY])

@@ -1,0 +1,198 @@
+"""The model before its first step: points become Gaussians; motion starts from the tracks, or at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+from intrasplat.clip import DepthClip
+from intrasplat.fusion import FusionSettings, PointCloud, nearest_pixels
+from intrasplat.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, mean_floor_error, try_bases
+from intrasplat.motion.tracks import GUESSED, Tracks, fit_tracks
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.scene.compact import MAX_WEIGHTS
+from intrasplat.splat.backend import CPU, Device, make_model
+from intrasplat.splat.constants import SH_C0
+from intrasplat.splat.deformation import AtRest, SharedBasis, motion_named
+from intrasplat.splat.gaussians import NEIGHBOURS, Gaussians, initial_gaussians
+from intrasplat.splat.layout import COLOUR, MEAN, ROWS
+from intrasplat.splat.model import Model
+from intrasplat.train.presets import Preset
+from intrasplat.train.run import Box
+from intrasplat.train.setup import Setup
+
+SHARE_PX = 4
+"""Points within such a square start with one motion. Tracks are smooth over more, and there is less to solve."""
+BETWEEN_KEYFRAMES_MM = 1e4
+"""Farther than any neighbours are apart."""
+MIN_STRIDE = 2
+"""Pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
+
+
+def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
+    """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
+    if preset.points_per_image is None or preset.fusion.mode != "fill":
+        return preset.fusion
+    return dataclasses.replace(preset.fusion, stride=stride_for(preset.points_per_image, intrinsics))
+
+
+def stride_for(points: int, intrinsics: Intrinsics) -> int:
+    return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
+
+
+def settled(
+    preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
+) -> tuple[Preset, tuple[Notice, ...]]:
+    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report.
+
+    tracks: of each keyframe, if there are any.
+    """
+    notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
+    left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
+    trials = Trials({})
+    if tracks and left_open:
+        trials = try_bases(tracks, clip, train, basis_values, preset.max_bases)
+    fusion = fusion_for(preset, clip.intrinsics)
+    if fusion.mode == "fill" and preset.points_per_image is not None:
+        least = ", the least there is" if fusion.stride == MIN_STRIDE else ""
+        wanted = preset.points_per_image
+        notices.append(
+            Notice.info(
+                NoticeCode.SPACING,
+                f"Gaussians start {fusion.stride} pixels apart{least}: {wanted} an image were asked for.",
+            )
+        )
+    elif fusion.mode == "fill":
+        finest = stride_for(MAX_POINTS, clip.intrinsics)
+        choice = choose_stride(clip, keys, finest, min((each.total for each in trials.decisive.values()), default=0.0))
+        fusion = dataclasses.replace(fusion, stride=choice.count)
+        preset = dataclasses.replace(preset, fusion=fusion)
+        notices.append(
+            Notice.info(NoticeCode.SPACING, f"Gaussians start {choice.count} pixels apart: {choice.reason}.")
+        )
+    if preset.bases is None:
+        floor = mean_floor_error(clip, keys, fusion.stride)
+        choice = choose_bases(trials, floor, len(train), preset.max_bases)
+        preset = preset.with_bases(choice.count)
+        notices.append(
+            Notice.info(
+                NoticeCode.BASES,
+                f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.",
+            )
+        )
+    return preset, tuple(notices)
+
+
+def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:
+    """The settled preset with so few bases that a scene of so many Gaussians can be stored, and the notice of it."""
+    most = MAX_WEIGHTS // (ROWS * points)
+    if preset.deformation != SharedBasis.kind or preset.bases is None or preset.bases <= most:
+        return preset, ()
+    text = f"Motion has {most} of {preset.bases} bases: more would make a scene of more than {MAX_WEIGHTS:,} weights."
+    return dataclasses.replace(preset, bases=most), (Notice.info(NoticeCode.BASES, text),)
+
+
+def basis_values(bases: int, trained_times: Sequence[float], times: Sequence[float]) -> NDArray[np.float64]:
+    """[T, B] values at the times of the bases that a shared motion trained on trained_times starts with."""
+    return values_at(SharedBasis.initial(1, bases=bases, times=trained_times), times)
+
+
+def values_at(motion: SharedBasis, times: Sequence[float]) -> NDArray[np.float64]:
+    """[T, B] values of the motion's bases at the times."""
+    return np.stack([motion.basis(t).double().numpy() for t in times])
+
+
+def start_model(
+    cloud: PointCloud,
+    tracks: Sequence[Tracks],
+    clip: DepthClip,
+    train: Sequence[int],
+    preset: Preset,
+    scale: float,
+    seed: int,
+    device: Device = CPU,
+    *,
+    gloss: bool = False,
+) -> Model:
+    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the (settled) preset.
+
+    A "shared" motion starts from the tracks of the keyframes, if there are any. Every other motion starts at rest.
+    gloss: whether two eyes teach.
+    """
+    gaussians = initial_gaussians(
+        _apart_by_keyframe_mm(cloud) * np.float32(scale),  # widths are by neighbours of one time
+        cloud.rgb,
+        sh_degree=preset.sh_degree,
+        opacity=preset.opacity,
+    )
+    gaussians = dataclasses.replace(
+        gaussians,
+        mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
+        log_scale=gaussians.log_scale + math.log(preset.spread),
+    )
+    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed, gloss)
+    motion = motion_named(preset.deformation).at_rest(gaussians, start)
+    if tracks and isinstance(motion, SharedBasis):
+        gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def _apart_by_keyframe_mm(cloud: PointCloud) -> NDArray[np.float32]:
+    """[N, 3] where the points lay in their keyframes, so that each has its neighbours in its own one."""
+    alone = np.bincount(cloud.key)[cloud.key] <= NEIGHBOURS
+    apart_mm = (BETWEEN_KEYFRAMES_MM * np.where(alone, 0, cloud.key)).astype(np.float32)
+    return cloud.reference_mm + apart_mm[:, None]
+
+
+def box_of(model: Model) -> Box:
+    """The corners of the box of the model's centres, units."""
+    centres = model.parameters()["canonical"][MEAN].cpu()
+    return tuple(centres.amin(1).tolist()), tuple(centres.amax(1).tolist())
+
+
+def resting_model(count: int, box: Box, setup: Setup, preset: Preset) -> Model:
+    """As start_model's for as many Gaussians in such a box, whose arrays are still to be loaded."""
+    gaussians = Gaussians(
+        mean=torch.tensor(box)[torch.arange(count) % 2],
+        quaternion=torch.zeros(count, 4),
+        log_scale=torch.zeros(count, 3),
+        opacity_logit=torch.zeros(count),
+        sh=torch.zeros(count, (preset.sh_degree + 1) ** 2, 3),
+    )
+    clip, times = setup.clip, [float(setup.clip.t[i]) for i in setup.split.train]
+    start = AtRest(preset.bases, preset.start_width, times, setup.options.seed, any(setup.sides))
+    motion = motion_named(preset.deformation).at_rest(gaussians, start)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, setup.device)
+
+
+def _follow_tracks(
+    gaussians: Gaussians,
+    motion: SharedBasis,
+    cloud: PointCloud,
+    tracks: Sequence[Tracks],
+    clip: DepthClip,
+    train: Sequence[int],
+    scale: float,
+) -> Gaussians:
+    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
+    so that they pass through their point and its colour at the time of the frame it was taken from."""
+    basis = values_at(motion, [float(clip.t[i]) for i in range(clip.frame_count)])
+    weights = np.zeros((len(cloud), basis.shape[1], 6), np.float32)
+    for key, each in enumerate(tracks):
+        rows = np.flatnonzero(cloud.key == key)
+        pixels = nearest_pixels(cloud.reference_mm[rows], clip, train[each.reference])
+        weights[rows], _ = fit_tracks(
+            each, basis[list(train)], pixels, clip.intrinsics.width, share_px=SHARE_PX, guessed=GUESSED
+        )
+    weights *= np.repeat(np.array([scale, 1 / SH_C0], np.float32), 3)
+    by_channel = torch.from_numpy(weights).permute(0, 2, 1)
+    motion.weight[:, MEAN], motion.weight[:, COLOUR] = by_channel[:, :3], by_channel[:, 3:]
+    moved = torch.from_numpy(np.einsum("nbc,nb->nc", weights, basis[cloud.frame]).astype(np.float32))
+    colour = torch.cat([gaussians.sh[:, :1] - moved[:, None, 3:], gaussians.sh[:, 1:]], 1)
+    return dataclasses.replace(gaussians, mean=gaussians.mean - moved[:, :3], sh=colour)

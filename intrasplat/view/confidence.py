@@ -1,0 +1,87 @@
+"""How likely each pixel of a view is right: the confidence layer.
+
+Symbols: H W pixels. A pixel is right if its depth errs by less than 2 % and its colour, in the mean of R G B, by
+less than 0.03 of white. Its likelihood is a logistic function of three numbers (docs/decisions/031):
+
+trust         the Gaussians' own (intrasplat/quality/trust.py), blended: what training frames say of them
+disagreement  mean |difference| of R G B between the pixel and the endoscope's view, at the same time, of the place that
+              the pixel shows. Where the endoscope sees that place, both show the same tissue.
+texture       deviation of brightness around the pixel: where it is rough, a small shift is a large error
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+
+Image = NDArray[np.float32]
+
+LEAST_TRUST, LEAST_DISAGREEMENT, LEAST_TEXTURE = 0.01, 0.005, 0.005
+"""Below these, differences say nothing."""
+WEIGHTS = np.array([1.0, -1.37, -0.48])
+"""Of the trust's log odds, and of the logarithms of disagreement and texture, found by `python -m
+lab.benchmarks.bm_confidence --fit`."""
+BIAS = -8.7
+TEXTURE_SIDE_PX = 7
+
+
+def confidence(found: NDArray[np.float32]) -> Image:
+    """[H, W] in (0, 1) of the evidence [3, H, W]."""
+    odds = np.tensordot(WEIGHTS.astype(np.float32), found, axes=1) + np.float32(BIAS)
+    return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
+
+
+def evidence(trust: Image, rgb: Image, known_rgb: Image) -> NDArray[np.float32]:
+    """[3, H, W] log odds of trust [H, W], and logarithms of disagreement and texture.
+
+    Args:
+        rgb: [3, H, W] the view.
+        known_rgb: [3, H, W] what the endoscope's view shows of the same places (seen_from_endoscope).
+    """
+    likely = np.clip(trust, LEAST_TRUST, 1 - LEAST_TRUST)
+    disagreement = np.abs(rgb - known_rgb).mean(0)
+    return np.stack(
+        [
+            np.log(likely / (1 - likely)),
+            np.log(disagreement + np.float32(LEAST_DISAGREEMENT)),
+            np.log(_texture(rgb.mean(0)) + np.float32(LEAST_TEXTURE)),
+        ]
+    )
+
+
+def seen_from_endoscope(
+    endoscope_rgb: Image,
+    depth_mm: Image,
+    camera: tuple[Intrinsics, NDArray[np.float64]],
+    endoscope: tuple[Intrinsics, NDArray[np.float64]],
+) -> Image:
+    """[3, H, W]: what the endoscope's view [3, h, w] shows where it sees the places that the pixels of a view show.
+
+    Beyond its edges, the nearest pixel at its edge; whatever stands before a place, if it is hidden.
+
+    Args:
+        depth_mm: [H, W] of the view, above 0.
+        camera, endoscope: intrinsics and world_from_camera [4, 4], mm, of the view and of the endoscope.
+    """
+    (k, pose), (own_k, own_pose) = camera, endoscope
+    height, width = depth_mm.shape
+    own_from_view = (np.linalg.inv(own_pose) @ pose).astype(np.float32)
+    x = ((np.arange(width, dtype=np.float32) + np.float32(0.5 - k.cx)) / np.float32(k.fx))[None]
+    y = ((np.arange(height, dtype=np.float32) + np.float32(0.5 - k.cy)) / np.float32(k.fy))[:, None]
+    points = [depth_mm * (row[0] * x + row[1] * y + row[2]) + row[3] for row in own_from_view[:3]]
+    ahead = np.maximum(points[2], np.float32(1e-3))
+    column = np.float32(own_k.fx) * points[0] / ahead + np.float32(own_k.cx - 0.5)
+    row = np.float32(own_k.fy) * points[1] / ahead + np.float32(own_k.cy - 0.5)
+    picture = np.ascontiguousarray(endoscope_rgb.transpose(1, 2, 0))
+    moved = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(moved.transpose(2, 0, 1), np.float32)
+
+
+def _texture(brightness: Image) -> Image:
+    """[H, W] standard deviation of brightness in a square about each pixel."""
+    side = (TEXTURE_SIDE_PX, TEXTURE_SIDE_PX)
+    variance = cv2.blur(brightness * brightness, side) - cv2.blur(brightness, side) ** 2
+    return np.asarray(np.sqrt(np.maximum(variance, 0)), np.float32)

@@ -1,0 +1,55 @@
+"""Between which depths the false colours of a scene lie: the same throughout the clip, so that nothing flickers.
+
+Symbols: N Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import to_camera
+from intrasplat.clip import spread
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.model import Model
+from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
+from intrasplat.view.out_of_view import seen_by_endoscope
+
+SAMPLED_FRAMES = 8
+"""Trained frames looked at, evenly spread."""
+PERCENTILES = (2.0, 98.0)
+"""Of the Gaussians' depths, so that a few strays do not flatten the picture."""
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """Depths before the endoscope in whole mm, and the median depth of the clip: the place that orbits turn about."""
+
+    near_mm: float
+    far_mm: float
+    median_mm: float
+
+    @classmethod
+    def of(cls, scene: TrainedScene, model: Model) -> Self:
+        frames = spread(scene.trained_frames, SAMPLED_FRAMES)
+        counts = scene.seen.numpy() > 0 if bool(scene.seen.any()) else np.ones(len(scene.gaussians), np.bool_)
+        seen = (seen_by_endoscope(scene, model, frame) for frame in frames)
+        depths_mm = np.concatenate([z_mm[in_view & counts] for z_mm, in_view in seen])
+        median_mm = MEDIAN_DEPTH_UNITS / scene.units_per_mm
+        near_mm, far_mm = np.percentile(depths_mm, PERCENTILES) if len(depths_mm) else (median_mm, median_mm)
+        near_mm = math.floor(near_mm)
+        return cls(near_mm, max(math.ceil(far_mm), near_mm + 1), median_mm)
+
+    def before(self, world_from_camera: NDArray[np.float64] | None) -> tuple[float, float]:
+        """Nearest and farthest depth in mm before a camera [4, 4] mm: moved by as much as the middle of the tissue
+        lies nearer or farther than before the endoscope. None: the endoscope itself.
+        """
+        if world_from_camera is None:
+            return self.near_mm, self.far_mm
+        middle_mm = to_camera(np.array([[0.0, 0.0, self.median_mm]]), world_from_camera)[0, 2]
+        moved_mm = round(float(middle_mm) - self.median_mm)
+        return self.near_mm + moved_mm, self.far_mm + moved_mm

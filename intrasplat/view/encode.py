@@ -1,0 +1,136 @@
+"""A rendered layer as a file: png and npy are exact, jpeg and webp are for eyes.
+
+            png                         npy                   jpeg, webp
+rgb         8 bit                       uint8 [H, W, 3]       8 bit
+depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
+confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high bright
+
+False colours are those of intrasplat/colours.py.
+
+Where unseen pixels are marked, depth and confidence are 0 there, and rgb shows a hatch; png and webp of rgb then have
+an alpha channel: 255 elsewhere, and there UNSEEN_ALPHA, as good as transparent. Whoever ignores alpha sees the hatch.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.colours import COLOUR_TABLE
+from intrasplat.picture import ImageFormat, Layer, Unseen
+from intrasplat.view.unseen import hatched
+
+DEPTH_PNG_PER_MM = 100.0
+DEFAULT_QUALITY = 90
+FOR_EYES = frozenset({ImageFormat.JPEG, ImageFormat.WEBP})
+UNSEEN_ALPHA = {ImageFormat.PNG: 0, ImageFormat.WEBP: 1}
+"""Alpha of an unseen pixel, of 255, in the formats that have alpha. webp's encoder flattens what alpha 0 hides, at any
+quality, and keeps what alpha 1 shows."""
+PNG_COMPRESSION = 1
+"""Fast rather than small: renders travel over the loopback or a hospital's own network."""
+
+FALSE_COLOURS = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 1, 3)[:, :, ::-1].copy()
+"""As OpenCV takes them, BGR."""
+
+
+class Layers(Protocol):
+    """The images of one render."""
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]: ...
+
+    @property
+    def depth_mm(self) -> NDArray[np.float32]: ...
+
+    @property
+    def confidence(self) -> NDArray[np.float32]: ...
+
+    @property
+    def unseen(self) -> NDArray[np.bool_]: ...
+
+
+def encode_layer(
+    frame: Layers,
+    layer: Layer,
+    image_format: ImageFormat,
+    quality: int = DEFAULT_QUALITY,
+    unseen: Unseen = Unseen.MARK,
+    *,
+    depth_range_mm: tuple[float, float] | None = None,
+) -> bytes:
+    """The file's bytes.
+
+    Args:
+        quality: 1 to 100, of jpeg and webp.
+        depth_range_mm: what false colours of depth reach from and to; they need it.
+    """
+    marked = frame.unseen if unseen is Unseen.MARK else None
+    if layer is Layer.RGB:
+        return _encode_colour(frame.rgb, marked, image_format, quality)
+    values = frame.depth_mm if layer is Layer.DEPTH else frame.confidence
+    if marked is not None:
+        values = np.where(marked, np.float32(0), values)
+    if image_format is ImageFormat.NPY:
+        return _npy(values)
+    if image_format in FOR_EYES:
+        return _image(_in_false_colours(values, layer, depth_range_mm), image_format, quality)
+    if layer is Layer.DEPTH:
+        steps = np.clip(np.rint(values * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
+        return _image(steps.astype(np.uint16), image_format, quality)
+    return _image(np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8), image_format, quality)
+
+
+def _encode_colour(
+    rgb: NDArray[np.uint8], marked: NDArray[np.bool_] | None, image_format: ImageFormat, quality: int
+) -> bytes:
+    """marked: pixels to hatch, and to make transparent where the format can; None: neither."""
+    if marked is not None:
+        rgb = hatched(rgb, marked)
+    if image_format is ImageFormat.NPY:
+        return _npy(rgb)
+    if marked is None or image_format not in UNSEEN_ALPHA:
+        return _image(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8), image_format, quality)
+    pixels = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA), np.uint8)
+    pixels[..., 3] = np.where(marked, np.uint8(UNSEEN_ALPHA[image_format]), np.uint8(255))
+    return _image(pixels, image_format, quality)
+
+
+def _in_false_colours(
+    values: NDArray[np.float32], layer: Layer, depth_range_mm: tuple[float, float] | None
+) -> NDArray[np.uint8]:
+    """BGR uint8 [H, W, 3]."""
+    if layer is Layer.CONFIDENCE:
+        return _coloured(values)
+    if depth_range_mm is None:
+        raise ValueError("depth in false colours needs depth_range_mm")
+    near_mm, far_mm = depth_range_mm
+    coloured = _coloured((np.float32(far_mm) - values) / np.float32(far_mm - near_mm))
+    coloured[values <= 0] = 0
+    return coloured
+
+
+def _coloured(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """BGR uint8 [H, W, 3] of numbers in [0, 1]; those beyond have the colour of the nearer end."""
+    steps = np.rint(np.clip(shares, 0, 1) * 255).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(steps, FALSE_COLOURS), np.uint8)
+
+
+def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFormat, quality: int) -> bytes:
+    parameter, value = {
+        ImageFormat.JPEG: (cv2.IMWRITE_JPEG_QUALITY, quality),
+        ImageFormat.WEBP: (cv2.IMWRITE_WEBP_QUALITY, quality),
+    }.get(image_format, (cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION))
+    done, encoded = cv2.imencode(f".{image_format.value}", pixels, [parameter, value])
+    if not done:
+        raise RuntimeError(f"OpenCV could not encode {pixels.shape} as {image_format.value}")
+    return bytes(encoded.tobytes())
+
+
+def _npy(values: NDArray[np.uint8] | NDArray[np.float32]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values, allow_pickle=False)
+    return buffer.getvalue()

@@ -1,0 +1,95 @@
+"""A measurement as it is told: the points of a view, and the distance of two of them over time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.camera import Intrinsics
+from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
+from intrasplat.notices import Notice
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.backend import CPU, Device
+from intrasplat.view.frame import held_in_clip, renderer_of
+from intrasplat.view.measure import MIN_CONFIDENCE, Distances, Place, distances, places_at
+
+OTHER_PLACE = "Choose another place or another moment."
+EXPANDED = 2.0
+"""Told uncertainties over standard ones: about 95 % of the true values lie within what is told."""
+DIGITS = 4
+"""After the point, of lengths: a tenth of a micrometre."""
+
+
+def measured(
+    scene: TrainedScene,
+    t: float,
+    world_from_camera: NDArray[np.float64] | None,
+    camera: Intrinsics,
+    points: tuple[Point, ...],
+    device: Device = CPU,
+) -> Measurement:
+    """What is seen at the points of a view at model time t (held within the clip); pose None: the endoscope's.
+
+    Raises:
+        InputError: a point lies outside the picture, or the scene does not know how far to trust it.
+    """
+    shown, outside = held_in_clip(scene, t)
+    places = places_at(scene, shown, world_from_camera, camera, points, device)
+    told = tuple(
+        _point(number, point, place, camera) for number, (point, place) in enumerate(zip(points, places, strict=True))
+    )
+    distance = None
+    if len(places) == 2 and all(each.refusal is None for each in told):
+        distance = _distance(scene, distances(scene, shown, places[0], places[1], device))
+    warnings: tuple[Notice, ...] = (*outside, *scene.pose_warnings)
+    range_mm = renderer_of(scene, device).depth_range.before(world_from_camera)
+    return Measurement(t=shown, points=told, distance=distance, depth_range_mm=range_mm, warnings=warnings)
+
+
+def _point(number: int, point: Point, place: Place, camera: Intrinsics) -> MeasuredPoint:
+    refusal = _refusal(f"points[{number}]", place)
+    likely = round(place.confidence, DIGITS)
+    if refusal is not None:
+        return MeasuredPoint(x=point[0], y=point[1], confidence=likely, refusal=refusal)
+    return MeasuredPoint(
+        x=point[0],
+        y=point[1],
+        confidence=likely,
+        depth_mm=round(place.depth_mm, DIGITS),
+        uncertainty_mm=round(EXPANDED * place.uncertainty_mm, DIGITS),
+        point_mm=_rounded(place.point_mm),
+        mm_per_px=round(place.depth_mm / camera.fx, 2 * DIGITS),
+    )
+
+
+def _refusal(field: str, place: Place) -> Refusal | None:
+    if place.unseen:
+        problem = "No frame of the clip saw what is shown here."
+        return Refusal(code=RefusalCode.UNSEEN, field=field, problem=problem, remedy=OTHER_PLACE)
+    if place.confidence < MIN_CONFIDENCE:
+        problem = f"The depth here is right with a probability of {place.confidence:.2f}, less than {MIN_CONFIDENCE:g}."
+        return Refusal(code=RefusalCode.LOW_CONFIDENCE, field=field, problem=problem, remedy=OTHER_PLACE)
+    return None
+
+
+def _distance(scene: TrainedScene, found: Distances) -> MeasuredDistance:
+    def told(values: NDArray[np.float64]) -> tuple[float | None, ...]:
+        return tuple(
+            round(float(value), DIGITS) if known else None for value, known in zip(values, found.known, strict=True)
+        )
+
+    return MeasuredDistance(
+        distance_mm=round(found.now_mm, DIGITS),
+        uncertainty_mm=round(EXPANDED * found.now_uncertainty_mm, DIGITS),
+        t=tuple(frame / scene.frame_count for frame in range(scene.frame_count)),
+        time_s=tuple(scene.frame_times_s.tolist()),
+        distances_mm=told(found.distances_mm),
+        uncertainties_mm=told(EXPANDED * found.uncertainties_mm),
+        first_mm=tuple(_rounded(each) for each in found.paths_mm[0]),
+        second_mm=tuple(_rounded(each) for each in found.paths_mm[1]),
+    )
+
+
+def _rounded(point_mm: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (round(float(each), DIGITS) for each in point_mm)
+    return x, y, z

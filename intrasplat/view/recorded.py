@@ -1,0 +1,171 @@
+"""Recorded frames as the model's cameras see them, with their masks: what a user judges model and masks by.
+
+A scene keeps at most MAX_KEPT moments of them in one file, which intrasplat/scene/recorded_file.py reads.
+Symbols: h w pixels of a picture.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip, Eye
+from intrasplat.clip.images import jpeg_size
+from intrasplat.clip.split import spread
+from intrasplat.errors import InputError, SceneError
+from intrasplat.intake.sniff import png_size
+from intrasplat.machine.mapped import let_go
+from intrasplat.names import Eye as EyeName
+from intrasplat.picture import RecordedMasks
+from intrasplat.report import Recorded
+from intrasplat.scene.recorded_file import MASK, PICTURE, name_of, nearest, read_frame
+
+MAX_KEPT = 120
+"""Moments of a clip."""
+MAX_WIDTH = 720
+"""Px of a picture: a wider frame is made smaller by a whole factor, which takes a third of the time of any other."""
+MAX_HEIGHT = 4 * MAX_WIDTH
+"""Of a picture that is decoded; it may have come from another site."""
+QUALITY = 60
+MARK, MARK_SHARE = (0, 220, 255), 0.45
+"""RGB that no tissue has, and how much of it the masked parts get; their outline gets all of it."""
+AFTER_HEADER = 33
+"""Bytes of a PNG before its second chunk."""
+BLACK_IS_CLEAR = b"\x00\x00\x00\x02tRNS\x00\x00\x76\x93\xcd\x38"
+"""A PNG's chunk by which grey level 0 is transparent."""
+EYES: tuple[EyeName, EyeName] = ("left", "right")
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
+    """The zip of a clip's recorded frames, and what the report says of it. The same clip gives the same bytes.
+
+    All frames are kept, or MAX_KEPT that are spread evenly. Where masks were found, frames that nobody looked at have
+    none, and are not kept.
+    """
+    looked_at = clip.used if clip.masks is not None and clip.masks.are_found else range(clip.frame_count)
+    frames = spread(looked_at, MAX_KEPT)
+    content, is_masked, size = io.BytesIO(), False, (0, 0)
+    masks: dict[str, bytes] = {}
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
+        for name in eyes:
+            for index in frames:
+                rgb, tool = _picture(_eye(clip, name), index)
+                size, is_masked = tool.shape, is_masked or bool(tool.any())
+                archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(rgb))
+                masks[name_of(name, index, MASK)] = _png(tool)
+        for path, png in masks.items() if is_masked else ():
+            archive.writestr(zipfile.ZipInfo(path), png)
+    height, width = size
+    told = Recorded(
+        frames=tuple(frames),
+        eyes=tuple(eyes),
+        width=width,
+        height=height,
+        masks=is_masked,
+        size_bytes=content.tell(),
+    )
+    return content.getvalue(), told
+
+
+def live_frame(
+    clip: DepthClip, t: float, eye: EyeName = "left", masks: RecordedMasks = RecordedMasks.MARKED
+) -> tuple[int, bytes]:
+    """The frame nearest to model time t that has a mask, as JPEG; or its mask alone, as PNG.
+
+    Raises:
+        InputError: the clip has no such eye.
+    """
+    index = nearest(clip.used, t, clip.frame_count)
+    rgb, tool = _picture(_eye(clip, eye), index)
+    if masks is RecordedMasks.ONLY:
+        return index, _png(tool)
+    return index, _jpeg(_marked(rgb, tool) if masks is RecordedMasks.MARKED else rgb)
+
+
+def stored_frame(
+    path: Path,
+    frame_count: int,
+    t: float,
+    eye: EyeName = "left",
+    masks: RecordedMasks = RecordedMasks.MARKED,
+) -> tuple[int, bytes]:
+    """As live_frame, of those that kept_frames has put into a file.
+
+    Raises:
+        SceneError: there is no such file, or it is damaged.
+        InputError: it has no such eye, or no masks.
+    """
+    if masks is RecordedMasks.ONLY:
+        return read_frame(path, frame_count, t, eye, MASK)
+    index, jpeg = read_frame(path, frame_count, t, eye)
+    if masks is RecordedMasks.OFF:
+        return index, jpeg
+    try:
+        _, png = read_frame(path, frame_count, t, eye, MASK)
+    except InputError:  # nothing is masked
+        return index, jpeg
+    if jpeg_size(jpeg) != (size := png_size(png)) or size is None or size[0] > MAX_WIDTH or size[1] > MAX_HEIGHT:
+        raise SceneError("A recorded frame of this scene is damaged, too large, or does not fit its mask.")
+    rgb, tool = _decoded(jpeg, cv2.IMREAD_COLOR)[..., ::-1], _decoded(png, cv2.IMREAD_GRAYSCALE) > 0
+    return index, _jpeg(_marked(np.ascontiguousarray(rgb), tool))
+
+
+def _eye(clip: DepthClip, name: EyeName) -> Eye:
+    try:
+        return clip.eyes[EYES.index(name)]
+    except IndexError:
+        raise InputError("eye", f"this clip has no {name} eye.", "Ask for eye=left.") from None
+
+
+def _picture(eye: Eye, index: int) -> tuple[Picture, Mask]:
+    """A frame [h, w, 3] and where it shows instruments [h, w]."""
+    rgb, tool = eye.rgb[index].copy(), ~eye.tissue[index]
+    let_go(eye.rgb[index])
+    let_go(eye.tissue[index])
+    height, width = tool.shape
+    factor = -(-width // MAX_WIDTH)
+    if factor > 1:
+        size = width // factor, max(1, height // factor)
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        tool = cv2.resize(tool.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return rgb, tool
+
+
+def _marked(rgb: Picture, tool: Mask) -> Picture:
+    """The picture with the instruments marked; it writes on the given one."""
+    mark: NDArray[np.float32] = np.array(MARK, np.float32)
+    outline = cv2.morphologyEx(tool.view(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    rgb[tool] = (1 - MARK_SHARE) * rgb[tool] + MARK_SHARE * mark
+    rgb[outline] = mark
+    return rgb
+
+
+def _jpeg(rgb: Picture) -> bytes:
+    return cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+
+
+def _decoded(content: bytes, flags: int) -> Picture:
+    """A picture or a mask from a scene's file.
+
+    Raises:
+        SceneError: it is none.
+    """
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if picture is None:
+        raise SceneError("A recorded frame of this scene is damaged.")
+    return np.asarray(picture, np.uint8)
+
+
+def _png(tool: Mask) -> bytes:
+    """255 on instruments, transparent elsewhere, 1 bit a pixel."""
+    png = cv2.imencode(".png", tool.view(np.uint8) * np.uint8(255), [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
+    return png[:AFTER_HEADER] + BLACK_IS_CLEAR + png[AFTER_HEADER:]

@@ -1,0 +1,176 @@
+"""Is the confidence layer the probability that a pixel is right, and does it rank the errors?
+
+    python -m lab.benchmarks.bm_confidence [--fit] [--csv docs/results/confidence.csv]
+
+Trains `fast` for a fixed number of iterations on small stereo clips of synthetic tissue, on both eyes, and compares
+views 10 and 15 degrees off the axis and the right eye's views with the truth. Prints the rank correlations of
+lab/evaluate/truth.py. With --csv it also writes the reliability diagram: a row a clip, kind of view and bin of
+confidence, and the same as PNG beside it.
+
+--fit finds the constants of intrasplat/quality/trust.py and intrasplat/view/confidence.py anew: a logistic regression on
+pixels of the clips FITTED_ON, trained on both eyes and on the left one alone. The other clips confirm it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.options import ReconstructionOptions
+from intrasplat.pipeline import reconstruct
+from intrasplat.quality import trust
+from intrasplat.scene.checkpoint import load_scene
+from intrasplat.scene.model import model_of
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.train.hooks import TrainingHooks
+from intrasplat.train.request import ReconstructionRequest
+from intrasplat.train.targets import TrainingFrames
+from intrasplat.view.camera import view_camera
+from intrasplat.view.confidence import LEAST_DISAGREEMENT, evidence, seen_from_endoscope
+from intrasplat.view.frame import render_frame
+from lab.evaluate.ranking import rank_scores, reliability
+from lab.evaluate.rows import commit, machine
+from lab.evaluate.sources import open_source, source_of
+from lab.evaluate.style import GREY, PANEL_INCHES, PNG_DPI, SETTINGS
+from lab.evaluate.truth import SceneCandidate, Truth, errors_of
+
+MOTIONS = ("still", "breathing", "pull", "cut")
+FITTED_ON = ("still", "cut")
+CLIP, ITERATIONS = "phantom:{}:160x128:24frames:stereo", 200
+PIXELS_FITTED = 20_000
+"""Of a clip, drawn by chance."""
+FIELDS = ("clip", "views", "low", "high", "pixels", "confidence", "depth_right", "colour_right", "right")
+LOOKS = dict(zip(MOTIONS, (("#0072B2", "o"), ("#E69F00", "^"), ("#009E73", "s"), ("#D55E00", "D")), strict=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A scene, the frames of the eyes it was trained on, and the truth."""
+
+    scene: TrainedScene
+    eyes: list[TrainingFrames]
+    truth: Truth
+
+
+def trained(motion: str, eyes: str) -> Trained:
+    opened = open_source(source_of(CLIP.format(motion)), "every8", TrainingHooks())
+    options = ReconstructionOptions(iterations=ITERATIONS, eyes=eyes)  # type: ignore[arg-type]  # pydantic checks it
+    with tempfile.TemporaryDirectory() as folder:
+        report = reconstruct(ReconstructionRequest(opened.clip, options), Path(folder), TrainingHooks())
+        scene = load_scene(Path(folder))
+    train = [i for i in range(report.frame_count) if i not in {*report.held_out, *report.repeated}]
+    assert opened.phantom is not None
+    truth = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
+    sides = zip(opened.clip.eyes, (0.0, 1.0) if eyes == "both" else (0.0,), strict=False)
+    return Trained(scene, [TrainingFrames(eye, train, scene.units_per_mm, side) for eye, side in sides], truth)
+
+
+def measured(motion: str) -> Iterator[dict[str, Any]]:
+    """Rows of the reliability diagram; prints the rank correlations."""
+    run = trained(motion, "both")
+    candidate = SceneCandidate(run.scene)
+    for views, expected in run.truth.expected.items():
+        errors = errors_of([candidate.view(each.frame, each.pose) for each in expected], expected)
+        scores = rank_scores(errors, "rank")
+        print(f"{motion:10} {views:9}", *(f"{name} {value:.2f}" for name, value in scores.items()), flush=True)
+        for each in reliability(errors):
+            yield {"clip": f"phantom-{motion}", "views": views, **dataclasses.asdict(each)}
+
+
+def evidence_of(run: Trained, rng: np.random.Generator) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Of some pixels that show what was seen: [P, 5] the numbers that confidence is made of, the last one 1, and
+    [P] whether the pixel is right. The two of the Gaussians are blended as logarithms.
+    """
+    scene, model = run.scene, model_of(run.scene)
+    found = trust.logarithms(trust.evidence(model, run.eyes))
+    numbers, rights = [], []
+    for expected in (each for views in run.truth.expected.values() for each in views):
+        t, k = expected.frame / scene.frame_count, scene.intrinsics
+        shown = render_frame(scene, t, expected.pose)
+        own_pose = scene.world_from_camera[expected.frame]
+        own, image = (model.render(view_camera(scene, t, pose, k), t).copy() for pose in (own_pose, expected.pose))
+        alpha = np.maximum(image[4], 1e-3)
+        blended = [model.blend_values(np.ascontiguousarray(each, np.float32)) / alpha for each in found]
+        known = seen_from_endoscope(own[:3], shown.depth_mm, (k, expected.pose), (k, own_pose))
+        seen = evidence(np.full_like(alpha, 0.5), image[:3], known)[1:]
+        depth_right = np.abs(shown.depth_mm - expected.depth_mm) < trust.RIGHT_DEPTH * expected.depth_mm
+        colour = np.abs(np.clip(image[:3], 0, 1).transpose(1, 2, 0) - expected.rgb).mean(-1)
+        judged = (shown.depth_mm > 0) & ~shown.unseen & (expected.depth_mm > 0)
+        numbers.append(np.stack([*blended, *seen, np.ones_like(alpha)], -1)[judged])
+        rights.append((depth_right & (colour < trust.RIGHT_COLOUR))[judged])
+    every, right = np.concatenate(numbers), np.concatenate(rights)
+    chosen = rng.permutation(len(every))[:PIXELS_FITTED]
+    return every[chosen], right[chosen]
+
+
+def logistic(numbers: NDArray[np.floating], right: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The weights of a logistic regression, by Newton's method."""
+    x, y, weights = numbers.astype(np.float64), right.astype(np.float64), np.zeros(numbers.shape[1])
+    for _ in range(12):
+        likely = 1 / (1 + np.exp(-(x @ weights)))
+        spread = (likely * (1 - likely) + 1e-6)[:, None]
+        weights += np.linalg.solve((x * spread).T @ x + 1e-3 * np.eye(x.shape[1]), x.T @ (y - likely))
+    return weights
+
+
+def fit() -> None:
+    """Print the constants. A trusted Gaussian is one that the endoscope's own view shows with usual texture."""
+    rng, parts = np.random.default_rng(0), []
+    for motion in FITTED_ON:
+        for eyes in ("both", "left"):
+            parts.append(evidence_of(trained(motion, eyes), rng))
+    numbers, right = (np.concatenate(each) for each in zip(*parts, strict=True))
+    weights = logistic(numbers, right)
+    view = float(weights[2] * np.log(LEAST_DISAGREEMENT) + weights[3] * np.median(numbers[:, 3]))
+    print("trust.WEIGHTS", np.round(weights[:2], 2), "trust.BIAS", round(float(weights[4]) + view, 1))
+    print("confidence.WEIGHTS", np.round([1, *weights[2:4]], 2), "confidence.BIAS", round(-view, 1))
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """The share of right pixels over confidence, a panel a kind of view and a line a clip."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(SETTINGS):
+        figure = Figure(figsize=(2 * PANEL_INCHES[0], PANEL_INCHES[1] * 1.15), layout="constrained")
+        for axis, views in zip(figure.subplots(1, 2), ("off-axis", "right"), strict=True):
+            axis.plot([0, 1], [0, 1], color=GREY, dashes=(4, 3), linewidth=1, label="as it says")
+            for motion, (colour, marker) in LOOKS.items():
+                bins = [row for row in rows if (row["clip"], row["views"]) == (f"phantom-{motion}", views)]
+                shown = [(row["confidence"], row["right"]) for row in bins if row["pixels"] >= 100]
+                axis.plot(*zip(*shown, strict=True), color=colour, marker=marker, markersize=4.5, label=motion)
+            axis.set(xlabel="confidence", ylabel="share of pixels that are right", xlim=(0, 1), ylim=(0, 1))
+            axis.set_title({"off-axis": "views 10 and 15 degrees off", "right": "the right eye"}[views])
+        figure.axes[0].legend(loc="upper left", fontsize=8)
+        figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--csv", type=Path)
+    options = parser.parse_args()
+    if options.fit:
+        fit()
+        return
+    rows = [row for motion in MOTIONS for row in measured(motion)]
+    if options.csv:
+        with options.csv.open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow([*FIELDS, "machine", "commit"])
+            for row in rows:
+                values = [f"{row[name]:.4g}" if isinstance(row[name], float) else row[name] for name in FIELDS]
+                writer.writerow([*("" if each == "nan" else each for each in values), machine(), commit()])
+        draw(rows, options.csv.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""A process that is told to end hears it, wherever the signal finds it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from intrasplat.machine.processes import heeding_signals
+
+PROGRAM = """
+import os, signal, sys, time
+from intrasplat.machine.processes import told_to_end
+end = told_to_end()
+with end._cond:  # as end.wait() does for a moment
+    os.kill(os.getpid(), int(sys.argv[1]))
+    time.sleep(0.05)
+end.wait()
+print("ended")
+"""
+
+
+@pytest.mark.parametrize("number", [2, 15])
+def test_a_signal_that_finds_the_main_thread_inside_the_event_is_heard_all_the_same(number: int) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(number)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    assert ended.stdout == "ended\n"
+
+
+def test_after_the_with_statement_signals_do_what_they_did_before() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with heeding_signals() as end:
+        signal.raise_signal(signal.SIGTERM)
+        assert end.wait(10)
+    assert signal.getsignal(signal.SIGTERM) is before

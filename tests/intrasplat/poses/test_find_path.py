@@ -1,0 +1,163 @@
+"""Paths of phantoms' endoscopes, found from the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from intrasplat.clip import DepthClip, training_frames
+from intrasplat.errors import InputError
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.timing import Timings
+from intrasplat.notices import NoticeCode
+from intrasplat.options import ReconstructionOptions
+from intrasplat.poses import camera_rests, with_poses
+from intrasplat.poses.estimate import find_path
+from intrasplat.poses.rigid import Reals
+from intrasplat.poses.trajectory import trajectory_error
+from intrasplat.stereo import match_eyes
+from lab.phantom import CameraPath, Motion, PhantomSettings, make_phantom
+
+FRAMES = 24
+
+
+@cache
+def clip_of(motion: Motion, *camera: CameraPath, period_frames: float = 12.0) -> tuple[DepthClip, Reals]:
+    """A stereo clip without poses, and the true ones. Callers share the arrays."""
+    settings = PhantomSettings(
+        width=160,
+        height=128,
+        frames=FRAMES,
+        motion=motion,
+        tools=(),
+        camera=camera,
+        period_frames=period_frames,
+        frame_rate_hz=10.0,
+    )
+    phantom = make_phantom(settings)
+    drawn = phantom.stereo_recording()
+    clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
+    return clip, np.stack([phantom.world_from_camera(i) for i in range(FRAMES)])
+
+
+def posed(clip: DepthClip, poses: str = "auto") -> DepthClip:
+    return with_poses(clip, ReconstructionOptions.model_validate({"poses": poses}), Hooks(), Timings())
+
+
+def test_a_camera_over_still_tissue_is_found() -> None:
+    clip, true = clip_of("still", "turn")
+    found = posed(clip)
+    error = trajectory_error(found.world_from_camera, true)
+    assert error.mm < 1.3  # a pixel is 0.6 mm
+    assert error.deg < 0.6
+    assert found.poses is not None
+    assert found.poses.source == "estimated"
+    assert found.poses.extent_deg == pytest.approx(np.degrees(np.arccos((np.trace(true[-1, :3, :3]) - 1) / 2)), abs=0.5)
+    assert found.right is not None
+    assert clip.right is not None
+    between = np.linalg.inv(found.world_from_camera) @ found.right.world_from_camera
+    assert between == pytest.approx(clip.right.world_from_camera, abs=1e-9)
+    assert found.rgb is clip.rgb
+
+
+def test_held_out_frames_change_no_other_pose() -> None:
+    clip, _ = clip_of("still", "turn")
+    train = training_frames(FRAMES, "every8")
+    spoilt = clip.rgb.copy()
+    held_out = sorted(set(range(FRAMES)) - set(train))
+    spoilt[held_out] = 255 - spoilt[held_out]
+    one, two = (find_path(each, train) for each in (clip, replace(clip, rgb=spoilt)))
+    assert (one.world_from_camera[train] == two.world_from_camera[train]).all()
+    assert one.period_frames == two.period_frames
+
+
+def test_a_fixed_camera_leaves_the_clip_as_it_is() -> None:
+    clip, _ = clip_of("still")
+    assert camera_rests(clip, training_frames(FRAMES, "every8"))
+    found = posed(clip)
+    assert found.poses is not None
+    assert found.poses.source == "fixed"
+    assert found.world_from_camera is clip.world_from_camera
+    assert found.right is clip.right
+    assert found.depth_mm is clip.depth_mm
+
+
+def test_tissue_that_breathes_is_not_taken_for_a_camera() -> None:
+    clip, _ = clip_of("breathing")
+    assert not camera_rests(clip, training_frames(FRAMES, "every8"))
+    found = posed(clip)
+    assert found.poses is not None
+    assert found.poses.source == "fixed"
+    assert found.poses.tissue_mm is not None
+    assert found.poses.tissue_mm > 1
+    assert found.world_from_camera is clip.world_from_camera
+
+
+def test_a_camera_that_cannot_be_followed_is_told() -> None:
+    clip, _ = clip_of("still", "turn")
+    random = np.random.default_rng(0)
+    found = posed(replace(clip, rgb=random.integers(0, 255, clip.rgb.shape, np.uint8)))
+    assert found.poses is not None
+    assert found.poses.source == "fixed"
+    assert NoticeCode.POSES_UNSURE in [each.code for each in found.warnings]
+
+
+def test_a_fast_pan_is_followed() -> None:
+    clip, true = clip_of("still", "pan")
+    path = find_path(clip, training_frames(FRAMES, "every8"))
+    error = trajectory_error(path.world_from_camera, true)
+    assert error.mm < 1.5  # of 127 mm in a second; frames share half of their view with the next but one
+    assert error.deg < 1
+
+
+@pytest.mark.parametrize("camera", ["advance", "turn", "shake"])
+def test_less_than_a_breath_tells_no_camera_from_tissue_and_says_so(camera: CameraPath) -> None:
+    clip, true = clip_of("breathing", camera, period_frames=36.0)
+    train = training_frames(FRAMES, "every8")
+    path = find_path(clip, train)
+    error = trajectory_error(path.world_from_camera[train], true[train])
+    assert error.mm > 1.5
+    assert path.sigma_mm > error.mm / 2
+    assert path.confused
+    assert NoticeCode.CAMERA_OR_TISSUE in [each.code for each in posed(clip).warnings]
+
+
+def test_frames_that_show_nothing_of_the_others_are_told() -> None:
+    clip, _ = clip_of("still", "turn")
+    random = np.random.default_rng(0)
+    rgb = clip.rgb.copy()
+    rgb[10] = random.integers(0, 255, rgb[10].shape, np.uint8)
+    path = find_path(replace(clip, rgb=rgb), training_frames(FRAMES, "every8"))
+    assert path.unsure == (10,)
+    assert not path.confused
+
+
+@pytest.mark.parametrize("camera", [(), ("turn",)])
+def test_a_camera_that_must_be_fixed_is_told_if_the_picture_moves(camera: tuple[CameraPath, ...]) -> None:
+    clip, _ = clip_of("still", *camera)
+    fixed = posed(clip, "fixed")
+    assert fixed.world_from_camera is clip.world_from_camera
+    (notice,) = (each for each in fixed.assumptions if each.code is NoticeCode.POSES)
+    assert ("though most of the picture moves" in notice.text) is bool(camera)
+
+
+def test_poses_that_are_not_there_cannot_be_asked_for() -> None:
+    clip, _ = clip_of("still")
+    with pytest.raises(InputError) as caught:
+        posed(clip, "given")
+    assert caught.value.field == "options.poses"
+
+
+def test_a_clip_with_poses_keeps_them_unless_others_are_asked_for() -> None:
+    phantom = make_phantom(PhantomSettings(width=96, height=80, frames=3, camera=("swing",)))
+    clip = phantom.depth_clip()
+    given = posed(clip)
+    assert given.poses is not None
+    assert given.poses.source == "given"
+    assert given.world_from_camera is clip.world_from_camera
+    assert posed(given, "fixed") is given
+    fixed = posed(clip, "fixed")
+    assert (fixed.world_from_camera == np.eye(4)).all()

@@ -1,0 +1,84 @@
+"""Poses that come with a clip: kept where they are good, steadied where they jump to and fro, and told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.timing import Timings
+from intrasplat.notices import NoticeCode
+from intrasplat.options import Poses, ReconstructionOptions
+from intrasplat.poses import with_poses
+from intrasplat.poses.trajectory import trajectory_error
+from intrasplat.scene.scene import POSE_DOUBTS
+from lab.conditions.clean import clean_of
+from lab.conditions.scenes import noisy
+from lab.evaluate.sources import open_source, source_of
+from lab.phantom import PhantomSettings, make_phantom
+from lab.phantom.scene import Phantom
+
+
+def brought(path: str, noise_mm: float) -> tuple[DepthClip, DepthClip]:
+    """A clip with depth and its true poses, and the same with poses that err."""
+    clip = open_source(source_of(f"phantom:breathing+{path}:96x80:32frames"), "none", Hooks()).clip
+    poses = noisy(clip.world_from_camera, noise_mm, np.random.default_rng(1))
+    return clip, replace(clip, world_from_camera=poses)
+
+
+def posed(clip: DepthClip, poses: Poses = "auto") -> DepthClip:
+    return with_poses(clip, ReconstructionOptions(poses=poses, holdout="none"), Hooks(), Timings())
+
+
+@pytest.mark.parametrize("path", ["swing", "turn", "shake"])
+def test_smooth_and_shaken_poses_stay_as_they_were_given(path: str) -> None:
+    clip, _ = brought(path, 0.0)
+    result = posed(clip)
+    np.testing.assert_array_equal(result.world_from_camera, clip.world_from_camera)
+    assert result.poses is not None
+    assert result.poses.source == "given"
+    assert result.poses.steadied_mm is None
+    assert result.warnings == clip.warnings
+    assert result.assumptions == clip.assumptions
+
+
+@pytest.mark.parametrize("path", ["swing", "roll"])
+def test_poses_that_jump_are_refined_to_half_of_their_noise_and_the_rest_is_told(path: str) -> None:
+    clip, given = brought(path, 1.0)
+    result = posed(given)
+    before, after = (trajectory_error(each.world_from_camera, clip.world_from_camera) for each in (given, result))
+    assert after.mm < 0.5 * before.mm
+    assert after.deg < 0.5 * before.deg
+    assert result.poses is not None
+    assert result.poses.steadied_mm == pytest.approx(1.0 * np.sqrt(5), rel=0.3)
+    assert [notice.code for notice in result.warnings] == [NoticeCode.POSE_JITTER]
+    assert [notice.code for notice in result.assumptions if notice not in clip.assumptions] == [NoticeCode.POSES]
+
+
+def test_poses_that_must_be_given_stay_as_they_are_and_their_jumps_are_told() -> None:
+    _, given = brought("swing", 1.0)
+    result = posed(given, "given")
+    np.testing.assert_array_equal(result.world_from_camera, given.world_from_camera)
+    assert [notice.code for notice in result.warnings if notice not in given.warnings] == [NoticeCode.POSE_JITTER]
+    assert NoticeCode.POSE_JITTER in POSE_DOUBTS  # so every view repeats it
+
+
+@dataclass(frozen=True)
+class JumpingPhantom(Phantom):
+    """A phantom whose endoscope itself jumps to and fro from frame to frame."""
+
+    def world_from_camera(self, frame: float) -> NDArray[np.float64]:
+        still = np.tile(np.eye(4), (self.settings.frames, 1, 1))
+        return noisy(still, 0.7, np.random.default_rng(1))[round(frame)]
+
+
+def test_jumps_that_the_pictures_show_are_the_cameras() -> None:
+    made = make_phantom(PhantomSettings(width=96, height=80, frames=32, motion="breathing"))
+    jumping = JumpingPhantom(**{each.name: getattr(made, each.name) for each in fields(made)})
+    clip = clean_of(jumping).clip
+    result = posed(clip)
+    np.testing.assert_array_equal(result.world_from_camera, clip.world_from_camera)

@@ -1,0 +1,45 @@
+"""A picture of fewer pixels and Gaussians shows what the whole one does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from intrasplat.outcome import snapshot_of
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.metrics import psnr_tissue
+from intrasplat.view.coarse import LEVELS, thinned
+from intrasplat.view.frame import render_frame
+from tests.intrasplat.phantoms import phantom_clip, prepared, trained
+
+
+@pytest.fixture(scope="module")
+def scene() -> TrainedScene:
+    run, _ = prepared(phantom_clip(width=192, height=160), iterations=30)
+    return snapshot_of(trained(run), as_it_lies=True)
+
+
+@pytest.mark.parametrize(("level", "least_db"), [(1, 26.0), (2, 22.0)])
+def test_a_coarse_picture_resembles_the_whole_one_and_leaves_no_gaps(
+    scene: TrainedScene, level: int, least_db: float
+) -> None:
+    detail, clip = LEVELS[level], scene.intrinsics
+    whole = render_frame(scene, 0.4)
+    camera = clip.resized(clip.width // detail.pixels, clip.height // detail.pixels)
+    coarse = render_frame(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True).enlarged(
+        clip.width, clip.height
+    )
+    solid = whole.depth_mm > 0
+    assert psnr_tissue(coarse.rgb, whole.rgb, solid) > least_db
+    assert (coarse.depth_mm[solid] > 0).mean() > 0.98
+
+
+def test_a_thinned_scene_is_made_once_and_moves_as_all_do(scene: TrainedScene) -> None:
+    few = thinned(scene, 4)
+    assert thinned(scene, 4) is few
+    assert thinned(scene, 1) is scene
+    assert len(few.gaussians) == -(-len(scene.gaussians) // 4)
+    moved, all_moved = (each.deformation.deform(each.gaussians, 0.7) for each in (few, scene))
+    torch.testing.assert_close(moved.mean, all_moved.mean[::4])
+    assert np.all(few.gaussians.log_scale.numpy() > scene.gaussians.log_scale[::4].numpy())

@@ -1,0 +1,313 @@
+"""Renders of a scene: held within the clip, honest about what was never seen, the same from disk as from memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from intrasplat.camera import Intrinsics
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.outcome import scene_of, snapshot_of
+from intrasplat.scene.checkpoint import load_scene, save_scene
+from intrasplat.scene.scene import POSE_DOUBTS, TrainedScene
+from intrasplat.splat.metrics import psnr_tissue
+from intrasplat.train.presets import PRESETS
+from intrasplat.train.run import Run
+from intrasplat.view.camera import endoscope_pose
+from intrasplat.view.frame import FAR_POSE, judged_camera, render_frame, renderer_of
+from lab.phantom import orbit_pose
+from tests.helpers import assert_close
+from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
+from tests.intrasplat.scenes import random_scene
+
+LAST = (FRAMES - 1) / FRAMES
+
+
+def made(preset: str = "fast", *, moving_camera: bool = False, iterations: int = 20) -> tuple[Run, TrainedScene]:
+    clip = phantom_clip(moving_camera=moving_camera)
+    run, _ = prepared(clip, preset, iterations=iterations)
+    trained(run)
+    return run, scene_of(run)
+
+
+@pytest.fixture(scope="module")
+def scene() -> TrainedScene:
+    return made()[1]
+
+
+def shifted(right_mm: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    pose = np.eye(4)
+    pose[0, 3] = right_mm
+    return pose
+
+
+@pytest.mark.parametrize("t", [-0.5, 1.0, 1e6])
+def test_a_time_outside_the_clip_shows_its_first_or_last_frame_and_warns(scene: TrainedScene, t: float) -> None:
+    frame = render_frame(scene, t)
+    np.testing.assert_array_equal(frame.rgb, render_frame(scene, 0.0 if t < 0 else LAST).rgb)
+    assert any("outside the clip" in warning.text for warning in frame.warnings)
+
+
+def test_the_endoscopes_own_view_needs_no_warning(scene: TrainedScene) -> None:
+    assert render_frame(scene, 0.4).warnings == ()
+
+
+def test_every_view_repeats_that_the_clips_poses_are_in_doubt(tmp_path: Path) -> None:
+    doubts = tuple(Notice.warning(code, f"{code} is so.") for code in sorted(POSE_DOUBTS))
+    other = Notice.warning(NoticeCode.BLOOD, "It is red.")
+    clip = dataclasses.replace(phantom_clip(), warnings=(other, *doubts))
+    run, _ = prepared(clip, "fast", iterations=2)
+    trained(run)
+    save_scene(tmp_path / "scene", scene_of(run))
+    assert snapshot_of(run).pose_warnings == doubts
+    assert load_scene(tmp_path / "scene").pose_warnings == doubts
+    beside = render_frame(load_scene(tmp_path / "scene"), 0.4, orbit_pose(3, 0)).warnings
+    assert [each for each in beside if each.code in POSE_DOUBTS] == list(doubts)
+    assert other not in beside
+
+
+@pytest.mark.parametrize(("trust", "warns"), [(0.5, False), (0.05, True)])
+def test_tissue_that_is_hardly_trusted_is_a_reason_to_warn(scene: TrainedScene, trust: float, warns: bool) -> None:
+    frame = render_frame(dataclasses.replace(scene, seen=torch.full_like(scene.seen, trust)), 0.4)
+    assert [warning.code for warning in frame.warnings] == [NoticeCode.HARDLY_SEEN] * warns
+
+
+@pytest.mark.parametrize("size", [(97, 81), (33, 17), (8, 8), (200, 150)])
+def test_every_layer_has_the_asked_size(scene: TrainedScene, size: tuple[int, int]) -> None:
+    width, height = size
+    frame = render_frame(scene, 0.3, None, scene.intrinsics.resized(width, height))
+    assert (frame.rgb.shape, frame.rgb.dtype.name) == ((height, width, 3), "uint8")
+    for layer in (frame.depth_mm, frame.confidence):
+        assert (layer.shape, layer.dtype.name) == ((height, width), "float32")
+    assert frame.confidence.min() >= 0
+    assert frame.confidence.max() <= 1
+    assert np.isfinite(frame.depth_mm).all()
+    solid = frame.depth_mm > 0
+    assert solid.mean() > 0.9
+    assert not frame.confidence[~solid].any()
+
+
+@pytest.fixture(scope="module")
+def doubted(scene: TrainedScene) -> TrainedScene:
+    """Of its Gaussians, no frame saw those at the left, and those at the right were hardly seen."""
+    column = scene.gaussians.mean[:, 0]
+    seen = torch.where(column < -15, torch.tensor(0.0), torch.where(column > 0, torch.tensor(0.05), scene.seen))
+    return dataclasses.replace(scene, seen=seen)
+
+
+@pytest.mark.parametrize("scale", [0.15, 0.25, 0.5, 0.75, 1.5, 2, 4])
+@pytest.mark.parametrize("orbit", [None, (10, -5)])
+def test_a_view_is_trusted_alike_in_pictures_of_every_size(
+    doubted: TrainedScene, orbit: tuple[float, float] | None, scale: float
+) -> None:
+    pose, camera = None if orbit is None else orbit_pose(*orbit), doubted.intrinsics
+    own = render_frame(doubted, 0.5, pose)
+    other = render_frame(doubted, 0.5, pose, camera.resized(round(scale * WIDTH), round(scale * HEIGHT)))
+    assert {NoticeCode.UNSEEN, NoticeCode.HARDLY_SEEN} <= {each.code for each in own.warnings}
+    assert [each.code for each in other.warnings] == [each.code for each in own.warnings]
+    assert other.unseen_share == pytest.approx(own.unseen_share, abs=0 if scale < 1 else 0.004)
+    assert other.unseen.mean() == pytest.approx(own.unseen_share, abs=0.03 if scale < 0.5 else 0.015)
+    assert other.confidence.mean() == pytest.approx(own.confidence.mean(), abs=0.01)
+    assert not other.confidence[other.depth_mm == 0].any()
+
+
+def test_a_part_of_the_view_is_trusted_as_the_whole_view_is(doubted: TrainedScene) -> None:
+    camera, whole = doubted.intrinsics, render_frame(doubted, 0.5, orbit_pose(10, -5))
+    part = camera.resized(2 * WIDTH, 2 * HEIGHT).cut(WIDTH, HEIGHT // 2, WIDTH // 2, HEIGHT)
+    shown = render_frame(doubted, 0.5, orbit_pose(10, -5), part)
+    rows, columns = slice(HEIGHT // 4, 3 * HEIGHT // 4), slice(WIDTH // 2, 3 * WIDTH // 4)
+    assert shown.confidence.mean() == pytest.approx(whole.confidence[rows, columns].mean(), abs=0.02)
+
+
+def test_a_smaller_picture_is_as_bright_as_the_recording_and_its_depth_is_a_mean(scene: TrainedScene) -> None:
+    own = render_frame(scene, 0.5)
+    small = render_frame(scene, 0.5, None, scene.intrinsics.resized(WIDTH // 4, HEIGHT // 4))
+    blocks = (HEIGHT // 4, 4, WIDTH // 4, 4)
+    assert np.abs(own.rgb.reshape(*blocks, 3).mean((1, 3)) - small.rgb).max() <= 1
+    solid = (own.depth_mm > 0).reshape(blocks).all((1, 3))
+    assert solid.mean() > 0.9
+    assert_close(small.depth_mm[solid], own.depth_mm.reshape(blocks).mean((1, 3))[solid], relative=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("clip", "asked", "judged"),
+    [
+        ((640, 512), (160, 128), (640, 512)),
+        ((640, 512), (1920, 1536), (640, 512)),
+        ((3840, 2160), (160, 90), (1930, 1086)),
+        ((3840, 2160), (2880, 1620), (2880, 1620)),
+        ((3840, 2160), (2461, 1384), (2461, 1384)),
+    ],
+)
+def test_a_view_is_judged_in_the_recordings_pixels_as_far_as_they_are_not_too_many(
+    clip: tuple[int, int], asked: tuple[int, int], judged: tuple[int, int]
+) -> None:
+    own = Intrinsics(width=clip[0], height=clip[1], fx=500.3, fy=501.0, cx=300.0, cy=250.0)
+    found = judged_camera(own.resized(*asked), own)
+    assert (found.width, found.height) == judged
+    wide = dataclasses.replace(own, fx=own.fx / 100, fy=own.fy / 100)
+    assert judged_camera(wide, own).width * judged_camera(wide, own).height <= max(1 << 21, clip[0] * clip[1])
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("orbit", [None, (10, -5)])
+def test_a_larger_picture_is_the_recordings_one_between_its_pixels_too(
+    scene: TrainedScene, orbit: tuple[float, float] | None, scale: int
+) -> None:
+    pose = None if orbit is None else orbit_pose(*orbit)
+    own = render_frame(scene, 0.5, pose)
+    large = render_frame(scene, 0.5, pose, scene.intrinsics.resized(scale * WIDTH, scale * HEIGHT))
+    averaged = large.rgb.reshape(HEIGHT, scale, WIDTH, scale, 3).mean((1, 3))
+    assert 10 * np.log10(255**2 / np.square(averaged - own.rgb).mean()) > 42  # 33 dB where needles come out
+    assert abs(averaged.mean() - own.rgb.mean()) < 0.5
+    assert large.unseen_share == pytest.approx(own.unseen_share, abs=0.005)
+
+
+def test_another_camera_looks_at_the_same_tissue(scene: TrainedScene) -> None:
+    camera = scene.intrinsics
+    right_half = Intrinsics(
+        width=WIDTH // 2, height=HEIGHT, fx=camera.fx, fy=camera.fy, cx=camera.cx - WIDTH // 2, cy=camera.cy
+    )
+    whole, half = render_frame(scene, 0.5), render_frame(scene, 0.5, None, right_half)
+    assert_close(half.rgb, whole.rgb[:, WIDTH // 2 :], absolute=1, relative=0)
+    assert_close(half.depth_mm, whole.depth_mm[:, WIDTH // 2 :], relative=1e-4)
+
+
+def test_depth_is_in_mm(scene: TrainedScene) -> None:
+    clip = phantom_clip()
+    for index in (1, 9):  # held out
+        tissue = clip.tissue[index]
+        error_mm = np.abs(render_frame(scene, float(clip.t[index])).depth_mm - clip.depth_mm[index])[tissue]
+        assert np.median(error_mm) < 2
+
+
+def test_confidence_falls_with_the_distance_from_the_endoscope(scene: TrainedScene) -> None:
+    depth_mm = 60 / scene.units_per_mm
+    means = [render_frame(scene, 0.5, shifted(share * depth_mm)).confidence for share in (0, 0.1, 0.2, 0.3, 0.6)]
+    levels = [float(np.median(each[each > 0])) for each in means]
+    assert levels == sorted(levels, reverse=True)
+    assert levels[0] > 0.5
+    assert levels[-1] < levels[0] / 2  # 30 degrees aside
+
+
+def test_a_pose_far_from_the_endoscope_warns(scene: TrainedScene) -> None:
+    depth_mm = 60 / scene.units_per_mm
+    near = render_frame(scene, 0.5, shifted(0.5 * FAR_POSE * depth_mm))
+    far = render_frame(scene, 0.5, shifted(1.1 * FAR_POSE * depth_mm))
+    assert not any("most of it is a guess" in warning.text for warning in near.warnings)
+    assert any("most of it is a guess" in warning.text for warning in far.warnings)
+
+
+def test_a_view_of_nothing_is_empty_and_says_so(scene: TrainedScene) -> None:
+    away = np.eye(4)
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0])  # turned about
+    frame = render_frame(scene, 0.5, away)
+    assert not frame.depth_mm.any()
+    assert not frame.confidence.any()
+    assert frame.unseen.all()
+    assert NoticeCode.UNSEEN in [warning.code for warning in frame.warnings]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_stored_scene_renders_as_the_model_did(preset: str, tmp_path: Path) -> None:
+    run, scene = made(preset)
+    save_scene(tmp_path, scene)
+    stored = load_scene(tmp_path)
+    for index in (0, 5, 11):
+        shown = view(run, index)
+        frame = render_frame(stored, index / FRAMES)
+        assert np.abs(np.clip(shown.rgb, 0, 1) * 255 - frame.rgb).max() <= 1
+        assert_close(frame.depth_mm, shown.depth_mm, relative=1e-4)
+
+
+def test_sizes_come_and_go_without_changing_a_picture(scene: TrainedScene) -> None:
+    first = render_frame(scene, 0.2).rgb
+    for width in range(40, 48):
+        render_frame(scene, 0.7, None, scene.intrinsics.resized(width, 30))
+    np.testing.assert_array_equal(render_frame(scene, 0.2).rgb, first)
+
+
+def test_a_view_of_the_same_size_in_a_pause_changes_nothing(scene: TrainedScene) -> None:
+    renderer, camera = renderer_of(scene), scene.intrinsics.resized(1100, 1000)
+    poses = [orbit_pose(yaw_deg, 0.0) for yaw_deg in (0.0, 10.0)]
+    alone = [renderer.layers(0.5, pose, camera)[0] for pose in poses]
+    in_pauses: list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]] = []
+    shown, _ = renderer.layers(
+        0.5, poses[0], camera, pause=lambda: in_pauses.append(renderer.layers(0.5, poses[1], camera)[0])
+    )
+    np.testing.assert_array_equal(shown, alone[0])
+    assert len(in_pauses) > 3
+    for each in in_pauses:
+        np.testing.assert_array_equal(each, alone[1])
+
+
+def test_a_scene_that_is_dropped_takes_its_renderer_along() -> None:
+    scene = random_scene()
+    render_frame(scene, 0.0)
+    alive = weakref.ref(scene)
+    del scene
+    gc.collect()
+    assert alive() is None
+
+
+def test_a_moving_camera_is_followed() -> None:
+    clip = phantom_clip(moving_camera=True)
+    _, scene = made(moving_camera=True, iterations=60)
+    assert not np.array_equal(clip.world_from_camera[9], np.eye(4))
+    held_out = 9
+    t = float(clip.t[held_out])
+    assert_close(endoscope_pose(scene, t), clip.world_from_camera[held_out])
+    own, standing = (render_frame(scene, t, pose).rgb / np.float32(255) for pose in (None, np.eye(4)))
+    own_db, standing_db = (psnr_tissue(each, clip.rgb[held_out], clip.tissue[held_out]) for each in (own, standing))
+    assert own_db > max(standing_db + 1, 22)
+
+
+def test_between_frames_the_endoscope_is_half_way() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[2] = orbit_pose(20, 0)
+    poses[2, :3, 3] = [4.0, 2.0, 0.0]
+    scene = dataclasses.replace(random_scene(), world_from_camera=poses, frame_times_s=np.arange(4) / 30)
+    half = endoscope_pose(scene, 1.5 / 4)
+    assert_close(half[:3, 3], np.array([2.0, 1.0, 0.0]))
+    turned = Rotation.from_matrix(half[:3, :3]).magnitude()
+    assert turned == pytest.approx(Rotation.from_matrix(poses[2, :3, :3]).magnitude() / 2)
+    for frame in range(4):
+        assert_close(endoscope_pose(scene, frame / 4), poses[frame])
+    assert_close(endoscope_pose(scene, 5.0), poses[3])
+    assert_close(endoscope_pose(scene, -5.0), poses[0])
+
+
+def test_a_scene_of_one_frame_stands_still() -> None:
+    scene = dataclasses.replace(
+        random_scene(), world_from_camera=np.eye(4)[None], frame_times_s=np.zeros(1), trained_t=(0.0,)
+    )
+    assert_close(endoscope_pose(scene, 0.7), np.eye(4))
+    assert render_frame(scene, 0.7).rgb.shape == (48, 64, 3)
+
+
+def test_the_range_of_false_colours_holds_nearly_all_depths_of_the_clip_and_moves_with_the_camera(
+    scene: TrainedScene,
+) -> None:
+    found = renderer_of(scene).depth_range
+    near_mm, far_mm = found.before(None)
+    for t in (0.0, 0.4, LAST):
+        depth_mm = render_frame(scene, t).depth_mm
+        assert ((near_mm <= depth_mm) & (depth_mm <= far_mm))[depth_mm > 0].mean() > 0.9
+    assert found.before(shifted(5.0)) == (near_mm, far_mm)
+    nearer = np.eye(4)
+    nearer[2, 3] = 10.0
+    assert found.before(nearer) == (near_mm - 10, far_mm - 10)
+
+
+def test_the_range_of_false_colours_has_a_width_where_nothing_is_in_view() -> None:
+    scene = random_scene()
+    scene.gaussians.mean[:, 2] = -60.0
+    near_mm, far_mm = renderer_of(scene).depth_range.before(None)
+    assert near_mm < far_mm

@@ -1,0 +1,183 @@
+"""The conditions of the stability atlas do what their table says, the same each time, and keep the truth."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip
+from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
+from lab.phantom import PhantomSettings
+
+CLEAN_FRAMES = 12
+OF_THE_SAME_CLIP = [name for name in CONDITIONS if not name.startswith(("tiny", "large", "cutting", "fast_pull"))]
+SLOW = ("large", "tiny")  # a phantom of its own for each severity
+
+
+@cache
+def clean() -> CleanClip:
+    return clean_clip(PhantomSettings(width=96, height=80, frames=CLEAN_FRAMES))
+
+
+def spoilt_anew(name: str, severity: int) -> Given:
+    return CONDITIONS[name].apply(clean(), severity, 0)
+
+
+@cache
+def spoilt(name: str, severity: int) -> Given:
+    """The same, shared by the tests: some conditions draw a phantom of their own."""
+    return spoilt_anew(name, severity)
+
+
+def clip_of(given: Given) -> DepthClip:
+    assert isinstance(given.clip, DepthClip)
+    return given.clip
+
+
+def pictures(given: Given) -> NDArray[np.uint8]:
+    """All the frames, or of a recording the first pair."""
+    if isinstance(given.clip, DepthClip):
+        return given.clip.rgb
+    frame = given.clip.frame(0)
+    return np.stack([frame.left, frame.right])
+
+
+@pytest.mark.parametrize("name", [name for name in CONDITIONS if name not in SLOW])
+def test_the_same_severity_and_seed_give_the_same_clip_and_leave_the_clean_one_alone(name: str) -> None:
+    before = clean().clip.rgb.copy(), clean().clip.depth_mm.copy(), clean().clip.tissue.copy()
+    first, again = spoilt_anew(name, 3), spoilt(name, 3)
+    np.testing.assert_array_equal(pictures(first), pictures(again))
+    if isinstance(first.clip, DepthClip):
+        np.testing.assert_array_equal(clip_of(first).depth_mm, clip_of(again).depth_mm)
+        np.testing.assert_array_equal(clip_of(first).world_from_camera, clip_of(again).world_from_camera)
+    for value, kept in zip((clean().clip.rgb, clean().clip.depth_mm, clean().clip.tissue), before, strict=True):
+        np.testing.assert_array_equal(value, kept)
+
+
+@pytest.mark.parametrize("name", [name for name in CONDITIONS if name not in SLOW])
+def test_what_is_given_fits_its_truth(name: str) -> None:
+    given = spoilt(name, 5)
+    height, width = given.depth_mm.shape[1:]
+    assert given.rgb.shape == (CLEAN_FRAMES, height, width, 3)
+    assert given.scored.shape == (CLEAN_FRAMES, height, width)
+    assert given.scored.any(axis=(1, 2)).all()
+    assert (given.depth_mm[given.scored] > 0).all()
+    assert max(given.source) < CLEAN_FRAMES
+    if isinstance(given.clip, DepthClip):
+        assert len(given.source) == given.clip.frame_count
+        assert given.clip.rgb.shape[1:3] == (height, width)
+        assert given.clip.rgb.dtype == np.uint8
+        assert given.clip.depth_mm.dtype == np.float32
+
+
+def test_every_condition_has_five_levels_that_grow_worse_in_order() -> None:
+    for condition in CONDITIONS.values():
+        assert len(condition.levels) == len(SEVERITIES)
+        assert list(condition.levels) in (sorted(condition.levels), sorted(condition.levels, reverse=True))
+
+
+@pytest.mark.parametrize("name", ["smoke", "blood", "defocus", "motion_blur", "exposure_drift", "white_balance"])
+def test_a_higher_severity_is_farther_from_the_clean_pictures(name: str) -> None:
+    distances = [
+        float(np.abs(clip_of(spoilt(name, severity)).rgb.astype(float) - clean().clip.rgb).mean())
+        for severity in SEVERITIES
+    ]
+    assert distances == sorted(distances)
+    assert distances[0] > 0
+
+
+@pytest.mark.parametrize("severity", SEVERITIES)
+def test_shares_are_what_the_table_says(severity: int) -> None:
+    def level(name: str) -> float:
+        return CONDITIONS[name].levels[severity - 1]
+
+    pixels = clean().clip.tissue.size
+    covered = (clip_of(spoilt("tools", severity)).depth_mm == 45).sum() / pixels
+    assert covered == pytest.approx(level("tools"), abs=0.01)
+    holes = (clip_of(spoilt("depth_holes", severity)).depth_mm == 0).mean()
+    assert holes == pytest.approx(level("depth_holes"), abs=0.02)
+    ratio = clip_of(spoilt("depth_outliers", severity)).depth_mm / clean().clip.depth_mm
+    assert (ratio != 1).mean() == pytest.approx(level("depth_outliers"), abs=0.02)
+    border = (clip_of(spoilt("black_border", severity)).rgb.sum(axis=-1) == 0).mean()
+    assert border == pytest.approx(level("black_border"), abs=0.02)
+    unmasked = clip_of(spoilt("masks_missing", severity)).tissue.all(axis=(1, 2)).mean()
+    assert unmasked == pytest.approx(level("masks_missing"), abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["fast_pull", "cutting"])
+def test_a_motion_of_its_own_is_compared_with_itself_when_it_is_calm(name: str) -> None:
+    def way(severity: int) -> float:
+        return float(np.abs(np.diff(spoilt(name, severity).depth_mm, axis=0)).mean())
+
+    assert way(0) < way(1) < way(5)
+    assert CONDITIONS[name].clean_name == name
+
+
+def test_depth_noise_has_the_deviation_of_its_level() -> None:
+    error = clip_of(spoilt("depth_noise", 3)).depth_mm / clean().clip.depth_mm - 1
+    assert error.std() == pytest.approx(0.05, rel=0.05)
+
+
+def test_frames_that_are_lost_or_few_say_where_they_come_from() -> None:
+    for name in ("few_frames", "dropped_frames"):
+        given = spoilt(name, 3)
+        assert list(given.source) == sorted(set(given.source))
+        np.testing.assert_array_equal(clip_of(given).rgb, clean().clip.rgb[list(given.source)])
+    assert clip_of(spoilt("few_frames", 5)).frame_count == 1
+
+
+def test_repeated_frames_are_judged_by_what_should_have_been_there() -> None:
+    given = spoilt("duplicated_frames", 4)
+    assert given.source == tuple(range(CLEAN_FRAMES))
+    repeats = [np.array_equal(*pair) for pair in zip(clip_of(given).rgb[1:], clip_of(given).rgb[:-1], strict=True)]
+    assert sum(repeats) == round(0.55 * CLEAN_FRAMES)
+
+
+def test_grey_and_flooded_pictures_are_judged_against_grey_and_flooded_tissue() -> None:
+    grey = spoilt("grey_scale", 5)
+    assert np.ptp(grey.rgb, axis=-1).max() < 1e-6
+    flooded = spoilt("blood", 5)
+    assert flooded.rgb[-1, -1].mean(axis=0)[0] > 3 * flooded.rgb[-1, -1].mean(axis=0)[1]
+    np.testing.assert_array_equal(spoilt("smoke", 5).rgb, clean().rgb)
+
+
+def test_wrong_poses_are_right_in_the_first_frame_and_the_pictures_show_the_right_ones() -> None:
+    right, wrong = spoilt("moving_camera", 2), spoilt("noisy_poses", 3)
+    np.testing.assert_array_equal(clip_of(right).rgb, clip_of(wrong).rgb)
+    np.testing.assert_array_equal(clip_of(wrong).world_from_camera[0], np.eye(4))
+    error_mm = (clip_of(wrong).world_from_camera - clip_of(right).world_from_camera)[1:, :3, 3]
+    assert 0.2 < error_mm.std() < 1.0
+    rotations = clip_of(wrong).world_from_camera[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (12, 3, 3)), atol=1e-9
+    )
+
+
+def test_a_recording_is_written_as_files_with_what_the_user_believes(tmp_path: Path) -> None:
+    given = spoilt("wrong_baseline", 5)
+    assert isinstance(given.clip, Recording)
+    request = write_recording(given.clip, tmp_path)
+    assert (tmp_path / "000011r.png").exists()
+    assert request.calibration is not None
+    told_mm = 1.5 * clean().phantom.settings.baseline_mm
+    assert f"T_0={-told_mm:.9g}" in request.calibration.read_text()
+    np.testing.assert_array_equal(given.clip.frame(2).right, clean().phantom.frame(2).right)
+
+
+def test_misrectified_and_inverted_recordings_are_just_that() -> None:
+    low = spoilt("misrectified", 3).clip
+    assert isinstance(low, Recording)
+    np.testing.assert_array_equal(low.frame(0).right[4:], clean().phantom.frame(0).right[:-4])
+    np.testing.assert_array_equal(low.frame(0).left, clean().phantom.frame(0).left)
+    inverted = spoilt("inverted_masks", 2).clip
+    assert isinstance(inverted, Recording)
+    assert inverted.frame(0).tissue.mean() == pytest.approx(1 - clean().phantom.frame(0).tissue.mean() + 0.2, abs=0.1)
+
+
+def test_other_sizes_show_the_same_tissue() -> None:
+    given = spoilt("tiny", 5)
+    assert clip_of(given).rgb.shape == (CLEAN_FRAMES, 51, 64, 3)

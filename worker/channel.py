@@ -1,0 +1,99 @@
+"""The device process's end of the messages of worker/orders.py: it sends reports and reads orders.
+
+Imports no torch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import sys
+import threading
+from dataclasses import dataclass, field
+from typing import BinaryIO
+
+from pydantic import ValidationError
+
+from contract.runtime import traces
+from worker.orders import DeviceReport, RunJob, ScoreScene, line_of, read_order
+
+TRACES_PATIENCE_S = 1.0
+"""How long the end of the process waits for a collector: less than a supervisor waits for the process."""
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+class Channel:
+    """Sends reports; for any thread."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+        self._last: dict[type[DeviceReport], DeviceReport] = {}
+
+    @classmethod
+    def instead_of_stdout(cls) -> Channel:
+        """Take stdout for reports; anything else that is printed from now on goes to stderr."""
+        sys.stdout.flush()
+        own = os.dup(sys.stdout.fileno())  # child processes do not inherit it
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        return cls(os.fdopen(own, "wb"))
+
+    def send(self, message: DeviceReport) -> None:
+        """Write one report; if the supervisor is gone, do nothing."""
+        with self._lock, contextlib.suppress(BrokenPipeError):
+            self._stream.write(line_of(message))
+            self._stream.flush()
+
+    def send_if_new(self, message: DeviceReport) -> None:
+        """Write a report unless it equals the last of its type; for one thread."""
+        if self._last.get(type(message)) != message:
+            self._last[type(message)] = message
+            self.send(message)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What was ordered; `stop` is set once it shall stop."""
+
+    order: RunJob | ScoreScene
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+class Orders:
+    """Reads orders in a thread, which ends the whole process when the orders end."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+        threading.Thread(target=self._read, name="orders", daemon=True).start()
+
+    @classmethod
+    def from_stdin(cls) -> Orders:
+        """Orders from stdin, read through a copy: at exit Python must not wait for this thread's lock on sys.stdin."""
+        return cls(os.fdopen(os.dup(sys.stdin.fileno()), "rb"))
+
+    def next(self, timeout_s: float) -> Task | None:
+        """The next task; None after timeout_s."""
+        try:
+            return self._tasks.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def _read(self) -> None:
+        task: Task | None = None
+        for line in self._stream:
+            try:
+                order = read_order(line)
+            except ValidationError:  # of another version: a process that hears no orders would only seem to work
+                logger.error("an order cannot be read; restart the worker after updating the program")
+                os._exit(1)
+            if isinstance(order, RunJob | ScoreScene):
+                task = Task(order)
+                self._tasks.put(task)
+            elif task is not None:
+                task.stop.set()
+        traces.flush(TRACES_PATIENCE_S)
+        os._exit(0)  # all that must be kept is on disk already

@@ -1,0 +1,162 @@
+"""The device process as its supervisor sees it: started, given orders, watched, and killed if need be.
+
+A kernel may crash, hang or eat all memory. Whatever becomes of the device process, the supervisor survives and sees it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import subprocess
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
+from worker.orders import Advanced, DeviceOrder, Failed, Finished, Holding, Ready, Scored, Stopped, line_of, read_report
+
+MAX_START_S = 240.0
+"""To import torch and compile all kernels, on a slow machine whose cache is empty."""
+
+LOOK_PERIOD_S = 0.1
+"""How soon a supervisor that waits for its child sees what has become of it, or acts on a new order of the queue."""
+
+MAX_STOP_S = 5.0
+"""How long a child that is told to stop may take to save the job's state before it is killed."""
+
+LAST_REPORTS_S = 0.5
+"""How long to wait for the last reports of a dead child, in case a process of its own holds its pipe open."""
+
+MAX_END_S = 2.0
+"""A child without a job ends at once when its orders end."""
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The child is gone; cause is for the log."""
+
+    cause: str
+
+
+JobReport: TypeAlias = Advanced | Finished | Scored | Stopped | Failed
+
+
+class DeviceChild:
+    """One running device process: send() gives orders, next_report() hears of the job. `kill` must end the process."""
+
+    def __init__(self, process: subprocess.Popen[bytes], kill: Callable[[], None]) -> None:
+        self.process = process
+        self.kill = kill
+        self.ready: Ready | None = None
+        self.scenes: tuple[str, ...] = ()
+        self._reports: queue.SimpleQueue[JobReport] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, name="reports", daemon=True)
+        self._reader.start()
+
+    @property
+    def ended(self) -> Ended | None:
+        """How the process ended; None while it runs. For any thread."""
+        status = self.process.poll()
+        return None if status is None else Ended(cause_of(status))
+
+    def send(self, order: DeviceOrder) -> None:
+        """Give an order. A dead child hears none, which next_report() tells."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            self.process.stdin.write(line_of(order))
+            self.process.stdin.flush()
+
+    def next_report(self, timeout_s: float) -> JobReport | Ended | None:
+        """The next report on the job, then the child's end; None after timeout_s."""
+        with contextlib.suppress(queue.Empty):
+            return self._reports.get(timeout=timeout_s)
+        ended = self.ended
+        if ended is None:
+            return None
+        self._reader.join(LAST_REPORTS_S)
+        with contextlib.suppress(queue.Empty):
+            return self._reports.get_nowait()
+        return ended
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as lines:
+            for line in lines:
+                report = read_report(line)
+                if report is None:
+                    logger.warning("the device process printed a line of %d bytes that is not a report", len(line))
+                elif isinstance(report, Ready):
+                    self.ready = report
+                elif isinstance(report, Holding):
+                    self.scenes = report.scenes
+                else:
+                    self._reports.put(report)
+
+
+class ChildKeeper:
+    """Keeps one device process running. Use it from one thread, which must live as long as the process."""
+
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str] | None = None, last_words: Path | None = None
+    ) -> None:
+        self._supervised = Supervised(
+            "device process",
+            command,
+            environment,
+            last_words=last_words,
+            pipes=True,
+            dies_with_parent=False,  # it sees to that itself
+            grace_s=MAX_END_S,
+        )
+        self._child: DeviceChild | None = None
+
+    @property
+    def live(self) -> DeviceChild | None:
+        """The child, if it is ready and has not ended; for any thread."""
+        child = self._child
+        return child if child is not None and child.ready is not None and child.ended is None else None
+
+    def child(self, end: threading.Event) -> DeviceChild | None:
+        """The child as soon as it is ready; None if `end` was set first.
+
+        Raises:
+            UnavailableError: the child cannot work here; carries its last words.
+        """
+        while not end.is_set():
+            ended = self._supervised.watch()
+            if ended is not None:
+                _log_end(ended)
+            self._child = child = self._running()
+            if child is not None and child.ready is not None:
+                self._supervised.mark_healthy()
+                return child
+            if child is not None and self._supervised.age_s > MAX_START_S:
+                logger.warning("the device process was not ready after %g s and was killed", MAX_START_S)
+                child.kill()
+            end.wait(LOOK_PERIOD_S)
+        return None
+
+    def stop(self) -> None:
+        """Let a child without a job end, for good."""
+        self._supervised.stop()
+
+    def _running(self) -> DeviceChild | None:
+        """The child of the process that runs now, which may be a new one."""
+        process = self._supervised.process
+        if process is None:
+            return None
+        if self._child is not None and self._child.process is process:
+            return self._child
+        return DeviceChild(process, self._supervised.kill)
+
+
+def _log_end(ended: ProcessEnd) -> None:
+    if ended.pause_s:
+        logger.warning("the device process %s before it was ready; another starts in %g s", ended.cause, ended.pause_s)
+    else:
+        logger.warning("the device process %s; another starts", ended.cause)

@@ -1,0 +1,348 @@
+"""The job loop: claim a job, let the device process reconstruct it, settle. No torch here, so nothing can hang.
+
+A job ends in exactly one of done, failed and cancelled. If the child dies, the job is handed back and the death counts
+against it. If this process is told to end, or the job to make way, the job is handed back and a later attempt resumes
+it. If this process dies, its child dies too, the claim runs out, and any worker takes the job.
+
+A job is done before its scene is scored. The scores follow within seconds. If scoring is cut off, the worker scores the
+scene when no job waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from contract.queue.interface import Claim, Order, Queue
+from contract.store.store import Store
+from contract.wire.job import JobProgress, JobRecord, JobState
+from intrasplat.errors import ErrorCode, IntrasplatError, UnavailableError
+from intrasplat.files.disk_errors import StoreFullError
+from worker.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
+from worker.hang import HangDetector
+from worker.heartbeat import Heartbeat
+from worker.held import HeldClaim
+from worker.job_errors import describe
+from worker.job_spans import StageSpans, attempt_span
+from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.room import Room
+from worker.scores import AwaitedScores, LeftScores
+
+CLAIM_TIMEOUT_S = 1.0
+"""How soon an idle worker notices that it should end, or that its child has."""
+
+UNREACHABLE_PAUSE_S = 1.0
+
+MAX_STORE_S = 60.0
+"""The job fails when the store fails for so long. For room on the disk it waits as long as it takes."""
+
+PUBLISHING = "publish"
+"""The last stage a caller sees: the scene is published."""
+
+DONE = "done"
+UNSETTLED = "the queue cannot be reached; the lease will run out"
+
+_Result = TypeVar("_Result")
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+@dataclass(frozen=True)
+class Died:
+    """The child is gone. excused: not because of the job, as it had been told to stop or had died before."""
+
+    cause: str
+    excused: bool
+
+
+class Consumer:
+    """Takes one job after the other. job_id names the running one and may be read from any thread."""
+
+    def __init__(
+        self,
+        queue: Queue,
+        store: Store,
+        keeper: ChildKeeper,
+        name: str,
+        owner: str,
+        end: threading.Event,
+        min_free_bytes: int = 0,
+    ) -> None:
+        self._room = Room(store, min_free_bytes)
+        self._queue = queue
+        self._store = store
+        self._keeper = keeper
+        self._name = name
+        self._owner = owner
+        self._end = end
+        self._left = LeftScores(queue, store, name, end)
+        self.held = HeldClaim(store.run_dir / f"{name}.claim")
+        self.job_id: str | None = None
+
+    def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
+        """Take jobs until `end` is set.
+
+        Raises:
+            UnavailableError: the child cannot work here.
+        """
+        away = short = False
+        while (child := self._keeper.child(self._end)) is not None:
+            was_short, short = short, self._room.is_short()
+            if short != was_short:
+                logger.warning("jobs wait for room on the disk" if short else "the disk has room for jobs again")
+            if short:
+                self._end.wait(claim_timeout_s)
+                continue
+            try:
+                record = self._queue.claim(self._owner, claim_timeout_s)
+            except UnavailableError as error:
+                if not away:
+                    logger.warning("waiting for the queue: %s", error)
+                away = True
+                self._end.wait(UNREACHABLE_PAUSE_S)
+                continue
+            away = False
+            if record is not None:
+                self.job_id = record.job_id
+                self.held.note(Claim(record.job_id, record.attempt, self._owner))
+                scores = run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
+                self.held.forget()
+                self.job_id = None
+                if scores is not None:
+                    # also while a job waits: made up for later they take several times as long
+                    scores.take(child, stop=self._end.is_set)
+            else:
+                self._left.make_up(child)
+
+
+def run_job(
+    queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
+) -> AwaitedScores | None:
+    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's.
+
+    Returns the scores that the child measures now, if the job is done.
+    """
+    assert record.owner is not None
+    claim = Claim(record.job_id, record.attempt, record.owner)
+    log, started_s = _log_of(claim), time.monotonic()
+    room.begins()
+    with attempt_span(record, name) as span, Heartbeat(queue, claim) as heart:
+        log.info("an attempt starts")
+        job = _Job(queue, store, claim, heart, name, end, room)
+        try:
+            outcome = job.settle(job.work(child, record))
+        except IntrasplatError as error:  # the store failed, and the job is not with the child, or no more
+            outcome = job.settle(job.without_store(error))
+        except Exception as error:
+            child.kill()
+            outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
+        span.set(outcome=outcome)
+        log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
+    if not job.is_scoring:
+        return None
+    scores = AwaitedScores(store, name, record)
+    if outcome == DONE:
+        return scores
+    if outcome != UNSETTLED:  # if unsettled, the queue may have accepted the end
+        with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
+            store.expect_no_scores(name, claim.job_id, claim.attempt)
+    scores.take(child, stop=lambda: True)
+    return None
+
+
+def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
+    """A logger whose lines carry the job's id."""
+    return logging.LoggerAdapter(logger, {"job_id": claim.job_id, "attempt": claim.attempt})
+
+
+class _Job:
+    """One attempt at a job: work() watches the child, settle() tells the queue how it ended."""
+
+    def __init__(
+        self,
+        queue: Queue,
+        store: Store,
+        claim: Claim,
+        heart: Heartbeat,
+        name: str,
+        end: threading.Event,
+        room: Room,
+    ) -> None:
+        self._room = room
+        self._queue = queue
+        self._store = store
+        self._claim = claim
+        self._heart = heart
+        self._name = name
+        self._end = end
+        self._log = _log_of(claim)
+        self._stages = StageSpans()
+        self.is_scoring = False
+
+    def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
+        """Let the child reconstruct; stop it when the queue or `end` says so, kill it when it hangs."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        self._report(JobProgress(stage=FETCHING, fraction=0.0))
+        spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
+        kept = self._retry_store(lambda: self._store.kept_folder(job_id, attempt))
+        out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
+        if child.ended is not None:
+            return Died(child.ended.cause, excused=True)
+        child.send(RunJob(record=record, spool=spool, out=out, kept=kept))
+        detector, asked_s = HangDetector(), None
+        while True:
+            report = child.next_report(LOOK_PERIOD_S)
+            if isinstance(report, Finished | Stopped | Failed):
+                self.is_scoring = isinstance(report, Finished)
+                return report
+            if isinstance(report, Ended):
+                return Died(report.cause, excused=asked_s is not None)
+            if isinstance(report, Advanced):
+                detector.observe(report.progress)
+                self._report(report.progress)
+            if asked_s is None and self._is_to_stop():
+                child.send(StopJob())
+                asked_s = time.monotonic()
+            if asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S:
+                child.kill()
+                return Died(f"did not stop within {MAX_STOP_S:g} s and was killed", excused=True)
+            if detector.is_hung():
+                child.kill()
+                return Died(f"hung in stage {detector.stage!r} and was killed", excused=asked_s is not None)
+
+    def _report(self, progress: JobProgress) -> None:
+        self._heart.report(progress)
+        self._stages.reached(progress.stage)
+
+    def _is_to_stop(self) -> bool:
+        return self._heart.order is not Order.GO_ON or self._end.is_set()
+
+    def without_store(self, error: IntrasplatError) -> Failed | Died:
+        """The end of an attempt when the store fails: handed back if it was to stop anyway, else failed."""
+        if self._is_to_stop():
+            return Died("waited for the store", excused=True)
+        return Failed(error=describe(error), fault=type(error).__name__)
+
+    def settle(self, result: Finished | Stopped | Failed | Died) -> str:
+        """Tell the queue how the attempt ended, and tidy up; returns the outcome for the log.
+
+        Retry until the queue answers or `end` is set. After that touch nothing: whether the claim still stands is
+        unknown.
+        """
+        if isinstance(result, Failed | Died):
+            self._stages.end(result.fault if isinstance(result, Failed) else "died")
+        try:
+            return self._settle(result)
+        finally:
+            self._stages.end()
+
+    def _settle(self, result: Finished | Stopped | Failed | Died) -> str:
+        if self._heart.order in (Order.CANCEL, Order.LOST):
+            return self._withdraw()
+        result = self._excuse(result)
+        accepted, outcome = self._tell(result)
+        if accepted is None:
+            return UNSETTLED
+        if not accepted:
+            return self._withdraw()
+        self._tidy(result)
+        return outcome
+
+    def _excuse(self, result: Finished | Stopped | Failed | Died) -> Finished | Stopped | Failed | Died:
+        """The same, but a job that a full disk ended is to be handed back, no death counted."""
+        is_full = isinstance(result, Failed) and result.error.code is ErrorCode.STORE_FULL
+        died = isinstance(result, Died) and not result.excused
+        if is_full or (died and self._room.is_short()):
+            if self._room.ran_out(self._claim.job_id):
+                return Died("found the disk full", excused=True)
+            if isinstance(result, Failed):
+                return result.model_copy(update={"error": self._room.full_error()})
+        elif isinstance(result, Finished | Failed):
+            self._room.sufficed(self._claim.job_id)
+        return result
+
+    def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
+        """Whether the queue accepts the end (None: it cannot be reached), and the end in words for the log."""
+        if isinstance(result, Finished):
+            return self._publish(), DONE
+        if isinstance(result, Failed):
+            return self._retry_queue(lambda: self._queue.fail(self._claim, result.error)), f"failed ({result.fault})"
+        died = isinstance(result, Died) and not result.excused
+        if isinstance(result, Died):
+            self._log.warning("the device process %s", result.cause)
+        if isinstance(result, Stopped) and result.checkpointed:
+            self._store.hand_over(self._claim.job_id, self._claim.attempt)
+        accepted = self._retry_queue(lambda: self._queue.release(self._claim, died=died))
+        return accepted, "handed back, its worker's death held against it" if died else "handed back"
+
+    def _publish(self) -> bool | None:
+        """Publish the scene, then finish the record, so that whoever sees the job done finds its scene."""
+        self._report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
+        order = self._retry_queue(self._heart.beat)
+        if order is None or order in (Order.CANCEL, Order.LOST):
+            return None if order is None else False
+        self._retry_store(lambda: self._store.expect_scores(self._name, self._claim.job_id, self._claim.attempt))
+        self._retry_store(lambda: self._store.publish_scene(self._claim.job_id, self._claim.attempt))
+        return self._retry_queue(lambda: self._queue.finish(self._claim))
+
+    def _withdraw(self) -> str:
+        """Remove the whole job if it is cancelled, this attempt's files if another worker has taken it over."""
+        order = self._heart.order
+        if order not in (Order.CANCEL, Order.LOST):
+            order = self._retry_queue(self._heart.beat) or order
+        if order is Order.CANCEL:
+            self._remove(lambda: self._store.purge(self._claim.job_id))
+            confirmed = self._retry_queue(lambda: self._queue.confirm_cancel(self._claim))
+            return UNSETTLED if confirmed is None else "cancelled"
+        if order is Order.LOST:
+            self._remove(lambda: self._store.remove_attempt(self._claim.job_id, self._claim.attempt))
+            return "lost to another attempt"
+        return UNSETTLED
+
+    def _tidy(self, result: Finished | Stopped | Failed | Died) -> None:
+        """Remove what nobody needs once the queue has accepted the end."""
+        job_id, attempt = self._claim.job_id, self._claim.attempt
+        if isinstance(result, Finished):
+            self._remove(lambda: self._store.remove_other_attempts(job_id, attempt))
+        elif isinstance(result, Failed) or (isinstance(result, Died) and self._is_given_up()):
+            self._remove(lambda: self._store.remove_attempt(job_id, attempt))
+
+    def _is_given_up(self) -> bool:
+        """Whether the queue has failed the job after too many deaths."""
+        record = self._retry_queue(lambda: self._queue.get(self._claim.job_id))
+        return record is not None and record.state is JobState.FAILED
+
+    def _retry_queue(self, ask: Callable[[], _Result]) -> _Result | None:
+        """Retry until the queue answers; None if `end` is set first."""
+        while True:
+            try:
+                return ask()
+            except UnavailableError as error:
+                self._log.warning("waiting for the queue: %s", error.problem)
+                if self._end.wait(UNREACHABLE_PAUSE_S):
+                    return None
+
+    def _retry_store(self, work: Callable[[], _Result]) -> _Result:
+        """Retry while the store cannot be reached, for up to MAX_STORE_S; the beats go on."""
+        deadline_s = time.monotonic() + MAX_STORE_S
+        while True:
+            try:
+                return work()
+            except UnavailableError as error:
+                is_over = time.monotonic() > deadline_s and not isinstance(error, StoreFullError)
+                if is_over or self._is_to_stop():
+                    raise
+                self._log.warning("waiting for the store: %s", error.problem)
+                self._end.wait(UNREACHABLE_PAUSE_S)
+
+    def _remove(self, work: Callable[[], object]) -> None:
+        """Remove files; what cannot be removed now the service's sweep removes later."""
+        try:
+            work()
+        except UnavailableError as error:
+            self._log.warning("files were not removed: %s", error.problem)

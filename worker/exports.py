@@ -1,0 +1,71 @@
+"""Exports under way: each is made part by part, as its caller asks for the parts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
+from contract.wire.rendering import ExportRequest
+from intrasplat.errors import SceneError, UnavailableError
+
+MAX_OPEN = 8
+IDLE_S = 120.0
+"""So long after its last part an export is forgotten."""
+
+
+@dataclass(eq=False)
+class _Open:
+    key: tuple[str, int]
+    parts: Generator[bytes]
+    next_part: int
+    used_s: float
+
+
+class OpenExports:
+    """The exports that have begun and not ended, by their ids; for one thread."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._open: dict[str, _Open] = {}
+
+    def part(self, request: ExportRequest, begin: Callable[[], Generator[bytes]]) -> tuple[bytes, bool]:
+        """The part that is asked for, and whether more follow. The first is made of begin().
+
+        Raises:
+            UnavailableError: too many are under way.
+            SceneError: this export is not under way here.
+        """
+        if request.part == 0:
+            self.forget()
+            if len(self._open) >= MAX_OPEN:
+                raise UnavailableError(
+                    f"{MAX_OPEN} exports are under way, as many as may be.", "Ask again in a minute."
+                )
+            key = (request.scene_id, request.attempt)
+            self._open[request.export_id] = _Open(key, begin(), 0, self._clock())
+        export = self._open.get(request.export_id)
+        if export is None or export.next_part != request.part:
+            raise SceneError(f"The export of scene {request.scene_id} is not under way here any more.")
+        try:
+            content = next(export.parts, None)
+        except BaseException:
+            self._end(request.export_id)
+            raise
+        if content is None:
+            self._end(request.export_id)
+            return b"", False
+        export.next_part, export.used_s = request.part + 1, self._clock()
+        return content, True
+
+    def forget(self, is_gone: Callable[[str, int], bool] = lambda scene_id, attempt: False) -> None:
+        """End the exports of scenes that are gone, and of callers who are."""
+        now_s = self._clock()
+        for export_id, each in list(self._open.items()):
+            if now_s - each.used_s > IDLE_S or is_gone(*each.key):
+                self._end(export_id)
+
+    def _end(self, export_id: str) -> None:
+        export = self._open.pop(export_id, None)
+        if export is not None:
+            export.parts.close()  # its files go

@@ -1,0 +1,61 @@
+"""Decide when a job hangs: each stage has a limit for the time between two advances."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from contract.wire.job import JobProgress
+
+STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
+    {
+        "decode": 20.0,  # a frame has 10 s, which the decoding process enforces first
+        "stereo": 30.0,  # a pair of 4096 x 2160 takes 3 s on a slow core; three are aligned without a report
+        "compile": 120.0,  # one set of kernels takes seconds, on a crowded machine minutes
+        "masks": 60.0,  # a frame takes some 10 ms, of a hospital's own segmenter seconds
+        "poses": 60.0,  # a step of the fit takes up to some seconds
+        "fusion": 60.0,  # all frames at once, about 10 ms each
+        "motion": 10.0,  # a frame takes some 10 ms
+        "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a report between
+        "calibrate": 150.0,  # UNTIMED_STEPS and TIMED_STEPS are 15 iterations of training
+        "train": 10.0,  # an iteration takes 10 to 500 ms
+        "finish": 150.0,  # the motion of a long clip becomes patterns in some 10 s
+        "score": 60.0,  # a frame takes some 100 ms; afterwards flow copies of every held-out frame, and the files
+    }
+)
+"""Limits for the stages of intrasplat/pipeline.py: at least ten times what a step took on slow machines."""
+
+OTHER_LIMIT_S = 60.0
+"""The limit of any other stage, and of the time before the first report."""
+
+MAX_LOOK_S = 1.0
+"""How much of the time between two calls of is_hung() counts: a supervisor that was stopped heard nothing."""
+
+
+class HangDetector:
+    """Watches the reports of one job. Call is_hung() often."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._place: tuple[str, float, int] = ("", 0.0, 0)
+        self._looked_s = clock()
+        self._silence_s = 0.0
+
+    @property
+    def stage(self) -> str:
+        """The stage of the last report."""
+        return self._place[0]
+
+    def observe(self, progress: JobProgress) -> None:
+        """Take a report. It is an advance unless it repeats stage, fraction and iteration of the last."""
+        place = (progress.stage, progress.fraction, progress.iteration)
+        if place != self._place:
+            self._place, self._silence_s = place, 0.0
+
+    def is_hung(self) -> bool:
+        """Whether the job has not advanced for longer than its stage allows."""
+        now_s = self._clock()
+        self._silence_s += min(MAX_LOOK_S, now_s - self._looked_s)
+        self._looked_s = now_s
+        return self._silence_s > STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)

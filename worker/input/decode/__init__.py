@@ -1,6 +1,0 @@
-"""Files from outside in; a clip and its calibration out, read by a confined process. Verb: decode_clip."""
-
-from worker.input.decode.contained import DecoderKilledError, keep_decoder_ready
-from worker.input.decode.decoding import StereoRecording, decode_clip
-
-__all__ = ["DecoderKilledError", "StereoRecording", "decode_clip", "keep_decoder_ready"]

@@ -1,9 +1,0 @@
-"""A clip with depth in; the same clip with its camera's poses out, estimated if nobody gave them and the camera moves.
-
-Verbs: with_poses; camera_rests, and find_path of estimate.py.
-"""
-
-from worker.poses.posed import placed, with_poses
-from worker.poses.still import camera_rests
-
-__all__ = ["camera_rests", "placed", "with_poses"]

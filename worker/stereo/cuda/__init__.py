@@ -1,8 +1,0 @@
-"""Matching on a GPU: many pairs at once, semi-global in Triton, with OpenCV's core alone.
-
-Importing it needs triton; worker/stereo/depth.py does so only where the device is "cuda".
-"""
-
-from worker.stereo.cuda.matching import agreed_disparities, depth_of, frames_at_once, match_frames
-
-__all__ = ["agreed_disparities", "depth_of", "frames_at_once", "match_frames"]

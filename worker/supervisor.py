@@ -1,0 +1,157 @@
+"""The worker's process: it holds the claims, its child holds the device, and either may die at any time.
+
+Nothing here imports torch or compiles anything, so this process starts fast, needs little memory and never hangs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from contract.queue.installed import check_queue
+from contract.queue.interface import ANNOUNCE_PERIOD_S, Queue
+from contract.queue.redis_queue import RedisQueue
+from contract.runtime.locks import FolderLock
+from contract.runtime.settings import Settings
+from contract.store.store import Store, open_store
+from contract.wire.rendering import WorkerAddress
+from intrasplat.errors import UnavailableError
+from worker.child import ChildKeeper
+from worker.consume import Consumer
+
+LOOK_PERIOD_S = 0.1
+"""How soon a change is announced."""
+
+TIDY_PERIOD_S = 600.0
+"""How long a local copy may outlive a scene that was purged on another machine."""
+
+DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
+
+logger = logging.getLogger("intrasplat.worker")
+
+
+def run_supervisor(
+    settings: Settings,
+    end: threading.Event,
+    child_command: Sequence[str] | None = None,
+    *,
+    renders_only: bool = False,
+) -> None:
+    """Work until `end` is set; wait while the queue cannot be reached.
+
+    Args:
+        child_command: the program to run instead of `python -m worker device`; it must obey worker/orders.py.
+        renders_only: claim no jobs; answer renders of finished scenes.
+
+    Raises:
+        UnavailableError: a worker of this name already works on this data directory, the queue refuses this one, or the
+            child cannot work here.
+    """
+    assert settings.redis_url is not None
+    store = open_store(settings)
+    name = settings.worker_name
+    lock = FolderLock(store.run_dir / f"{name}.lock")
+    if not lock.take():
+        problem = f"A worker named {name} already works on {store.data_dir}."
+        raise UnavailableError(problem, "End it, or set another INTRASPLAT_WORKER_NAME.")
+    queue = RedisQueue(settings.redis_url)
+    environment = {**os.environ, **settings.to_environment()}
+    keeper = ChildKeeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
+    # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
+    consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
+    try:
+        check_queue(queue)
+        with (
+            announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
+            kept_tidy(store),
+        ):
+            if renders_only:
+                keep_rendering(keeper, end)
+            else:
+                consumer.held.give_back(queue)
+                consumer.run()
+    finally:
+        keeper.stop()
+        queue.close()
+        lock.release()
+
+
+def keep_rendering(keeper: ChildKeeper, end: threading.Event) -> None:
+    """Keep the child running, which answers renders, until `end` is set; raises as ChildKeeper.child."""
+    while keeper.child(end) is not None and not end.wait(LOOK_PERIOD_S):
+        pass
+
+
+def address_of(
+    name: str, keeper: ChildKeeper, consumer: Consumer, *, renders_only: bool = False
+) -> WorkerAddress | None:
+    """The address that a worker announces now; None while its child is not ready."""
+    child = keeper.live
+    if child is None or child.ready is None:
+        return None
+    ready = child.ready
+    return WorkerAddress(
+        name=name,
+        endpoint=ready.endpoint,
+        device=ready.device,
+        job_id=consumer.job_id,
+        scenes=child.scenes,
+        renders_only=renders_only,
+    )
+
+
+@contextlib.contextmanager
+def kept_tidy(store: Store) -> Iterator[None]:
+    """Tidy the store every TIDY_PERIOD_S while the context lasts."""
+    end = threading.Event()
+
+    def tidy() -> None:
+        while not end.is_set():
+            try:
+                store.tidy()
+            except UnavailableError as error:
+                logger.warning("the store was not tidied: %s", error.problem)
+            end.wait(TIDY_PERIOD_S)
+
+    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not joined: a bucket may answer slowly
+    try:
+        yield
+    finally:
+        end.set()
+
+
+@contextlib.contextmanager
+def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | None]) -> Iterator[None]:
+    """Announce the worker's address every ANNOUNCE_PERIOD_S and at every change while the context lasts."""
+    end = threading.Event()
+
+    def announce() -> None:
+        told: WorkerAddress | None = None
+        next_s = 0.0
+        while not end.wait(LOOK_PERIOD_S):
+            now = address()
+            if now == told and (now is None or time.monotonic() < next_s):
+                continue
+            with contextlib.suppress(UnavailableError):
+                if now is None:
+                    queue.withdraw(name)
+                else:
+                    queue.announce(now)
+                told = now
+            next_s = time.monotonic() + ANNOUNCE_PERIOD_S
+
+    thread = threading.Thread(target=announce, name="announce", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+        with contextlib.suppress(UnavailableError):
+            queue.withdraw(name)

@@ -1,0 +1,29 @@
+"""The spans of a request that a worker answers: all of it since it came, and its wait (contract/runtime/traces.py)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from contract.runtime import traces
+from worker.turns import Turn
+
+
+@contextmanager
+def answer_span(turn: Turn) -> Iterator[None]:
+    """The span of an answer that is being made; parts of it that begin in the context are within it."""
+    came_s = _came_s(turn)
+    with traces.span(turn.request.kind, turn.trace or traces.NEW, since_s=came_s, job_id=turn.request.scene_id):
+        traces.begin("wait for turn", since_s=came_s).end()
+        yield
+
+
+def shared_span(turn: Turn) -> None:
+    """The span of a request that got the answer of another that asked the same."""
+    told = traces.Attributes(job_id=turn.request.scene_id, shared=True)
+    traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **told).end()
+
+
+def _came_s(turn: Turn) -> float:
+    return time.time() - (time.monotonic() - turn.arrived_s)
