@@ -50,7 +50,7 @@ CLIPS ?= d4d_endonerf phantom:still phantom:breathing phantom:pull phantom:cut
 TABLE_CLIPS ?= phantom:breathing:160x128 phantom:pull:160x128 phantom:cut:160x128 phantom:still:160x128 d4d_endonerf:320x256
 TABLE_SECONDS ?= 60 1800
 GRID_CLIPS ?= phantom:still:640x512 phantom:breathing:640x512 phantom:pull:640x512 phantom:cut:640x512
-EVALUATE := $(BIN)/intrasplat evaluate
+EVALUATE := $(BIN)/python -m lab evaluate
 # the folder of the recordings: d4d_endonerf/ and so on
 evaluate table1 capacity: export INTRASPLAT_DATA ?= ../shared/data
 
@@ -62,7 +62,7 @@ help: ## this list
 setup: $(STAMP) ## make .venv and install what running needs into it (TORCH_INDEX=URL chooses the torch build)
 	@$(BIN)/python -c 'import torch; print(f"torch {torch.__version__}:", f"CUDA {torch.version.cuda} build" if torch.version.cuda else "CPU build")'
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml client/pyproject.toml service/pyproject.toml constraints.txt
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(NEW_ENOUGH)'; then \
 		echo "setup: Python 3.11 or newer is needed; $(or $(PYTHON),python3) is: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
 		echo "setup: install one, or name it: make setup PYTHON=/path/to/python3.12" >&2; exit 1; fi
@@ -73,7 +73,7 @@ $(STAMP): pyproject.toml constraints.txt
 		echo "setup: installing torch from $(or $(TORCH_INDEX),pip's own index)"; \
 		$(PIP) install -qq $(REINSTALL) --constraint $(TORCH_CONSTRAINTS) $(TORCH_INDEX:%=--index-url "%") torch; fi
 	@echo "setup: installing intrasplat and what it needs (download sizes are in README.md; minutes on a slow line)"
-	@$(PIP) install -qq --constraint constraints.txt --editable .
+	@$(PIP) install -qq --constraint constraints.txt --editable '.[charts]' --editable ./client --editable ./service
 	@echo "$(TORCH_INDEX)" >$@
 
 $(DEV_STAMP): $(STAMP)
@@ -98,8 +98,8 @@ check: setup $(DEV_STAMP) ## style, types, the import rules and the containers' 
 
 bench: setup ## every lab/benchmarks/bm_*.py, one after the other
 	@set -e; for each in lab/benchmarks/bm_*.py; do \
-		[ -e "$$each" ] || { echo "bench: benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
-		echo "== $$each"; $(BIN)/python "$$each"; done
+		[ -e "$$each" ] || { echo "bench: lab/benchmarks/ holds no bm_*.py" >&2; exit 1; }; \
+		echo "== $$each"; $(BIN)/python -m $$(echo "$${each%.py}" | tr / .); done
 
 gpu-check: ## with an NVIDIA GPU: check its kernels and time them; at most 7 minutes, docs/gpu.md
 	@# nothing is installed and no .venv is made; a PYTHON that is named is used whatever it has
@@ -142,4 +142,4 @@ sbom: setup $(DEV_STAMP) ## build/sbom.json: every component of this environment
 
 clean: ## remove .venv, caches and build leftovers; scenes and the demo's pictures stay
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
-	find contract worker service client tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find intrasplat contract worker service client lab tests -name __pycache__ -type d -prune -exec rm -rf {} +

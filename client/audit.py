@@ -10,7 +10,8 @@ from pathlib import Path
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.chain import HEAD_PATTERN, START, CheckedFile, check_files, has_branches, in_order, unnamed_lines
-from intrasplat.commands.arguments import Commands, add_command, add_data_dir, settings_of
+from contract.runtime.arguments import add_data_dir, settings_of
+from intrasplat.commands.arguments import Commands, add_command
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
 

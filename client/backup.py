@@ -8,10 +8,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from contract.runtime.arguments import add_data_dir, settings_of
 from contract.runtime.settings import Settings
 from contract.store.owner import check_owner
 from contract.wire.job import JobState
-from intrasplat.commands.arguments import Commands, add_command, add_data_dir, settings_of
+from intrasplat.commands.arguments import Commands, add_command
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
 

@@ -18,10 +18,11 @@ from datetime import UTC, datetime
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now, utc_text
 from contract.access.keys import DAY_S, DEFAULT_SCOPES, ApiKey, KeyFile, KeyScope, new_key
 from contract.access.webhook_secrets import tenant_secret
+from contract.runtime.arguments import add_data_dir, settings_of
 from contract.runtime.settings import Settings
 from contract.store.owner import check_owner
 from contract.wire.job import TENANT_PATTERN
-from intrasplat.commands.arguments import Commands, add_command, add_data_dir, settings_of
+from intrasplat.commands.arguments import Commands, add_command
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
 from intrasplat.files.disk_errors import disk_errors

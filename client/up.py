@@ -19,8 +19,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 
+from client.page import DASHBOARD
 from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer, ServerEnd
@@ -34,7 +34,6 @@ from intrasplat.files.disk_errors import StoreFullError, disk_errors
 from intrasplat.machine.processes import told_to_end
 from intrasplat_client import Client
 
-DASHBOARD = Path(__file__).resolve().parent / "dashboard"
 WATCH_PERIOD_S = 0.2
 READY_PERIOD_S = 1.0
 QUEUE_PERIOD_S = 1.0

@@ -4,15 +4,17 @@ ARG BASE=python:3.12.13-slim-trixie
 FROM ${BASE} AS build
 WORKDIR /app
 RUN python -m venv /venv
-COPY pyproject.toml constraints.txt README.md LICENSE ./
-# The project's own requirements are the worker's too (torch, OpenCV); the service needs these alone.
+COPY constraints.txt ./
+# The library asks for torch and OpenCV too; the service needs these alone.
 RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt \
         fastapi starlette anyio uvicorn websockets h11 pydantic redis pyzmq python-multipart httpx prometheus-client fsspec s3fs \
         opentelemetry-sdk opentelemetry-exporter-otlp-proto-http
+COPY pyproject.toml README.md LICENSE ./
+COPY intrasplat intrasplat
 COPY contract contract
 COPY service service
 COPY client client
-RUN /venv/bin/pip install --no-cache-dir --no-deps .
+RUN /venv/bin/pip install --no-cache-dir --no-deps . ./client ./service
 
 FROM ${BASE}
 RUN useradd --uid 10001 --no-create-home intrasplat \

@@ -13,15 +13,17 @@ COPY constraints.txt ./
 # Its index has of everything else the versions it likes; those of constraints.txt come with the next step.
 RUN grep -E '^(torch|triton)[<>=]' constraints.txt >torch.txt \
     && /venv/bin/pip install --no-cache-dir --constraint torch.txt --index-url "$TORCH_INDEX" torch
-# Then what pyproject.toml asks for, which a change of the code does not install anew.
+# Then what library and server ask for, which a change of the code does not install anew.
 COPY pyproject.toml docker/requirements.py README.md LICENSE ./
+COPY service/pyproject.toml service/
 RUN python requirements.py "$EXTRAS" >requirements.txt \
     && /venv/bin/pip install --no-cache-dir --constraint constraints.txt --requirement requirements.txt
+COPY intrasplat intrasplat
 COPY contract contract
 COPY worker worker
-# the command `intrasplat`, which runs the worker's programs too
+# the commands of the server
 COPY client client
-RUN /venv/bin/pip install --no-cache-dir --no-deps .
+RUN /venv/bin/pip install --no-cache-dir --no-deps . ./client ./service
 
 FROM ${BASE}
 # Triton, on a GPU, compiles its launchers with a C compiler; the CPU needs none.

@@ -176,7 +176,8 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
 
 
 def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
-    """The clip of a request with depth (intrasplat/stereo/opening.py) and its camera's poses (intrasplat/poses/posed.py).
+    """The clip of a request with depth (intrasplat/stereo/opening.py) and its camera's poses
+    (intrasplat/poses/posed.py).
 
     A GPU's kernels are examined before it matches anything.
     """

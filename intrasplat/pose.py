@@ -51,6 +51,27 @@ class OrbitPose(BaseModel):
 Pose = MatrixPose | OrbitPose
 
 
+def orbit(
+    yaw_deg: float, pitch_deg: float, zoom: float = 1.0, about_mm: tuple[float, float, float] | None = None
+) -> OrbitPose:
+    """The pose of a camera that has moved about the point it looks at.
+
+    Args:
+        yaw_deg: degrees to the right, -180 to 180.
+        pitch_deg: degrees up, -90 to 90.
+        zoom: times nearer, 0.1 to 10.
+        about_mm: the point in the world, mm; None: the one at the median depth on the first frame's axis.
+
+    Raises:
+        InputError: a number is out of its range.
+
+    Example:
+        >>> isp.orbit(10, 0).yaw_deg
+        10.0
+    """
+    return _parse_orbit([float(each) for each in (yaw_deg, pitch_deg, zoom, *(about_mm or ()))])
+
+
 def parse_pose(text: str) -> Pose:
     """Read a pose as the API and the command line spell it; numbers may be parted by commas or blanks.
 

@@ -145,7 +145,7 @@ def make_clip(clip: Path) -> Path:
     """A folder in StereoMIS layout: synthetic breathing tissue with an instrument in front."""
     say(f"making a stereo clip of synthetic tissue: {FRAMES} frames of {WIDTH} x {HEIGHT}, an instrument in front")
     size = ("--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT), "--seed", str(SEED))
-    command = [sys.executable, "-m", "worker", "phantom", *size, "--format", "stereomis", "--out", str(clip)]
+    command = [sys.executable, "-m", "lab", "phantom", *size, "--format", "stereomis", "--out", str(clip)]
     if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode != 0:
         raise UnavailableError("The synthetic clip could not be made.", "Try `intrasplat doctor`.")
     return clip

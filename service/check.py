@@ -76,7 +76,7 @@ def _findings(services: Deps, caller: Caller, described: DescribedClip) -> Itera
     yield from of_files
     if total_bytes:
         yield from _found(FindingCode.NO_ROOM, lambda: services.intake.check(caller.tenant, total_bytes))
-    yield from _of_sizes(ClipLimits.of(services.settings), files)
+    yield from _of_sizes(services.settings.clip_limits, files)
     if ("calibration", FindingCode.ENDING) not in {(finding.field, finding.code) for finding in of_files}:
         yield from _of_calibration(described)
     yield from _of_options(services, caller, described)

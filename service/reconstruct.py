@@ -26,7 +26,7 @@ from contract.wire.job import Forecast, JobRecord, JobView
 from contract.wire.labels import parse_labels
 from intrasplat.errors import InputError, LimitError, UnavailableError
 from intrasplat.intake.fit import check_fit
-from intrasplat.intake.limits import MAX_MEMORY_BYTES, ClipLimits
+from intrasplat.intake.limits import MAX_MEMORY_BYTES
 from intrasplat.intake.sniff import check_file
 from intrasplat.options import JobOptions, parse_options
 from service.access import Caller
@@ -299,7 +299,7 @@ def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: 
     How much memory it may take is for the worker to say, which may be elsewhere. names: of all files, by part. sent:
     the parts that are not an earlier job's.
     """
-    limits = replace(ClipLimits.of(services.settings), decoded_bytes=MAX_MEMORY_BYTES)
+    limits = replace(services.settings.clip_limits, decoded_bytes=MAX_MEMORY_BYTES)
     folder = services.store.incoming_folder(record.job_id)
     files = {part: folder / name for part, name in names.items()}
     for part, path in files.items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-import contract.queue.interface
 import intrasplat.files.disk_errors  # noqa: F401
 import worker.serve  # noqa: F401
 from contract.wire.checks import FindingCode
@@ -19,7 +18,9 @@ PAGE, ERRORS, REFUSALS, TRIES = re.split(
     "## (?:Errors|Refusals|Tries of a webhook)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
 )
 NOTICES, FINDINGS = PAGE.split("## Findings")
-SOURCES = [path for room in ("contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")]
+SOURCES = [
+    path for room in ("intrasplat", "contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")
+]
 
 
 def listed(page: str) -> list[str]:

@@ -39,8 +39,8 @@ SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 PINNED = re.compile(r"[a-z/-]+:\d+\.\d+\.\d+[a-z0-9.-]*(@sha256:[0-9a-f]{64})?$")
 START_TIMEOUT_S = 20.0
 PROXY_VARIABLES = frozenset({"INTRASPLAT_HOSTS", "FORWARDED_ALLOW_IPS"})
-NOT_IN_IMAGES = frozenset({"dev", "gpu", "slicer"})
-"""Extras that no container of a CPU needs: of tests, of GPUs, and of a bridge that runs beside Slicer."""
+NOT_IN_IMAGES = frozenset({"charts", "dev", "gpu", "slicer"})
+"""Extras that no container of a CPU needs: of charts, of tests, of GPUs, and of a bridge that runs beside Slicer."""
 
 each_service = pytest.mark.parametrize("name", SERVICES)
 each_dockerfile = pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
@@ -186,14 +186,14 @@ def test_the_service_image_has_every_package_that_the_service_imports() -> None:
     installed = {requirement_name(word) for word in text.split()}
     providers = packages_distributions()
     modules = {each.module.split(".")[0] for package in ("contract", "service") for each in imports_of(package)}
-    own = {"contract", "service", "client"}
+    own = {"intrasplat", "contract", "service", "client"}
     foreign = modules - sys.stdlib_module_names - own - {"pydantic_core"}  # a part of pydantic, which brings it
     names = {module: {each.lower().replace("_", "-") for each in providers[module]} for module in foreign}
     assert [module for module in sorted(foreign) if not names[module] & installed] == []
 
 
 def test_the_worker_image_has_every_extra_that_a_worker_can_use() -> None:
-    extras = set(project()["optional-dependencies"]) - NOT_IN_IMAGES
+    extras = {name for folder in (".", "service") for name in project(folder)["optional-dependencies"]} - NOT_IN_IMAGES
     (default,) = (text for kind, text in instructions(DOCKER / "worker.Dockerfile") if text.startswith("EXTRAS="))
     assert set(default.removeprefix("EXTRAS=").split(",")) == extras
     gpu = yaml.safe_load((DOCKER / "compose.gpu.yml").read_text())["services"]["worker"]["build"]["args"]["EXTRAS"]
@@ -203,7 +203,8 @@ def test_the_worker_image_has_every_extra_that_a_worker_can_use() -> None:
 @each_dockerfile
 def test_the_command_line_is_in_every_image(path: Path) -> None:
     copied = {source for kind, text in instructions(path) if kind == "COPY" for source in text.split()[:-1]}
-    assert {"client", "contract"} <= copied  # `intrasplat` is client.cli:main
+    assert {"intrasplat", "contract", "client"} <= copied
+    assert copied & {"service", "service/pyproject.toml"}  # which registers the server's commands
 
 
 def test_docker_itself_finds_no_fault_with_the_files() -> None:

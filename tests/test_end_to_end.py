@@ -24,7 +24,7 @@ MIN_PSNR_DB = 20.0
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "clip"
     size = ["--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT)]
-    subprocess.run([sys.executable, "-m", "worker", "phantom", *size, "--out", str(folder)], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", "lab", "phantom", *size, "--out", str(folder)], check=True, timeout=120)
     return folder
 
 

@@ -1,8 +1,9 @@
 """The import rules: which package may import which, in what order its rooms are read, and what stays light.
 
-contract <- worker, service, client; those three never import each other. intrasplat_client lies in client/ but is
-packed alone, so it imports no other package of ours; client imports it. Inside a package a room imports only rooms that
-stand before it in ROOMS, so that the order of imports is the order of reading.
+intrasplat <- contract <- worker, service, client; those three never import each other, and nothing that is installed
+imports lab or tests. intrasplat_client lies in client/ but is packed alone, so it imports no other package of ours;
+client imports it. Inside a package a folder or module imports only those that stand before it in ORDER, so that the
+order of imports is the order of reading.
 """
 
 from __future__ import annotations
@@ -18,44 +19,60 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MAY_IMPORT = {
-    "contract": {"contract"},
-    "worker": {"contract", "worker"},
-    "service": {"contract", "service"},
-    "client": {"contract", "client", "intrasplat_client"},
+    "intrasplat": {"intrasplat"},
+    "contract": {"intrasplat", "contract"},
+    "worker": {"intrasplat", "contract", "worker"},
+    "service": {"intrasplat", "contract", "service"},
+    "client": {"intrasplat", "contract", "client", "intrasplat_client"},
     "intrasplat_client": {"intrasplat_client"},
 }
 FOLDERS = {"intrasplat_client": REPOSITORY / "client" / "intrasplat_client"}
 """Of packages that do not lie in the repository's root."""
-ROOMS = {
-    "contract": ("wire", "runtime", "intake", "store", "queue", "access", "backup"),
-    "worker": (
+ORDER = {
+    "intrasplat": (
+        "errors",
+        "codes",
+        "names",
+        "version",
+        "server_parts",
+        "notices",
+        "options",
+        "report",
+        "pose",
+        "picture",
+        "colours",
+        "formats",
+        "measuring",
+        "files",
         "machine",
-        "input",
+        "intake",
+        "camera",
+        "clip",
+        "decode",
         "instruments",
         "stereo",
         "motion",
         "poses",
         "fusion",
-        "model",
-        "raster",
+        "splat",
         "scene",
         "train",
-        "render",
+        "view",
         "export",
-        "report",
+        "quality",
         "outcome",
         "pipeline",
-        "phantom",
-        "evaluate",
-        "daemon",
-        "doctor",
+        "recording",
+        "reconstruction",
         "commands",
         "__main__",
     ),
+    "contract": ("wire", "runtime", "store", "queue", "access", "backup"),
 }
-"""In the order in which they are read; a room is a folder or a module directly in the package."""
+"""In the order in which they are read: folders, and modules directly in the package."""
 FRAMEWORKS_BANNED = {
     "contract": {"torch", "numba", "cv2", "scipy", "matplotlib", "fastapi", "starlette", "uvicorn"},
+    "intrasplat": {"fastapi", "starlette", "uvicorn", "httpx", "redis", "zmq", "websockets"},
     "worker": {"fastapi", "starlette", "uvicorn", "httpx"},
     "service": {"torch", "numba", "cv2", "scipy", "matplotlib"},
     "client": {"torch", "numba", "cv2", "scipy", "fastapi"},  # matplotlib draws the demo's charts
@@ -98,10 +115,10 @@ def imports_of(package: str) -> Iterator[Import]:
         yield from imports_of_source(path, path.read_text(encoding="utf-8"))
 
 
-def room_of(module: str) -> str:
+def place_of(module: str) -> str:
     """intrasplat.splat.cpu.blend belongs to raster; worker itself and other packages' modules to no room ("")."""
     package, *rest = module.split(".")
-    return rest[0] if rest and package in ROOMS else ""
+    return rest[0] if rest and package in ORDER else ""
 
 
 def module_of(path: Path) -> str:
@@ -111,15 +128,15 @@ def module_of(path: Path) -> str:
 
 def is_out_of_order(importer: str, imported: str) -> bool:
     """Whether a module imports one of a room that stands later in the same package."""
-    package, room, other = importer.split(".")[0], room_of(importer), room_of(imported)
-    if imported.split(".")[0] != package or room not in ROOMS[package] or other not in ROOMS[package]:
+    package, room, other = importer.split(".")[0], place_of(importer), place_of(imported)
+    if imported.split(".")[0] != package or room not in ORDER[package] or other not in ORDER[package]:
         return False
-    return ROOMS[package].index(other) > ROOMS[package].index(room)
+    return ORDER[package].index(other) > ORDER[package].index(room)
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_a_package_imports_only_packages_below_it(package: str) -> None:
-    forbidden = MAY_IMPORT.keys() - MAY_IMPORT[package] | {"tests", "benchmarks"}
+    forbidden = MAY_IMPORT.keys() - MAY_IMPORT[package] | {"tests", "lab"}
     assert [str(each) for each in imports_of(package) if each.module.split(".")[0] in forbidden] == []
 
 
@@ -134,26 +151,28 @@ def test_imports_are_absolute(package: str) -> None:
     assert [str(each) for each in imports_of(package) if each.level] == []
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_every_module_has_a_room(package: str) -> None:
-    unplaced = {room_of(module_of(path)) for path in python_files(package)} - {"", *ROOMS[package]}
-    assert unplaced == set(), f"add {sorted(unplaced)} to ROOMS in {Path(__file__).name}, where it is to be read"
+@pytest.mark.parametrize("package", ORDER)
+def test_every_module_has_its_place(package: str) -> None:
+    unplaced = {place_of(module_of(path)) for path in python_files(package)} - {"", *ORDER[package]}
+    assert unplaced == set(), f"add {sorted(unplaced)} to ORDER in {Path(__file__).name}, where it is to be read"
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_a_room_imports_only_rooms_above_it(package: str) -> None:
+@pytest.mark.parametrize("package", ORDER)
+def test_a_module_imports_only_what_stands_above_it(package: str) -> None:
     assert [str(each) for each in imports_of(package) if is_out_of_order(module_of(each.path), each.module)] == []
 
 
 def test_the_checks_see_imports_inside_functions_and_of_names() -> None:
-    source = "def late() -> None:\n    from worker import train\n"
-    modules = [each.module for each in imports_of_source(REPOSITORY / "worker" / "model" / "loss.py", source)]
+    source = "def late() -> None:\n    from intrasplat import train\n"
+    modules = [each.module for each in imports_of_source(REPOSITORY / "intrasplat" / "splat" / "loss.py", source)]
     assert "intrasplat.train" in modules
     assert is_out_of_order("intrasplat.splat.loss", "intrasplat.train")
     assert not is_out_of_order("intrasplat.train.loop", "intrasplat.splat")
 
 
-@pytest.mark.parametrize("module", ["contract", "client", "client.cli", "intrasplat_client", "service.app"])
+@pytest.mark.parametrize(
+    "module", ["intrasplat", "intrasplat.__main__", "contract", "client.cli", "intrasplat_client", "service.app"]
+)
 def test_importing_it_loads_no_torch(module: str) -> None:
     heavy = ("torch", "numba", "cv2", "scipy", "matplotlib", "worker")
     program = f"import sys, {module}; print(*(each for each in {heavy!r} if each in sys.modules))"

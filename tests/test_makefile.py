@@ -27,8 +27,15 @@ class Checkout:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.cpu_index, self.nvidia = NO_ANSWER, ""
-        for name in ("Makefile", "pyproject.toml", "constraints.txt"):
-            shutil.copy(REPOSITORY / name, folder)
+        for name in (
+            "Makefile",
+            "pyproject.toml",
+            "client/pyproject.toml",
+            "service/pyproject.toml",
+            "constraints.txt",
+        ):
+            (folder / name).parent.mkdir(exist_ok=True)
+            shutil.copy(REPOSITORY / name, folder / name)
         python = folder / ".venv" / "bin" / "python"
         python.parent.mkdir(parents=True)
         for name in ("python", "ruff", "mypy", "intrasplat"):
@@ -82,14 +89,14 @@ def cpu_index() -> Iterator[str]:
 
 def test_setup_installs_once_and_only_what_running_needs(checkout: Checkout) -> None:
     (install,) = checkout.installs()
-    assert install.endswith("--editable .")
+    assert install.endswith("--editable .[charts] --editable ./client --editable ./service")
     assert checkout.installs() == []
     assert checkout.installs(target="demo") == []
 
 
 def test_tests_and_checks_add_their_tools_once(checkout: Checkout) -> None:
     running, tools = checkout.installs(target="test")
-    assert running.endswith("--editable .")
+    assert running.endswith("--editable .[charts] --editable ./client --editable ./service")
     assert tools.endswith("--editable .[dev]")
     assert checkout.installs(target="check") == []
 
@@ -98,7 +105,7 @@ def test_changed_requirements_are_installed_for_running_and_for_the_tests(checko
     checkout.installs(target="test")
     os.utime(checkout.folder / ".venv" / ".installed", (0, 0))
     running, tools = checkout.installs(target="test")
-    assert running.endswith("--editable .")
+    assert running.endswith("--editable .[charts] --editable ./client --editable ./service")
     assert tools.endswith("--editable .[dev]")
 
 

@@ -130,7 +130,7 @@ def opened(folder: Path) -> Iterator[dict[str, Any]]:
 def clip(tmp_path: Path) -> Path:
     size = ["--frames", "10", "--width", "96", "--height", "80"]
     subprocess.run(
-        [sys.executable, "-m", "worker", "phantom", *size, "--out", str(tmp_path / "clip")], check=True, timeout=120
+        [sys.executable, "-m", "lab", "phantom", *size, "--out", str(tmp_path / "clip")], check=True, timeout=120
     )
     return tmp_path / "clip"
 

@@ -39,7 +39,8 @@ def test_the_table_of_settings_has_every_setting_with_its_default() -> None:
 
 def test_every_variable_that_is_named_exists() -> None:
     named = set(re.findall(r"INTRASPLAT_[A-Z_]+", PAGE)) - {ENVIRONMENT_PREFIX + name.upper() for name, _ in Settings()}
-    sources = [path.read_text(encoding="utf-8") for path in (REPOSITORY / "worker").rglob("*.py")]
+    folders = (REPOSITORY / "intrasplat", REPOSITORY / "worker")
+    sources = [path.read_text(encoding="utf-8") for folder in folders for path in folder.rglob("*.py")]
     assert [name for name in sorted(named) if not any(f'"{name}"' in each for each in sources)] == []
 
 

@@ -22,12 +22,13 @@ TARGETS = (
     "help", "setup", "demo", "test", "check", "bench", "gpu-check", "evaluate", "capacity", "chaos", "sbom", "clean",
 )  # fmt: skip
 MAX_LINES = 400
-OURS = ("contract", "worker", "service", "client", "intrasplat_client", "tests")
+OURS = ("intrasplat", "contract", "worker", "service", "client", "intrasplat_client", "lab", "tests")
 LINK = re.compile(r"\[(?:[^\[\]]|\\.)*\]\(([^)\s]+)\)")
 
 
-def project() -> dict[str, Any]:
-    document = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
+def project(folder: str = ".") -> dict[str, Any]:
+    """The table [project]: of the library, or of the server ("service") or the HTTP client ("client")."""
+    document = tomllib.loads((REPOSITORY / folder / "pyproject.toml").read_text(encoding="utf-8"))
     table: dict[str, Any] = document["project"]
     return table
 
@@ -61,7 +62,7 @@ def names_in_the_tree() -> list[str]:
     """What the annotated tree in docs/index.md names, as paths."""
     page = (REPOSITORY / "docs" / "index.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```\w*\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    tree = next(each for each in blocks if each.startswith("contract/"))
+    tree = next(each for each in blocks if each.startswith("intrasplat/"))
     named, folder = [], ""
     for line in tree.splitlines():
         # Names end where the description begins: after two spaces, or at the end of the line.
@@ -78,7 +79,7 @@ def test_the_tree_in_the_docs_names_only_what_exists() -> None:
     assert [each for each in names_in_the_tree() if not (REPOSITORY / each).exists()] == []
 
 
-@pytest.mark.parametrize("package", ["contract", "worker"])
+@pytest.mark.parametrize("package", ["intrasplat", "contract", "lab"])
 def test_the_tree_in_the_docs_names_every_room(package: str) -> None:
     modules = {f"{package}/{path.name}" for path in (REPOSITORY / package).glob("[!_]*.py")}
     folders = {f"{package}/{path.parent.name}/" for path in (REPOSITORY / package).glob("*/__init__.py")}
@@ -119,6 +120,8 @@ def test_versions_agree() -> None:
     version = project()["version"]
     citation = (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert [project(folder)["version"] for folder in ("service", "client")] == [version, version]
+    assert {f"intrasplat=={version}", f"intrasplat-client=={version}"} <= set(project("service")["dependencies"])
     assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [version]
     assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0] == version
 
@@ -127,8 +130,8 @@ def test_every_direct_dependency_has_a_constraint_and_no_other_has() -> None:
     lines = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
     constrained = {requirement_name(each) for each in lines if each and not each.startswith("#")}
     extras = project()["optional-dependencies"]
-    direct = {requirement_name(each) for each in [*project()["dependencies"], *extras["dev"]]}
-    assert constrained == direct
+    needed = [*project()["dependencies"], *project("service")["dependencies"], *extras["charts"], *extras["dev"]]
+    assert constrained == {requirement_name(each) for each in needed} - {"intrasplat", "intrasplat-client"}
 
 
 def test_the_constraint_on_torch_is_the_projects_range() -> None:
@@ -149,7 +152,7 @@ def test_triton_is_asked_for_in_the_range_that_a_gpu_is_held_to() -> None:
 
 def test_long_files_say_why_they_are_long() -> None:
     silent = []
-    for package in ("contract", "worker", "service", "client", "tests", "benchmarks"):
+    for package in ("intrasplat", "contract", "worker", "service", "client", "lab", "tests"):
         for path in sorted((REPOSITORY / package).rglob("*.py")):
             lines = path.read_text(encoding="utf-8").splitlines()
             if len(lines) > MAX_LINES and not any(re.match(r"# long: \S", each) for each in lines):
@@ -157,8 +160,8 @@ def test_long_files_say_why_they_are_long() -> None:
     assert silent == [], "split them, or say why not in a line that begins '# long: '"
 
 
-@pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks").rglob("*.py")), ids=lambda path: path.stem)
-def test_a_benchmark_imports_only_names_that_exist(path: Path) -> None:
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "lab").rglob("*.py")), ids=lambda path: path.stem)
+def test_the_laboratory_imports_only_names_that_exist(path: Path) -> None:
     missing = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:

@@ -125,7 +125,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "clip"
     size = ["--frames", "10", "--width", "96", "--height", "80"]
-    subprocess.run([sys.executable, "-m", "worker", "phantom", *size, "--out", str(folder)], check=True, timeout=300)
+    subprocess.run([sys.executable, "-m", "lab", "phantom", *size, "--out", str(folder)], check=True, timeout=300)
     return folder
 
 

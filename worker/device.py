@@ -148,7 +148,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 
 def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:
     """Do what was ordered, and report it."""
-    order, limits = task.order, ClipLimits.of(settings)
+    order, limits = task.order, settings.clip_limits
     if order.record.imported is not None:
         take_in(order, order.record.imported, limits, settings.max_upload_bytes, channel)
         return

@@ -11,8 +11,8 @@ PATIENCE = 4.0
 """A request may wait so many times the seconds that it takes, before those that came later are answered first."""
 
 FIRST_SPEEDS = (3e11, 1e12, 2e12)
-"""Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail (intrasplat/view/coarse.py),
-until the first render has been timed (bm_service, on two cores)."""
+"""Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail
+(intrasplat/view/coarse.py), until the first render has been timed (bm_service, on two cores)."""
 COARSEST = len(FIRST_SPEEDS) - 1
 """Level of detail."""
 LEARNING = 0.2

@@ -29,19 +29,17 @@ from contract.wire.rendering import (
     render_cost,
 )
 from intrasplat.camera import Intrinsics
-from intrasplat.errors import InputError, LimitError
+from intrasplat.errors import InputError
 from intrasplat.export import DRAWN, export_parts
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.names import RECORDED
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.picture import MEDIA_TYPES, ImageFormat, IntrinsicsOverride, Layer, RecordedMasks
-from intrasplat.pose import MatrixPose, OrbitPose, world_from_camera
+from intrasplat.picture import MEDIA_TYPES, ImageFormat, Layer, RecordedMasks
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cpu.threads import beside
-from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
-from intrasplat.view.camera import endoscope_pose, right_eye
+from intrasplat.view.camera import camera_of, endoscope_pose, pose_of, right_eye, seen_through
 from intrasplat.view.coarse import LEVELS, thinned
 from intrasplat.view.encode import FOR_EYES, encode_layer
 from intrasplat.view.frame import LARGE_PIXELS, ROUNDING, View, drawn_pixels, no_pause, render_frame, renderer_of
@@ -146,7 +144,7 @@ class Views:
         if isinstance(request, ExportRequest):
             return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
         if scene is not None:
-            asked = _seen_through(scene.intrinsics, request.camera)
+            asked = seen_through(scene.intrinsics, request.camera)
             is_own, is_judged = request.is_from_endoscope, request.layer is Layer.CONFIDENCE
             drawn = drawn_pixels(
                 asked, scene.intrinsics, request.max_pixels, confidence=is_judged, from_endoscope=is_own
@@ -339,29 +337,3 @@ def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:
 def shown_time(scene: TrainedScene, t: float) -> float:
     """Model time that is shown for t: after the last frame, that of the last frame."""
     return min(t, (scene.frame_count - 1) / scene.frame_count)
-
-
-def pose_of(scene: TrainedScene, pose: MatrixPose | OrbitPose | None) -> NDArray[np.float64] | None:
-    """world_from_camera [4, 4], mm; None stays None, the endoscope's own pose."""
-    if pose is None:
-        return None
-    return np.array(world_from_camera(pose, MEDIAN_DEPTH_UNITS / scene.units_per_mm), dtype=np.float64)
-
-
-def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> Intrinsics:
-    """The clip's camera with the caller's overrides.
-
-    Raises:
-        LimitError: it has more than max_pixels.
-    """
-    width, height = wanted.size(clip.width, clip.height)
-    if width * height > max_pixels:
-        problem = f"{width} x {height} is more than {max_pixels} pixels."
-        raise LimitError("width", problem, "Ask for a smaller image.")
-    return _seen_through(clip, wanted)
-
-
-def _seen_through(clip: Intrinsics, wanted: IntrinsicsOverride) -> Intrinsics:
-    """The clip's camera with the caller's overrides, of any size."""
-    changes = {name: value for name in ("fx", "fy", "cx", "cy") if (value := getattr(wanted, name)) is not None}
-    return dataclasses.replace(clip.resized(*wanted.size(clip.width, clip.height)), **changes)

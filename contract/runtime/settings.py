@@ -14,6 +14,7 @@ from pydantic_core.core_schema import ValidationInfo
 
 from contract.runtime.queue_url import parse_queue_url
 from intrasplat.errors import InputError
+from intrasplat.intake.limits import EYES, ClipLimits
 from intrasplat.names import DeviceName
 
 GIB = 2**30
@@ -143,6 +144,11 @@ class Settings(BaseModel):
     # many machines
     store_url: str | None = Field(default=None, pattern=r"^s3://[^\s]+$")
     """The bucket that keeps clips and scenes for all machines; None: data_dir keeps them."""
+
+    @property
+    def clip_limits(self) -> ClipLimits:
+        """The limits of clips. A picture may hold two eyes of max_frame_pixels."""
+        return ClipLimits(self.max_frames, self.max_clip_s, EYES * self.max_frame_pixels)
 
     @field_validator("webhook_hosts")
     @classmethod

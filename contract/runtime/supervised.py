@@ -42,7 +42,8 @@ class Supervised:
         name: of the child, for messages.
         command: the program and its arguments.
         environment: of the child; None: the environment of this process.
-        last_words: the file in which the child leaves the UnavailableError that ended it (intrasplat/commands/exits.py);
+        last_words: the file in which the child leaves the UnavailableError that ended it
+        (intrasplat/commands/exits.py);
             None: its status alone is looked at.
         log: the file that receives stdout and stderr; None: the child writes where this process does.
         pipes: connect stdin and stdout to this process. The child is asked to end by closing its stdin, not by SIGTERM.

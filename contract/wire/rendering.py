@@ -9,7 +9,6 @@ id of the request that it gives up, and gets no answer.
 from __future__ import annotations
 
 import math
-from enum import StrEnum
 from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,80 +18,19 @@ from intrasplat.formats import ExportOptions
 from intrasplat.measuring import MAX_POINTS, Point
 from intrasplat.names import JOB_ID_PATTERN, Eye
 from intrasplat.notices import Notice
+from intrasplat.picture import (
+    MAX_JUDGED_PIXELS,
+    Highlights,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    RecordedMasks,
+    Unseen,
+)
 from intrasplat.pose import MatrixPose, OrbitPose
-
-
-class Layer(StrEnum):
-    """rgb; depth along the camera's z; confidence in [0, 1]."""
-
-    RGB = "rgb"
-    DEPTH = "depth"
-    CONFIDENCE = "confidence"
-
-
-class ImageFormat(StrEnum):
-    """png and npy are exact (depth: 16-bit PNG in 0.01 mm, npy float32 mm); jpeg and webp are for eyes."""
-
-    PNG = "png"
-    JPEG = "jpeg"
-    WEBP = "webp"
-    NPY = "npy"
-
-
-class Unseen(StrEnum):
-    """What a render shows where no training frame saw anything: a hatch, or the model's guess."""
-
-    MARK = "mark"
-    GUESS = "guess"
-
-
-class Highlights(StrEnum):
-    """Whether a render's colours show the highlights that both eyes of a stereo clip told apart."""
-
-    ON = "on"
-    OFF = "off"
-
-    def shown_in(self, layer: Layer) -> bool:
-        """Whether the render behind a layer has them; only colours can do without."""
-        return self is Highlights.ON or layer is not Layer.RGB
-
-
-MEDIA_TYPES = {
-    ImageFormat.PNG: "image/png",
-    ImageFormat.JPEG: "image/jpeg",
-    ImageFormat.WEBP: "image/webp",
-    ImageFormat.NPY: "application/x-npy",
-}
-
 
 GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
-
-
-class IntrinsicsOverride(BaseModel):
-    """Parts of the camera the caller wants otherwise than the clip's left eye; what is None follows the scene.
-
-    With only a width or a height the other keeps the aspect; focal lengths and centre scale along unless given.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    width: int | None = Field(default=None, ge=8, le=8192)
-    height: int | None = Field(default=None, ge=8, le=8192)
-    fx: float | None = Field(default=None, gt=0, le=1e5)
-    fy: float | None = Field(default=None, gt=0, le=1e5)
-    cx: float | None = Field(default=None, ge=-1e5, le=1e5)
-    cy: float | None = Field(default=None, ge=-1e5, le=1e5)
-
-    def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height in pixels of the image of a clip of width x height."""
-        if self.width is not None and self.height is not None:
-            return self.width, self.height
-        if self.width is not None:
-            return self.width, max(1, round(self.width * height / width))
-        if self.height is not None:
-            return max(1, round(self.height * width / height)), self.height
-        return width, height
 
 
 class PictureCamera(ClipCamera):
@@ -163,14 +101,6 @@ class ExportRequest(BaseModel):
     export_id: str = Field(pattern=r"^[0-9a-f]{32}$")
     """Chosen by the asker, the same for all parts."""
     part: int = Field(default=0, ge=0)
-
-
-class RecordedMasks(StrEnum):
-    """What a recorded frame shows of its mask: the masked parts marked, nothing, or the mask alone."""
-
-    MARKED = "marked"
-    OFF = "off"
-    ONLY = "only"
 
 
 class RecordedRequest(BaseModel):
@@ -257,8 +187,6 @@ class WorkerReply(BaseModel):
     """Of depth in false colours: the depths of the brightest and the darkest colour, the same throughout the clip."""
 
 
-MAX_JUDGED_PIXELS = 1 << 21
-"""A picture smaller than the recording is drawn in the recording's pixels, in at most so many: those of 1920 x 1080."""
 TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
 """What a scene is taken to have of which nothing is known yet."""
 

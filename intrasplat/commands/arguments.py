@@ -5,11 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
-from contract.runtime.settings import Settings
 from intrasplat.commands.exits import EXIT_CODES_HELP, flag_of
 from intrasplat.formats import ExportOptions
 from intrasplat.options import ClipOptions, Options, parse_options
@@ -26,18 +24,6 @@ def add_command(
     parser.epilog = EXIT_CODES_HELP
     parser.set_defaults(command=command)
     return parser
-
-
-def add_data_dir(parser: argparse.ArgumentParser) -> None:
-    """Add --data-dir, which settings_of reads."""
-    parser.add_argument("--data-dir", type=Path, metavar="DIR", help="of the service (default: its settings')")
-
-
-def settings_of(namespace: argparse.Namespace) -> Settings:
-    """The settings of the environment, with the data directory of --data-dir if that is given. Raises InputError."""
-    settings = Settings.from_environment()
-    chosen: Path | None = namespace.data_dir
-    return settings if chosen is None else settings.model_copy(update={"data_dir": chosen})
 
 
 def add_options(

@@ -66,7 +66,6 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.poses import with_poses
     from intrasplat.poses.trajectory import from_first, read_tum, trajectory_error, write_tum
     from intrasplat.stereo import ClipPaths, open_with_depth
-    from worker.orders import job_progress
 
     out: Path | None = options.out
     if out is not None and (out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK)):
@@ -75,7 +74,7 @@ def run_cli(options: argparse.Namespace) -> int:
     given, timings = given_options(options, ReconstructionOptions), Timings()
     keep_decoder_ready()
     with ProgressBar(sys.stderr) as bar:
-        hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)))
+        hooks = Hooks(on_progress=bar.show)
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
         true = None if known is None else from_first(_of_frames(clip, *known))

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from types import TracebackType
-from typing import TextIO
-
-from contract.wire.job import JobProgress
+from typing import Protocol, TextIO
 
 BAR_CELLS = 24
 LINE_COLUMNS = 78
 
 
-def format_progress(progress: JobProgress) -> str:
+class Shown(Protocol):
+    """Progress of a stage: of this process (intrasplat/machine/hooks.py) or of a job on a service.
+
+    fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue.
+    """
+
+    @property
+    def stage(self) -> str: ...
+    @property
+    def fraction(self) -> float: ...
+    @property
+    def psnr_db(self) -> float | None: ...
+    @property
+    def seconds_left(self) -> float | None: ...
+
+
+def format_progress(progress: Shown) -> str:
     """`train      [######..................]  25 %  31.24 dB  42 s left`, without the parts that are unknown."""
-    filled = round(progress.fraction * BAR_CELLS)
-    parts = [f"{progress.stage:<10} [{'#' * filled}{'.' * (BAR_CELLS - filled)}] {progress.fraction:4.0%}"]
-    if progress.psnr_db is not None:
+    fraction = min(1.0, max(0.0, progress.fraction)) if math.isfinite(progress.fraction) else 0.0
+    filled = round(fraction * BAR_CELLS)
+    parts = [f"{progress.stage:<10} [{'#' * filled}{'.' * (BAR_CELLS - filled)}] {fraction:4.0%}"]
+    if progress.psnr_db is not None and math.isfinite(progress.psnr_db):
         parts.append(f"{progress.psnr_db:.2f} dB")
-    if progress.seconds_left is not None:
+    if progress.seconds_left is not None and math.isfinite(progress.seconds_left):
         parts.append(f"{progress.seconds_left:.0f} s left")
     return "  ".join(parts)
 
@@ -31,7 +47,7 @@ class ProgressBar:
         self._last_stage: str | None = None
         self._line_open = False
 
-    def show(self, progress: JobProgress) -> None:
+    def show(self, progress: Shown) -> None:
         """Redraw the line; on anything but a terminal, write one line a stage."""
         if self._on_terminal:
             self._stream.write(f"\r{format_progress(progress):<{LINE_COLUMNS}}")

@@ -69,7 +69,6 @@ def run_cli(options: argparse.Namespace) -> int:
     """
     accepted_at_s = time.time()
     from intrasplat.machine.hooks import Hooks
-    from worker.orders import job_progress
 
     out: Path = options.out
     if out.exists() and not (out.is_dir() and {path.name for path in out.iterdir()} <= UNFINISHED):
@@ -81,7 +80,7 @@ def run_cli(options: argparse.Namespace) -> int:
     before = {number: signal.signal(number, _once(interrupted)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with ProgressBar(sys.stderr) as bar:
-            hooks = Hooks(on_progress=lambda now: bar.show(job_progress(now)), should_stop=interrupted.is_set)
+            hooks = Hooks(on_progress=bar.show, should_stop=interrupted.is_set)
             report = _reconstruct(options, out, hooks, accepted_at_s)
     except Cancelled as error:
         again = " The same command goes on from there." if any((out / name).exists() for name in KEPT) else ""

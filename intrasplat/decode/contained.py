@@ -39,10 +39,10 @@ NONSENSE = "the decoder talks nonsense"
 MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what a false answer may raise
 MEMORY_REMEDY = "Cut it shorter or scale it down, or give the worker's machine or container more memory."
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
-_PACKAGES = Path(__file__).resolve().parents[3]  # the folder that holds `worker` and `contract`
+_PACKAGES = Path(__file__).resolve().parents[2]  # the folder that holds `intrasplat`
 _KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
 
-logger = logging.getLogger("intrasplat.worker")
+logger = logging.getLogger(__name__)
 
 OnReport = Callable[[float], None]
 

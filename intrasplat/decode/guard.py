@@ -124,6 +124,6 @@ def _leave_network() -> bool:
 
 def _libraries() -> list[Path]:
     """Folders of Python and the libraries that it loads."""
-    package = Path(__file__).resolve().parents[2]
+    package = Path(__file__).resolve().parents[1]
     installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
-    return [package, package.parent / "contract", *map(Path, (*installed, "/usr", "/lib", "/lib64"))]
+    return [package, *map(Path, (*installed, "/usr", "/lib", "/lib64"))]

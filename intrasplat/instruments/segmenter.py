@@ -25,7 +25,7 @@ LIKELY = 0.1
 """Probability from which a pixel counts as what might be an instrument."""
 
 
-logger = logging.getLogger("intrasplat.worker")
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)

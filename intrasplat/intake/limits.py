@@ -7,13 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from intrasplat.errors import LimitError
 from intrasplat.machine.memory_limit import memory_bytes
-
-if TYPE_CHECKING:
-    from contract.runtime.settings import Settings
 
 MIN_SIDE_PX = 16  # stereo matching and the rasteriser's tiles need as much
 
@@ -65,11 +61,6 @@ class ClipLimits:
     clip_bytes: int = MAX_CLIP_BYTES
     decoded_bytes: int = field(default_factory=memory_for_clip_bytes)
     on_picture: Callable[[], None] = field(default=_ignore, compare=False)
-
-    @classmethod
-    def of(cls, settings: Settings) -> ClipLimits:
-        """The limits of an installation. A picture may hold two eyes of max_frame_pixels."""
-        return cls(settings.max_frames, settings.max_clip_s, EYES * settings.max_frame_pixels)
 
     def numbers(self) -> dict[str, float]:
         """The limits by their names, for another process."""

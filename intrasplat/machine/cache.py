@@ -61,9 +61,9 @@ def kernel_cache_directory() -> Path:
         RuntimeError: none of them is set and this user has no home.
     """
     digest = hashlib.sha256(numba.__version__.encode())
-    worker = Path(__file__).resolve().parents[1]
-    compiled_in = ("model/constants.py", "model/layout.py")
-    for source in [Path(__file__), *(worker / each for each in compiled_in), *sorted(worker.glob("raster/cpu/*.py"))]:
+    splat = Path(__file__).resolve().parents[1] / "splat"
+    compiled_in = [splat / "constants.py", splat / "layout.py", *sorted(splat.glob("cpu/*.py"))]
+    for source in [Path(__file__), *compiled_in]:
         digest.update(source.read_bytes())
     chosen = os.environ.get("INTRASPLAT_CACHE")
     base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "intrasplat"

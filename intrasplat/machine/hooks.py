@@ -27,6 +27,15 @@ class Progress:
     frames: int = 0
     megapixels: float = 0.0
 
+    def __str__(self) -> str:
+        """One line for people, such as `train 25 %, 31.2 dB, 42 s left`."""
+        parts = [f"{self.stage} {self.fraction:.0%}"]
+        if self.psnr_db is not None:
+            parts.append(f"{self.psnr_db:.1f} dB")
+        if self.seconds_left is not None:
+            parts.append(f"{self.seconds_left:.0f} s left")
+        return ", ".join(parts)
+
 
 def ignore(*arguments: object) -> None:
     """A callback that does nothing."""

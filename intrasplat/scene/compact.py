@@ -78,7 +78,8 @@ class DoesNotFitError(ValueError):
 
 
 def state_rows(channels: int) -> list[int]:
-    """Rows of intrasplat/splat/layout.py that a table holds of a Gaussian at rest, where its motion has so many channels.
+    """Rows of intrasplat/splat/layout.py that a table holds of a Gaussian at rest, where its motion has so many
+    channels.
 
     Without a channel for the gloss there is no gloss.
     """

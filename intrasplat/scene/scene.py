@@ -39,8 +39,8 @@ class TrainedScene:
     units_per_mm            optimiser units = mm * units_per_mm
     preset, seed, settings  how it was trained; settings is JSON
     trained_t               model times of the training frames
-    seen                    [N] float32 in [0, 1]: how likely each Gaussian is right (intrasplat/quality/trust.py); 0: no
-                            training frame saw it
+    seen                    [N] float32 in [0, 1]: how likely each Gaussian is right (intrasplat/quality/trust.py); 0:
+                            no training frame saw it
     right_eye_mm            where the right eye is, in the left one's camera axes, if both taught; the eyes decide what
                             a view shows of the Gaussians' gloss; None: there is none
     stored                  the compact tensors that are written to disk instead of the model's own, and from which

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from intrasplat.scene.archive import archive_parts
 from intrasplat.scene.player_page import page_parts
+from intrasplat.server_parts import server_part
+
+DASHBOARD_VARIABLE = "INTRASPLAT_DASHBOARD_DIR"
 
 
 def stored_parts(name: str, folder: Path, scene_id: str | None, dashboard_dir: Path | None) -> Iterator[bytes]:
@@ -20,3 +24,9 @@ def stored_parts(name: str, folder: Path, scene_id: str | None, dashboard_dir: P
         InputError, SceneError, UnavailableError: as archive_parts() and page_parts().
     """
     return page_parts(folder, scene_id, dashboard_dir) if name == "html" else archive_parts(folder, scene_id)
+
+
+def installed_dashboard() -> Path | None:
+    """The folder of the page's files, which come with the server; None: it is not installed."""
+    folder = os.environ.get(DASHBOARD_VARIABLE) or server_part("dashboard")
+    return Path(folder) if folder else None

@@ -54,8 +54,8 @@ class Camera:
     """A pinhole camera: OpenCV axes, focal lengths and principal point in pixels.
 
     camera_from_world is [4, 4] float64, rigid, translation in optimiser units; a tensor where its gradient is wanted.
-    side and dim say what it sees of the gloss g of a Gaussian (intrasplat/splat/gaussians.py): the colour gains side g and
-    loses dim |g|. The left eye has side -1/2, the right eye 1/2. The rasteriser gets colours that have it already.
+    side and dim say what it sees of the gloss g of a Gaussian (intrasplat/splat/gaussians.py): the colour gains side g
+    and loses dim |g|. The left eye has side -1/2, the right eye 1/2. The rasteriser gets colours that have it already.
     enlarged and recorded_depth say how large a pixel of the recording is (docs/rasterizer.md): by how much the focal
     lengths exceed the recording's, and the third row of the recording's camera_from_world. By default it is a pixel.
     """

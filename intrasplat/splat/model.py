@@ -1,9 +1,9 @@
 """What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
 
 Symbols: N Gaussians; H W pixels, as many as the camera says; F frames per step.
-Implementations: CpuModel (intrasplat/splat/cpu/model.py) and CudaModel (intrasplat/splat/cuda/model.py). Each holds a Motion,
-which evaluates and trains the deformation: by kernels, or on the CPU by torch (intrasplat/splat/cpu/unfused.py).
-intrasplat/splat/backend.py makes the one for a device.
+Implementations: CpuModel (intrasplat/splat/cpu/model.py) and CudaModel (intrasplat/splat/cuda/model.py). Each holds a
+Motion, which evaluates and trains the deformation: by kernels, or on the CPU by torch
+(intrasplat/splat/cpu/unfused.py). intrasplat/splat/backend.py makes the one for a device.
 
 A device may lag behind: step() may return before its step is made. Every other method waits for all steps first, so
 none sees a model between two steps. The sums of a step that lags come with a later answer. They tell whether its loss
@@ -98,8 +98,8 @@ class Model(Protocol):
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * render(camera, t)), cotangents [5, H, W], to the Gaussians as they are at t.
 
-        [VALUES, N], rows as in intrasplat/splat/layout.py, colours as if none were held above 0. Other harmonics are left
-        out.
+        [VALUES, N], rows as in intrasplat/splat/layout.py, colours as if none were held above 0. Other harmonics are
+        left out.
         """
         ...
 

@@ -26,7 +26,7 @@ from intrasplat.stereo.depth import estimate_depth
 TRIES = 3
 """Of a clip whose decoding process is killed from outside."""
 
-logger = logging.getLogger("intrasplat.worker")
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def open_with_depth(
 
     timings get decode_s, until the size of a stereo clip is known, and stereo_s, which includes decoding its frames.
 
-    Without masks instruments are found (intrasplat/instruments) by the segmenter, an ONNX file, if there is one, else if
-    options.mask_source is auto.
+    Without masks instruments are found (intrasplat/instruments) by the segmenter, an ONNX file, if there is one, else
+    if options.mask_source is auto.
 
     When something outside kills the decoding process, it is tried again, TRIES times in all.
 

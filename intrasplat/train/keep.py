@@ -38,7 +38,7 @@ NICENESS = 10
 SPARE_BYTES = 1 << 30
 """Nothing is kept that would leave less room on the disk than this."""
 
-logger = logging.getLogger("intrasplat.worker")
+logger = logging.getLogger(__name__)
 
 
 @contextmanager

@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from intrasplat.camera import Intrinsics
+from intrasplat.errors import LimitError
+from intrasplat.picture import IntrinsicsOverride
+from intrasplat.pose import MatrixPose, OrbitPose, world_from_camera
 from intrasplat.report import RightEye
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.step import camera_vector
-from intrasplat.train.targets import camera_in_units
+from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units
 
 MAX_SIDE = 1 << 20
 """Pixels as fine as the recording's along a side; a lens of 180 degrees needs fewer."""
@@ -110,3 +113,29 @@ def gloss_seen(
     away = float(np.linalg.norm(from_left_mm - along * baseline_mm)) / length_mm
     known = float(np.exp(-0.5 * (away / FADING) ** 2))
     return known * (along - 0.5), 0.0
+
+
+def pose_of(scene: TrainedScene, pose: MatrixPose | OrbitPose | None) -> NDArray[np.float64] | None:
+    """world_from_camera [4, 4], mm; None stays None, the endoscope's own pose."""
+    if pose is None:
+        return None
+    return np.array(world_from_camera(pose, MEDIAN_DEPTH_UNITS / scene.units_per_mm), dtype=np.float64)
+
+
+def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> Intrinsics:
+    """The clip's camera with the caller's overrides.
+
+    Raises:
+        LimitError: it has more than max_pixels.
+    """
+    width, height = wanted.size(clip.width, clip.height)
+    if width * height > max_pixels:
+        problem = f"{width} x {height} is more than {max_pixels} pixels."
+        raise LimitError("width", problem, "Ask for a smaller image.")
+    return seen_through(clip, wanted)
+
+
+def seen_through(clip: Intrinsics, wanted: IntrinsicsOverride) -> Intrinsics:
+    """The clip's camera with the caller's overrides, of any size."""
+    changes = {name: value for name in ("fx", "fy", "cx", "cy") if (value := getattr(wanted, name)) is not None}
+    return dataclasses.replace(clip.resized(*wanted.size(clip.width, clip.height)), **changes)

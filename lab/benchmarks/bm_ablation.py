@@ -1,6 +1,7 @@
 """Measure what each part of `fast` is worth: train with one part changed at a time.
 
-    python lab/benchmarks/bm_ablation.py [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv] [--only NAME ...]
+    python -m lab.benchmarks.bm_ablation [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv]
+        [--only NAME ...]
 
 The number of iterations is fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording
 (named `d4d-a`, if it is there) and two synthetic motions with true depth, 320 x 256, 64 frames. Both splits.

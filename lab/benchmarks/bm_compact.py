@@ -1,6 +1,7 @@
 """Measure what quantising a scene saves and costs: bytes against decibels, on training and on held-out frames.
 
-    python lab/benchmarks/bm_compact.py [CLIP ...] [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv FILE]
+    python -m lab.benchmarks.bm_compact [CLIP ...] [--iterations 1200] [--tolerances 0.05 0.1 0.14 0.2 0.4 0.8] [--csv
+        FILE]
 
 Trains `fast` on each clip (default: a synthetic one) for so many iterations, then stores the result at one tolerance
 after the other. Prints a row each: megabytes of the floats, of the compact file and of the manifest, the step, what was

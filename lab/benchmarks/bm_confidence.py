@@ -7,8 +7,8 @@ views 10 and 15 degrees off the axis and the right eye's views with the truth. P
 lab/evaluate/truth.py. With --csv it also writes the reliability diagram: a row a clip, kind of view and bin of
 confidence, and the same as PNG beside it.
 
---fit finds the constants of intrasplat/quality/trust.py and intrasplat/view/confidence.py anew: a logistic regression on
-pixels of the clips FITTED_ON, trained on both eyes and on the left one alone. The other clips confirm it.
+--fit finds the constants of intrasplat/quality/trust.py and intrasplat/view/confidence.py anew: a logistic regression
+on pixels of the clips FITTED_ON, trained on both eyes and on the left one alone. The other clips confirm it.
 """
 
 from __future__ import annotations

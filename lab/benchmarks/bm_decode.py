@@ -3,7 +3,7 @@
 Seconds of the processor, parent and child together, are given too: on a machine that does other things they tell more.
 
 
-    python lab/benchmarks/bm_decode.py [--data FOLDER] [--repeats 5]
+    python -m lab.benchmarks.bm_decode [--data FOLDER] [--repeats 5]
 
 FOLDER (INTRASPLAT_DATA, else ../shared/data) holds `d4d_stereo` (a side by side video) and `d4d_endonerf` (PNG).
 """

@@ -1,6 +1,6 @@
 """What it costs to be able to go on after a kill: the pauses of training, and the bytes and seconds of the disk.
 
-    python lab/benchmarks/bm_keep.py [CLIP --calibration F --masks F] [--preset fast] [--iterations 400] [--period-s 3]
+    python -m lab.benchmarks.bm_keep [CLIP --calibration F --masks F] [--preset fast] [--iterations 400] [--period-s 3]
 
 Reconstructs the clip, else a synthetic stereo clip of 640x512, with its state kept every --period-s of training and
 with nothing kept, in turn, --rounds times. Prints for each the median seconds of training and of the whole, and for

@@ -1,6 +1,7 @@
 """How well is tissue shown that comes into view later, and how well do poses that were found do beside true ones?
 
-    python lab/benchmarks/bm_keyframes.py [--motions breathing pull] [--paths still pan ...] [--frames 128] [--seeds 0 1]
+    python -m lab.benchmarks.bm_keyframes [--motions breathing pull] [--paths still pan ...] [--frames 128] [--seeds 0
+        1]
         [--iterations 600] [--out keyframes.csv]
 
 Draws stereo clips of 320x256 and trains `fast` on each with true poses and with those that `auto` finds. Prints and

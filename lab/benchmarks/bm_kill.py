@@ -1,6 +1,6 @@
 """How much work a kill -9 costs: seconds until a killed job is again where it was.
 
-    python lab/benchmarks/bm_kill.py CLIP [--calibration F] [--masks F] [--preset fast] [--budget-s 60] [--kills 20]
+    python -m lab.benchmarks.bm_kill CLIP [--calibration F] [--masks F] [--preset fast] [--budget-s 60] [--kills 20]
 
 A queue and a worker as `intrasplat up` runs them, on the clip's job of --budget-s. The kills are spread evenly over
 --length-s of the job; in turn they end the device process and the whole worker, which is started again at once. Prints

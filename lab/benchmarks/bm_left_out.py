@@ -1,6 +1,7 @@
 """What leaving out frames that show nothing new saves, and what it costs.
 
-    python lab/benchmarks/bm_left_out.py [--frames 256] [--width 320] [--height 256] [--iterations 300] [--only repeats ...]
+    python -m lab.benchmarks.bm_left_out [--frames 256] [--width 320] [--height 256] [--iterations 300] [--only repeats
+        ...]
 
 Draws stereo clips of synthetic tissue whose frames repeat, pause, rest, hardly move, or move. Matches and trains each
 with all frames and without those that show nothing new (`--use-frames`). Prints the median seconds of stereo, of three

@@ -1,6 +1,7 @@
 """A long clip beside parts of it alone: peak memory of each stage, a step's time, held-out score.
 
-    python -m lab.benchmarks.bm_long --cache FOLDER [--motions breathing pull] [--frames 1000] [--parts 0 600] [--part 100]
+    python -m lab.benchmarks.bm_long --cache FOLDER [--motions breathing pull] [--frames 1000] [--parts 0 600] [--part
+        100]
         [--width 640] [--height 512] [--seed 0] [--preset fast] [--steps-a-frame 6] [--csv docs/results/long.csv]
 
 Draws a synthetic clip of each motion in StereoMIS layout, raw frames of two eyes, into FOLDER, where the next run finds

@@ -1,6 +1,7 @@
 """How well are instruments found in clips without masks, what does it cost, and what does the model lose?
 
-    python lab/benchmarks/bm_masks.py [--seeds 11 12] [--frames 64] [--size 640x512] [--iterations 300] [--out masks.csv]
+    python -m lab.benchmarks.bm_masks [--seeds 11 12] [--frames 64] [--size 640x512] [--iterations 300] [--out
+        masks.csv]
         [--places moving rests lies inside small]
 
 Draws stereo clips of each kind of instrument and of none, withholds their masks and finds them (`--mask-source auto`).

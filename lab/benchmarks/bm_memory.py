@@ -1,6 +1,6 @@
 """How much memory each stage of a reconstruction takes at most.
 
-    python lab/benchmarks/bm_memory.py [--motion pull] [--frames 150] [--width 640] [--height 512] [--preset fast]
+    python -m lab.benchmarks.bm_memory [--motion pull] [--frames 150] [--width 640] [--height 512] [--preset fast]
         [--iterations 60 | --budget-s S] [--cache FOLDER] [--csv docs/results/memory.csv]
 
 Draws a synthetic clip in StereoMIS layout, raw frames of two eyes, and reconstructs it in this process as the command
@@ -97,7 +97,7 @@ def _clip(options: argparse.Namespace, folder: Path) -> Path:
     if not folder.exists():
         drawn = ["--motion", options.motion, "--frames", options.frames, "--width", options.width]
         drawn += ["--height", options.height, "--format", "stereomis", "--out", folder]
-        subprocess.run([sys.executable, "-m", "worker", "phantom", *map(str, drawn)], check=True)
+        subprocess.run([sys.executable, "-m", "lab", "phantom", *map(str, drawn)], check=True)
     return folder
 
 

@@ -1,6 +1,6 @@
 """What one eye can tell of the other: the left eye of a stereo clip teaches, the right eye judges, and what bounds it.
 
-    python lab/benchmarks/bm_one_eye.py [--clip d4d_stereo] [--iterations 300] [--holdout every8] [--seed 0]
+    python -m lab.benchmarks.bm_one_eye [--clip d4d_stereo] [--iterations 300] [--holdout every8] [--seed 0]
 
 A line for each of these, in dB over the held-out frames, also without highlights:
 

@@ -1,6 +1,6 @@
 """How exactly is a moving camera's path found, of each path and motion of the phantom and of a real fixed camera?
 
-    python lab/benchmarks/bm_poses.py [--motions breathing pull] [--paths pan ...] [--frames 64] [--seeds 0]
+    python -m lab.benchmarks.bm_poses [--motions breathing pull] [--paths pan ...] [--frames 64] [--seeds 0]
         [--noise 0.25 1.0] [--out poses.csv]
 
 Draws stereo clips of 320x256 whose poses are withheld, and estimates them (`--poses estimate`). Prints and writes of

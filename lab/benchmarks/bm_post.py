@@ -128,7 +128,7 @@ def _run(clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | N
     """The clip through the command line."""
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     given += ["--preset", preset, *(["--budget-s", str(budget_s)] if budget_s else [])]
-    command = [sys.executable, "-m", "client.cli", "reconstruct", str(clip), *given, "--out", str(out)]
+    command = [sys.executable, "-m", "intrasplat", "reconstruct", str(clip), *given, "--out", str(out)]
     start_s, load = time.perf_counter(), os.getloadavg()[0]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     done_s = round(time.perf_counter() - start_s, 2)

@@ -1,6 +1,6 @@
 """What a whole installation answers under load, idle and while a job trains, side by side in one run.
 
-    python lab/benchmarks/bm_service.py [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--job-only]
+    python -m lab.benchmarks.bm_service [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--job-only]
         [--csv docs/results/service.csv]
 
 Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures:
@@ -53,7 +53,7 @@ JOB_REQUESTS_A_SECOND = 200
 SETTLED = 3
 ENDLESS = 1_000_000  # iterations; the job is cancelled at the end
 CHUNK_BYTES = 1 << 20
-VIDEO = Path(__file__).parents[1] / "tests" / "data" / "stereo_sbs_h264.mp4"
+VIDEO = Path(__file__).parents[2] / "tests" / "data" / "stereo_sbs_h264.mp4"
 
 PARTS = ("worker", "service", "viewers")
 """Whose CPU seconds a second are counted while a job trains."""
@@ -111,7 +111,7 @@ def make_clip(folder: Path, width: int = WIDTH, height: int = HEIGHT, frames: in
     """A synthetic stereo clip of width x height an eye."""
     size = ("--frames", str(frames), "--width", str(width), "--height", str(height))
     out = folder / "clip"
-    command = [sys.executable, "-m", "worker", "phantom", *size, "--out", str(out)]
+    command = [sys.executable, "-m", "lab", "phantom", *size, "--out", str(out)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     return PhantomClip(out / "stereo.webm", out / "calibration.json")
 

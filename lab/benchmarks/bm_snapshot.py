@@ -1,6 +1,6 @@
 """What it costs to be watched: copies of the model while it trains, and how soon the first one is on the screen.
 
-    python lab/benchmarks/bm_snapshot.py [--iterations 150]
+    python -m lab.benchmarks.bm_snapshot [--iterations 150]
 
 Trains `fast` on a synthetic clip of 640x512, so many iterations each time: alone, with a viewer who asks for one JPEG
 after the other as fast as they come, and with one who is held to the share that a worker gives to renders; the three in

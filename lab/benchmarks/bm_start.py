@@ -1,6 +1,6 @@
 """How soon a clip's first frame has depth, and all have, and how soon the first training step can be made.
 
-    python lab/benchmarks/bm_start.py [CLIP --calibration F --masks F] [--preset instant] [--repeats 5] [--cold]
+    python -m lab.benchmarks.bm_start [CLIP --calibration F --masks F] [--preset instant] [--repeats 5] [--cold]
 
 CLIP is d4d_stereo of INTRASPLAT_DATA by default. Prints medians over the repeats, in one process whose libraries are
 loaded and whose kernels are compiled, as a worker's are: seconds since the start, seconds of each stage, and seconds of

@@ -1,6 +1,6 @@
 """Depth from stereo: error on synthetic tissue; on real clips agreement with a reference, rows, seconds per frame.
 
-    python lab/benchmarks/bm_stereo.py [--data FOLDER] [--repeats 3] [--device cuda] [--every 8]
+    python -m lab.benchmarks.bm_stereo [--data FOLDER] [--repeats 3] [--device cuda] [--every 8]
 
 With TRITON_INTERPRET=1 in the environment "cuda" needs no GPU and takes half a minute a pair: accuracy, not speed.
 FOLDER (INTRASPLAT_DATA, else ../shared/data) holds `d4d_stereo` and `d4d_endonerf` (one recording, as stereo video and

@@ -1,6 +1,6 @@
 """Measure what both eyes of a stereo clip teach, judged by the left eye, by the right, and by a synthetic clip's truth.
 
-    python lab/benchmarks/bm_two_eyes.py [--clips d4d_stereo ...] [--holdout every8 blocks8] [--eyes left both]
+    python -m lab.benchmarks.bm_two_eyes [--clips d4d_stereo ...] [--holdout every8 blocks8] [--eyes left both]
         [--budget-s 15 60 | --iterations N ...] [--seeds 0 1 2] [--csv docs/results/two-eyes.csv]
         [--at-most N] [--again]
 

@@ -1,6 +1,6 @@
 """Is what no frame saw marked, and is what a frame saw not? What does it cost a render?
 
-    python lab/benchmarks/bm_unseen.py [--iterations 200] [--rounds 30]
+    python -m lab.benchmarks.bm_unseen [--iterations 200] [--rounds 30]
 
 Trains `fast` on a phantom of 320x256 for each motion, under an instrument that never moves: the mask of frame 0 lies on
 all frames. Prints of each, in the held-out frames: of the pixels that no frame shows as tissue, and of the tissue, the

@@ -1,7 +1,7 @@
 """Check and time the GPU kernels: one command that ends within seven minutes and needs no network.
 
     make gpu-check [PYTHON=python3] [ARGS="--clip FOLDER --out docs/results"]
-    python lab/gpu/check.py --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
+    python -m lab.gpu.check --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
 
 Three parts run in this order: correct.py checks the kernels, speed.py times steps and pictures, train.py measures how
 soon training reaches a given quality. Each part is a process with a deadline and writes OUT/gpu-*.csv row by row. If a

@@ -38,7 +38,7 @@ of runs have their load. A section holds for the commits it names; later ones ma
 _ABLATION = """
 ## What each part of fast is worth
 
-`python lab/benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
+`python -m lab.benchmarks.bm_ablation --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
 held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
 320x256, where the finest grid has 20 k points, so rows that name fewer points than `fast` equal its own there. More
 points gain where the picture is larger, and cost time and bytes in proportion. Runs as short as these are one cycle.
@@ -46,22 +46,22 @@ points gain where the picture is larger, and cost time and bytes in proportion. 
 _RASTER = """
 ## Splatting on the CPU
 
-`python lab/benchmarks/bm_raster.py --csv docs/results/raster.csv` ([raster.csv](raster.csv)): 640x512, 40,096 Gaussians on
-a grid of 2.86 pixels, medians in ms.
+`python -m lab.benchmarks.bm_raster --csv docs/results/raster.csv` ([raster.csv](raster.csv)): 640x512, 40,096 Gaussians
+on a grid of 2.86 pixels, medians in ms.
 """
 _SCENE = """
 The model that `intrasplat reconstruct CLIP --iterations 600 --out s600` ends with on `d4d-a`:
-`python lab/benchmarks/bm_raster.py --scene s600 --quick | tee docs/results/raster-scene.txt`
+`python -m lab.benchmarks.bm_raster --scene s600 --quick | tee docs/results/raster-scene.txt`
 """
 _STEREO = """
 ## Depth from stereo
 
-`python lab/benchmarks/bm_stereo.py | tee docs/results/stereo.txt`:
+`python -m lab.benchmarks.bm_stereo | tee docs/results/stereo.txt`:
 """
 _SERVICE = """
 ## The service under load
 
-`python lab/benchmarks/bm_service.py --csv docs/results/service.csv` ([service.csv](service.csv)): a whole installation,
+`python -m lab.benchmarks.bm_service --csv docs/results/service.csv` ([service.csv](service.csv)): a whole installation,
 idle and while a clip trains, in one run; viewers, service, queue and worker share the cores. Renders are JPEGs of
 640x512 at random times and poses, and a viewer asks again when it is answered. Beside training, the scene is a finished
 one; `the job` is a scene that trains. Fewest a second: what the viewer had who got fewest.
@@ -73,17 +73,17 @@ Uploads, the service's resident memory before and at its peak:
 _MEMORY = """
 ## Memory of a reconstruction
 
-`python lab/benchmarks/bm_memory.py --csv docs/results/memory.csv` ([memory.csv](memory.csv)): the peak of the process's
+`python -m lab.benchmarks.bm_memory --csv docs/results/memory.csv` ([memory.csv](memory.csv)): the peak of the process's
 resident memory in each stage, for a clip of both eyes as recorded. `import` is with all libraries loaded, before the
 clip; another process decodes ([decision 033](../decisions/033-memory.md)).
 """
 _LONG = """
 ## A long clip
 
-`python -m lab.benchmarks.bm_long --cache FOLDER --csv docs/results/long.csv` ([long.csv](long.csv)): a synthetic clip of
-both eyes, and parts of it alone with as many steps a frame. Scores of every8, in dB, left and right eye: of the clip or
-part trained alone, and of the whole clip's scene on the part's frames. The peak of the process's resident memory before
-training, in training, in finishing and in scoring, in MiB; seconds that storing and scoring take
+`python -m lab.benchmarks.bm_long --cache FOLDER --csv docs/results/long.csv` ([long.csv](long.csv)): a synthetic clip
+of both eyes, and parts of it alone with as many steps a frame. Scores of every8, in dB, left and right eye: of the clip
+or part trained alone, and of the whole clip's scene on the part's frames. The peak of the process's resident memory
+before training, in training, in finishing and in scoring, in MiB; seconds that storing and scoring take
 ([decision 042](../decisions/042-long-clips.md)).
 """
 _CHAOS = """
@@ -95,7 +95,7 @@ past their lease, and a wire that misbehaves.
 _SOAK = """
 ## An hour of everything
 
-`python lab/benchmarks/bm_soak.py --csv docs/results/soak.csv | tee docs/results/soak.txt` ([soak.csv](soak.csv)). GREW
+`python -m lab.benchmarks.bm_soak --csv docs/results/soak.csv | tee docs/results/soak.txt` ([soak.csv](soak.csv)). GREW
 marks memory that rose by more than 2 % between the eleventh to thirteenth minute and the last three, and files or
 threads of which there were at least three more. The service grew by 2.9 %, of which 1 MiB came at once in minute 21;
 from minute 40 to the end it grew by 0.3 %. So it settles, but not within ten minutes. An hour with gc.freeze() after

@@ -13,7 +13,7 @@ Row = dict[str, str]
 _PATHS = """
 ## Paths of a camera that moves
 
-`python lab/benchmarks/bm_poses.py --frames 128 --seeds 0 1 --out docs/results/poses.csv` and, for the last three rows,
+`python -m lab.benchmarks.bm_poses --frames 128 --seeds 0 1 --out docs/results/poses.csv` and, for the last three rows,
 `--frames 64 --motions breathing --paths pan advance shake --seeds 1` ([poses.csv](poses.csv)): stereo clips of 320x256
 without poses. The absolute trajectory error of the estimated path, of training frames and of held-out ones, and what
 the report says of it. `d4d_stereo` has no true path; its camera is fixed, and its error is the distance from rest of
@@ -23,7 +23,7 @@ too many ([decision 049](../decisions/049-what-is-camera-and-what-is-tissue.md))
 _NOISY = """
 ### Given poses that jump
 
-`python lab/benchmarks/bm_poses.py --frames 64 --paths pan advance roll turn shake swing --seeds 1 --noise 0.1 0.25 1.0
+`python -m lab.benchmarks.bm_poses --frames 64 --paths pan advance roll turn shake swing --seeds 1 --noise 0.1 0.25 1.0
 --out docs/results/noisy_poses.csv` ([noisy_poses.csv](noisy_poses.csv)): clips with depth whose poses err by so many mm
 along each axis, and by as much again at the tissue by their angles; the absolute trajectory error as given and as
 trained on. Each report says by how much the given poses jump and what steadying may leave; warned is from two
@@ -32,17 +32,17 @@ pixels of 640 on ([decision 051](../decisions/051-given-poses-that-jump.md)).
 _TISSUE = """
 ### Tissue that comes into view later
 
-`python -m lab.benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv`, in parts that
-ran one after another ([keyframes.csv](keyframes.csv)): `fast` on stereo clips of 320x256, with the true poses and with
-those that `auto` finds. Held-out psnr_tissue in dB, left and right eye; the share of the tissue seen by any frame that
-the scene covers. Then what has left the view, from where the camera was a quarter of the clip before: the median error
-of its depth in mm, had it stayed as it was, and as shown; the mean confidence there, and of what is in view. The rows
-ran beside other programs ([decision 050](../decisions/050-keyframes.md)).
+`python -m lab.benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out docs/results/keyframes.csv`, in parts
+that ran one after another ([keyframes.csv](keyframes.csv)): `fast` on stereo clips of 320x256, with the true poses and
+with those that `auto` finds. Held-out psnr_tissue in dB, left and right eye; the share of the tissue seen by any frame
+that the scene covers. Then what has left the view, from where the camera was a quarter of the clip before: the median
+error of its depth in mm, had it stayed as it was, and as shown; the mean confidence there, and of what is in view. The
+rows ran beside other programs ([decision 050](../decisions/050-keyframes.md)).
 """
 _MASKS = """
 ## Instruments found without masks
 
-`python lab/benchmarks/bm_masks.py --size 320x256 --seeds 31 --iterations 300 --out docs/results/masks.csv`
+`python -m lab.benchmarks.bm_masks --size 320x256 --seeds 31 --iterations 300 --out docs/results/masks.csv`
 ([masks.csv](masks.csv)): masks that are found against true ones, of every kind of instrument, and held-out dB of
 `fast` with the true masks and with those found, over the tissue of the true ones: what is masked and never seen is a
 hole there, and counts. The masks of `d4d-a` and `d4d-a-stereo` are approximate, and `surgt_raw` has none. The rows ran

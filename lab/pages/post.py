@@ -16,9 +16,9 @@ CPU = "cpu"
 _INTRODUCTION = """
 ## What a caller waits for
 
-`python -m lab.benchmarks.bm_post --csv docs/results/post.csv` ([post.csv](post.csv)): seconds from the POST of a clip to a
-warm worker, medians. The first view shows one moment; a good view is a snapshot of training that scores 33 dB or more
-in the left eye, counted where not every run had one. `t_train_s` and `t_post_s` are those of the report
+`python -m lab.benchmarks.bm_post --csv docs/results/post.csv` ([post.csv](post.csv)): seconds from the POST of a clip
+to a warm worker, medians. The first view shows one moment; a good view is a snapshot of training that scores 33 dB or
+more in the left eye, counted where not every run had one. `t_train_s` and `t_post_s` are those of the report
 ([conventions](../conventions.md#clocks)). `eta off`: how far the `eta_s` of a job was off at most, as a share of the
 whole, after its first tenth. `d4d_stereo` is `d4d-a` as raw stereo.
 """

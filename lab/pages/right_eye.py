@@ -16,9 +16,9 @@ TWO_EYES = "two-eyes.csv"
 _TWO_EYES = """
 ## Two eyes
 
-`python lab/benchmarks/bm_two_eyes.py` ([two-eyes.csv](two-eyes.csv), a row a run): `fast` on a stereo clip, trained on the
-left eye or on both, judged at held-out moments by the left eye and by the right; medians over seeds. `warp` is what the
-left eye's picture scores in the right eye, warped by stereo depth ([conventions](../conventions.md#scores)).
+`python -m lab.benchmarks.bm_two_eyes` ([two-eyes.csv](two-eyes.csv), a row a run): `fast` on a stereo clip, trained on
+the left eye or on both, judged at held-out moments by the left eye and by the right; medians over seeds. `warp` is what
+the left eye's picture scores in the right eye, warped by stereo depth ([conventions](../conventions.md#scores)).
 """
 _TRUTH = """
 Synthetic clips have a truth for every pose. 10 and 15 degrees: views so far beside the endoscope, in dB; bound: what a

@@ -32,9 +32,9 @@ confidence is a probability. [Decision 031](../decisions/031-confidence-is-a-pro
 _MEASURE = """
 ## Are measured distances true
 
-`python -m lab.benchmarks.bm_measure --csv docs/results/measure.csv` ([measure.csv](measure.csv)): points of views of three
-times and three poses, and distances between them followed over all frames, against the truth of synthetic clips. Errors
-and standard uncertainties are medians in mm; 1 u and 2 u are the shares that lie within one and two of them.
+`python -m lab.benchmarks.bm_measure --csv docs/results/measure.csv` ([measure.csv](measure.csv)): points of views of
+three times and three poses, and distances between them followed over all frames, against the truth of synthetic clips.
+Errors and standard uncertainties are medians in mm; 1 u and 2 u are the shares that lie within one and two of them.
 API and page state 2 u.
 Still and cut had a part in the calibration, the others had none ([what it means](../conventions.md#measuring)).
 """
@@ -47,9 +47,10 @@ _MEASURED = {
 _OFF_AXIS = """
 ## Beside the endoscope
 
-`python -m lab.benchmarks.bm_off_axis --picture docs/results/off-axis.jpg`: a synthetic pull, from 12 and 20 degrees to the
-right, left, top and bottom. Columns: truth; trained on the left eye, its guesses shown; trained on both eyes, with what
-no frame showed hatched. [Decision 036](../decisions/036-beside-and-behind-instruments.md) says what is still wrong.
+`python -m lab.benchmarks.bm_off_axis --picture docs/results/off-axis.jpg`: a synthetic pull, from 12 and 20 degrees to
+the right, left, top and bottom. Columns: truth; trained on the left eye, its guesses shown; trained on both eyes, with
+what no frame showed hatched. [Decision 036](../decisions/036-beside-and-behind-instruments.md) says what is still
+wrong.
 
 ![Truth, left eye alone and both eyes from 12 and 20 degrees](off-axis.jpg)
 """

@@ -36,7 +36,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="intrasplat-page-") as name:
         folder = Path(name)
-        command = [sys.executable, "-m", "worker", "phantom", *PHANTOM]
+        command = [sys.executable, "-m", "lab", "phantom", *PHANTOM]
         subprocess.run([*command, "--format", "stereomis", "--out", str(folder / "clip")], check=True)
         clip = zipped(folder / "clip")
         with started_service(folder / "data", folder / "service.log") as client, browser() as driver:

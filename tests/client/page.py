@@ -23,7 +23,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
 from contract.queue.memory import MemoryQueue

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from selenium import webdriver
 
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 from intrasplat.pose import parse_pose
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import pose_of

@@ -256,7 +256,7 @@ def test_every_help_tells_the_exit_codes(
     assert "isp_secret" not in told
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "render", "phantom", "evaluate", "doctor", "worker"])
+@pytest.mark.parametrize("command", ["reconstruct", "render", "poses", "doctor", "worker"])
 def test_local_commands_have_help_too(command: str) -> None:
     told = run_here(Path.cwd(), command, "--help").stdout
     assert told.startswith(f"usage: intrasplat {command} ")
@@ -271,7 +271,7 @@ def run_here(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_a_local_command_is_one_process_that_ends_as_the_workers_program_ends(tmp_path: Path) -> None:
+def test_the_worker_is_one_process_that_ends_as_its_program_ends(tmp_path: Path) -> None:
     program = tmp_path / "worker" / "__main__.py"
     program.parent.mkdir()
     (program.parent / "__init__.py").touch()
@@ -281,9 +281,9 @@ def test_a_local_command_is_one_process_that_ends_as_the_workers_program_ends(tm
         ("import os; os.kill(os.getpid(), 15)", -signal.SIGTERM),
     ):
         program.write_text(f"import sys; print(*sys.argv[1:], flush=True)\n{source}\n")
-        ended = run_here(tmp_path, "reconstruct", "a b", "--out", "c")
+        ended = run_here(tmp_path, "worker", "a b", "--out", "c")
         assert ended.returncode == status
-        assert ended.stdout == "reconstruct a b --out c\n"
+        assert ended.stdout == "consume a b --out c\n"
 
 
 def test_a_job_that_has_not_begun_is_shown_by_its_state(client: Client, clip: Path) -> None:
@@ -312,9 +312,9 @@ def test_import_sends_a_scene_of_another_installation(
     assert "scene: scene.zip is not a readable zip" in capsys.readouterr().err
 
 
-def test_work_on_this_machine_without_the_workers_packages_says_where_to_do_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_work_on_this_machine_without_torch_names_the_doctor(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "worker", None)  # as in the service's container
-    assert main(["doctor"]) == ExitCode.UNAVAILABLE
-    assert "the worker's container" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "intrasplat.splat.backend", None)  # as in the service's container
+    assert main(["render", str(tmp_path), "--t", "0", "--out", "view.png"]) == ExitCode.UNAVAILABLE
+    assert "intrasplat doctor" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import get_args
 import pytest
 
 from client.generate_page import PAGE_TYPES, generate
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 from intrasplat.options import JobOptions
 from tests.client.words import table
 

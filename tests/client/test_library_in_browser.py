@@ -10,7 +10,7 @@ from typing import Any
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.labels import LabelChange, Labels

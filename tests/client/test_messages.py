@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 from contract.wire.checks import FindingCode
 from contract.wire.job import JobState
 from intrasplat.errors import ErrorCode

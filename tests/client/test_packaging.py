@@ -65,5 +65,5 @@ def test_it_has_the_version_and_the_ranges_of_the_whole_project() -> None:
     table: dict[str, Any] = document["project"]
     assert table["version"] == project()["version"]
     assert table["requires-python"] == project()["requires-python"]
-    assert set(table["dependencies"]) <= set(project()["dependencies"])
+    assert set(table["dependencies"]) <= set(project("service")["dependencies"])
     assert (FOLDER / "LICENSE").read_text(encoding="utf-8") == (REPOSITORY / "LICENSE").read_text(encoding="utf-8")

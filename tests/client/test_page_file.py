@@ -15,14 +15,14 @@ from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
-from client.cli import DASHBOARD_VARIABLE
-from client.up import DASHBOARD
+from client.page import DASHBOARD
+from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, SceneError, UnavailableError
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.inline import CannotInlineError, inlined
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.scene.stored_exports import stored_parts
+from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
 from intrasplat.view.frame import render_frame
 from intrasplat.view.unseen import hatched
 from tests.archives import ORIGIN, small_scene, stored
@@ -33,7 +33,6 @@ from tests.client.test_accessible_in_browser import axe as axe
 from tests.client.test_player import scattered
 from tests.client.words import table
 from tests.intrasplat.scenes import random_scene
-from worker.__main__ import main
 
 LEAST_DB = 50.0
 OPENS_WITHIN_S = 120.0
@@ -205,6 +204,7 @@ def test_the_command_line_writes_the_file(tmp_path: Path, monkeypatch: pytest.Mo
     assert main(["export", str(tmp_path / "scene"), "--format", "html"]) == ExitCode.OK
     size, scene_size = (tmp_path / "scene.html").stat().st_size, (tmp_path / "scene/scene.safetensors").stat().st_size
     assert 4 * scene_size / 3 < size < 4 * scene_size / 3 + 400_000
+    monkeypatch.setattr("intrasplat.scene.stored_exports.server_part", lambda name: None)
     monkeypatch.delenv(DASHBOARD_VARIABLE)
     assert main(["export", str(tmp_path / "scene"), "--format", "html"]) == ExitCode.UNAVAILABLE
 

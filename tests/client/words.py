@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 
-from client.up import DASHBOARD
+from client.page import DASHBOARD
 
 LANGUAGES = ("en", "de")
 

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import torch
 
+from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.names import CURVE, RECORDED, REPORT, PresetName
 from intrasplat.notices import NoticeCode
 from intrasplat.report import Report
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
 from intrasplat.train.presets import PRESETS
-from worker.__main__ import main
+from lab.__main__ import main as laboratory
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
 TRAINING_S = 1.0
@@ -32,7 +33,7 @@ TRAINING_S = 1.0
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "clip"
     size = ["--width", str(WIDTH), "--height", str(HEIGHT), "--frames", str(FRAMES)]
-    assert main(["phantom", *size, "--format", "endonerf", "--out", str(folder)]) == ExitCode.OK
+    assert laboratory(["phantom", *size, "--format", "endonerf", "--out", str(folder)]) == ExitCode.OK
     return folder
 
 
@@ -47,7 +48,7 @@ def scene(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene_of_two_eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("two-eyes")
     size = ["--frames", "10", "--width", "128", "--height", "96"]
-    assert main(["phantom", "--format", "stereomis", *size, "--out", str(folder / "clip")]) == ExitCode.OK
+    assert laboratory(["phantom", "--format", "stereomis", *size, "--out", str(folder / "clip")]) == ExitCode.OK
     train = ["--eyes", "both", "--iterations", "10", "--out", str(folder / "scene")]
     assert main(["reconstruct", str(folder / "clip"), *train]) == ExitCode.OK
     return folder / "scene"
@@ -63,7 +64,7 @@ def test_reconstruct_tells_the_right_eyes_score_of_a_clip_that_has_one(
 ) -> None:
     drawn, out = tmp_path / "clip", tmp_path / "scene"
     size = ["--frames", "10", "--width", "128", "--height", "96"]
-    assert main(["phantom", "--format", "stereomis", *size, "--out", str(drawn)]) == ExitCode.OK
+    assert laboratory(["phantom", "--format", "stereomis", *size, "--out", str(drawn)]) == ExitCode.OK
     capsys.readouterr()
     assert main(["reconstruct", str(drawn), "--eyes", "left", "--iterations", "5", "--out", str(out)]) == ExitCode.OK
     report = Report.model_validate_json((out / REPORT).read_text())
@@ -154,7 +155,17 @@ def test_a_view_that_cannot_be_meant_is_a_bad_input(
 
 def interrupt_in_training(clip: Path, out: Path, number: signal.Signals) -> str:
     """Start a run that would take long, send it a signal once it trains; what it said at its end."""
-    command = [sys.executable, "-m", "worker", "reconstruct", str(clip), "--iterations", "100000", "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "intrasplat",
+        "reconstruct",
+        str(clip),
+        "--iterations",
+        "100000",
+        "--out",
+        str(out),
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert any(line.startswith("train") for line in process.stderr)

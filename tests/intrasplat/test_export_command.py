@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.export import export_parts
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions
@@ -13,7 +14,6 @@ from intrasplat.scene.archive import read_archive
 from intrasplat.scene.checkpoint import save_scene
 from tests.archives import stored
 from tests.intrasplat.scenes import random_scene
-from worker.__main__ import main
 
 
 @pytest.fixture

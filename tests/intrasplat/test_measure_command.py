@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from contract.store.store import Store
+from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.measuring import Measurement
 from tests.worker.test_views import CLIP, UNITS_PER_MM, publish
-from worker.__main__ import main
 
 JOB_ID = "0" * 32
 

@@ -27,8 +27,8 @@ from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
+from lab.__main__ import main
 from tests.reports import REPORT_OF_A_SCENE
-from worker.__main__ import main
 from worker.child import ChildKeeper, DeviceChild
 from worker.device import make_or_start_anew, request_of, scored
 from worker.job_errors import describe

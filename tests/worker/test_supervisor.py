@@ -36,7 +36,7 @@ from worker.supervisor import run_supervisor
 LEASE_S = 6.0
 """Three beats, and three times as long as standin.py takes for a `slow` job, which ends while its worker sleeps."""
 
-REPOSITORY = Path(__file__).resolve().parents[3]
+REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = f"""
 import functools, sys
 from contract.runtime.logs import configure

@@ -1,10 +1,10 @@
 """Deformation and Adam: the per-parameter half of a training step.
 
 N Gaussians padded to a multiple of LANES, B bases, F frames per step. The canonical state has the ROWS of
-intrasplat/splat/layout.py; FDM moves the first CHANNELS of them, shared bases those or all. Rows of N floats everywhere, so
-that a vector is LANES Gaussians; a gradient is a sum over the frames, in their order. Adam (Kingma and Ba 2015) with
-bias correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the same square
-root.
+intrasplat/splat/layout.py; FDM moves the first CHANNELS of them, shared bases those or all. Rows of N floats
+everywhere, so that a vector is LANES Gaussians; a gradient is a sum over the frames, in their order. Adam (Kingma and
+Ba 2015) with bias correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the
+same square root.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ Symbols: K splats of a chunk (axis 0), P pixels of a tile (axis 1); for one pixe
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
     B_(i-1) = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0: what lies behind splat i - 1, as if it were alone
     dL/dpower_i = w_i (s_i - B_i), 0 where alpha was capped
-as in intrasplat/splat/cpu/blend.py. The forward pass leaves T before each chunk in memory, and the backward pass computes
-a chunk's alphas again. Derivations: docs/rasterizer.md; the loss: intrasplat/splat/loss.py.
+as in intrasplat/splat/cpu/blend.py. The forward pass leaves T before each chunk in memory, and the backward pass
+computes a chunk's alphas again. Derivations: docs/rasterizer.md; the loss: intrasplat/splat/loss.py.
 
 Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products, sums and steps from splat to
 splat need no shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the

@@ -64,7 +64,7 @@ SIZES_KEPT = 3
 
 
 class CudaModel:
-    """Canonical Gaussians, their deformation and Adam's moments, trained on the device. See intrasplat/splat/model.py."""
+    """Canonical Gaussians, their deformation and Adam's moments, trained on the device (intrasplat/splat/model.py)."""
 
     answers_every = CHECK_EVERY
 

@@ -67,7 +67,7 @@ def test_only_a_clip_that_has_its_depth_must_fit_into_memory() -> None:
 
 
 def test_the_limits_are_the_deployments() -> None:
-    limits = ClipLimits.of(Settings(max_frames=7, max_clip_s=2.5, max_frame_pixels=1000))
+    limits = Settings(max_frames=7, max_clip_s=2.5, max_frame_pixels=1000).clip_limits
     with pytest.raises(LimitError, match="the limit is 7"):
         limits.check_clip("clip", "it", 8, 20, 20)
     with pytest.raises(LimitError, match=r"lasts 2\.6 s; the limit is 2\.5 s"):

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.poses.rigid import between
 from intrasplat.poses.trajectory import read_tum, trajectory_error, write_tum
 from lab.phantom import PhantomSettings, make_phantom, write_stereo_video, write_stereomis
-from worker.__main__ import main
 
 SETTINGS = PhantomSettings(
     width=160, height=128, frames=16, motion="still", tools=(), camera=("turn",), frame_rate_hz=8.0

@@ -1,4 +1,4 @@
-"""Run as a program: compile every kernel that matching on a GPU launches, as tests/intrasplat/splat/cuda_probe.py does."""
+"""Compile every kernel that matching on a GPU launches; run as a program, as tests/intrasplat/splat/cuda_probe.py."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import Cancelled, InputError, UnavailableError
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
+from lab.__main__ import main
 from lab.evaluate.cells import Cell, plan
 from lab.evaluate.command import SUMMARY, measure_all
 from lab.evaluate.measure import Bench, Values, _OnTheWay, command_of, seconds_of
@@ -24,7 +25,6 @@ from lab.evaluate.rows import CURVES, KEY, LOCK, RUN_FIELDS, RUNS, Results, addi
 from lab.evaluate.sources import DATA_VARIABLE, open_source, source_of
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.intrasplat.phantoms import phantom_clip
-from worker.__main__ import main
 
 CLIP = "phantom:pull:96x80:12frames"
 NAME = "phantom-pull-96x80-12frames"

@@ -12,6 +12,7 @@ from intrasplat.machine.hooks import Progress
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
+from lab.__main__ import main
 from lab.conditions import CLEAN, CLEAN_STEREO, CONDITIONS, clean_clip
 from lab.evaluate.atlas import count_outcomes, draw_map, places_of, told_table
 from lab.evaluate.rows import Row, read_rows, write_rows
@@ -31,7 +32,6 @@ from lab.evaluate.stability import (
 )
 from lab.pages.stability import stability_sections
 from tests.test_repository import REPOSITORY
-from worker.__main__ import main
 
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 

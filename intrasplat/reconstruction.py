@@ -1,0 +1,325 @@
+"""A clip becomes a scene: `reconstruct`; a scene is rendered, saved, exported: `Scene`; and read again: `load`.
+
+Symbols: T frames, H W pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from intrasplat.camera import Intrinsics
+from intrasplat.clip import DepthClip
+from intrasplat.errors import InputError
+from intrasplat.export import export_parts
+from intrasplat.formats import EXPORT_FORMATS, check_export
+from intrasplat.machine.hooks import Progress, ignore, never
+from intrasplat.names import KEPT, MANIFEST, REPORT
+from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
+from intrasplat.picture import IntrinsicsOverride
+from intrasplat.pipeline import reconstruct as run_pipeline
+from intrasplat.pose import MatrixPose, OrbitPose, parse_pose
+from intrasplat.recording import Clip, FilePath
+from intrasplat.report import Report
+from intrasplat.scene.checkpoint import load_scene
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.scene.stored_exports import installed_dashboard, stored_parts
+from intrasplat.splat.backend import choose_device
+from intrasplat.stereo import ClipPaths
+from intrasplat.train.hooks import TrainingHooks
+from intrasplat.train.request import ReconstructionRequest
+from intrasplat.view.camera import camera_of, pose_of
+from intrasplat.view.frame import View, render_frame
+
+MAX_RENDER_PIXELS = 8192 * 8192
+
+
+class Scene:
+    """A reconstructed clip: any moment from any pose. `reconstruct` and `load` make it.
+
+    Example:
+        >>> scene.frame_count
+        10
+        >>> scene.report.iterations
+        4
+    """
+
+    def __init__(self, folder: Path, device: str = "auto") -> None:
+        """folder holds the scene's files, as `reconstruct` and the command line write them."""
+        self._folder, self._device = folder, device
+
+    def __repr__(self) -> str:
+        return f"Scene({len(self.trained.gaussians)} Gaussians, {self.frame_count} frames, {self.trained.preset})"
+
+    @cached_property
+    def trained(self) -> TrainedScene:
+        """The model itself: Gaussians and deformation in optimiser units (mm * units_per_mm), camera, poses."""
+        return load_scene(self._folder)
+
+    @cached_property
+    def report(self) -> Report:
+        """The quality report: scores of held-out frames, assumptions and warnings.
+
+        Raises:
+            InputError: the scene has none.
+        """
+        path = self._folder / REPORT
+        if not path.is_file():
+            raise InputError("folder", f"{self._folder} holds no {REPORT}.", "Reconstruct the clip again.")
+        return Report.model_validate_json(path.read_bytes())
+
+    @property
+    def frame_count(self) -> int:
+        """T, the frames of the clip; frame i is shown at t = i / T."""
+        return self.trained.frame_count
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera of the clip's left eye, in pixels."""
+        return self.trained.intrinsics
+
+    @property
+    def world_from_camera(self) -> NDArray[np.float64]:
+        """[T, 4, 4] the endoscope's own poses in mm, OpenCV axes."""
+        return self.trained.world_from_camera
+
+    def render(
+        self,
+        t: float,
+        pose: MatrixPose | OrbitPose | NDArray[np.floating[Any]] | str | None = None,
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        intrinsics: Intrinsics | None = None,
+        highlights: bool = True,
+    ) -> View:
+        """The scene at model time t from a pose, instruments removed.
+
+        Args:
+            t: 0 is the first frame, i / T frame i; later times show the last frame, with a warning.
+            pose: `orbit(...)`, `pose(...)`, [4, 4] world_from_camera in mm, or the API's text; None: the endoscope's.
+            width, height: of the picture in pixels; with one of them the other keeps the aspect. Default: the clip's.
+            intrinsics: another camera, instead of width and height.
+            highlights: whether to show highlights that both eyes of a stereo clip told apart.
+
+        Returns:
+            A View with rgb [H, W, 3] uint8, depth_mm [H, W] float32 (0: nothing solid), confidence [H, W] float32 in
+            [0, 1], unseen [H, W] bool and warnings.
+
+        Raises:
+            InputError: the pose or the size cannot be used.
+            LimitError: the picture has too many pixels.
+            UnavailableError: the device is not there.
+
+        Example:
+            >>> view = scene.render(t=0.4, pose=isp.orbit(10, 0))
+            >>> view.rgb.shape[:2] == view.depth_mm.shape == view.confidence.shape
+            True
+        """
+        if not np.isfinite(t):
+            raise InputError("t", f"it is {t}.", "Give a number: 0 is the first frame, 1 the end of the clip.")
+        camera = intrinsics
+        if camera is None:
+            try:
+                wanted = IntrinsicsOverride(width=width, height=height)
+            except ValidationError as error:
+                first = error.errors()[0]
+                field, problem = str(first["loc"][0]), f"{first['input']} is not accepted: {first['msg']}."
+                raise InputError(field, problem, "Give 8 to 8192 pixels.") from error
+            camera = camera_of(self.intrinsics, wanted, MAX_RENDER_PIXELS)
+        device = choose_device(self._device)
+        return render_frame(self.trained, t, self._world_from_camera(pose), camera, device, highlights=highlights)
+
+    def _world_from_camera(self, pose: Any) -> NDArray[np.float64] | None:
+        if isinstance(pose, np.ndarray):
+            if pose.shape not in ((4, 4), (3, 4)):
+                raise InputError("pose", f"it is {list(pose.shape)}.", "Give [4, 4] world_from_camera in mm.")
+            pose = " ".join(repr(float(each)) for each in pose.ravel())
+        return pose_of(self.trained, parse_pose(pose) if isinstance(pose, str) else pose)
+
+    def save(self, folder: FilePath) -> None:
+        """Write the scene's files into a new or empty folder; `load` and the command line read them.
+
+        Raises:
+            InputError: the folder holds something.
+
+        Example:
+            >>> scene.save(tmp / "scene")
+            >>> isp.load(tmp / "scene").frame_count
+            10
+        """
+        target = Path(folder)
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise InputError("folder", f"{target} is there already.", "Name a new folder, or empty it.")
+        target.mkdir(parents=True, exist_ok=True)
+        files = sorted(self._folder.iterdir(), key=lambda path: path.name == MANIFEST)  # the manifest makes it whole
+        for path in files:
+            if path.is_file() and path.name not in KEPT:
+                shutil.copyfile(path, target / path.name)
+
+    def export(
+        self,
+        path: FilePath,
+        *,
+        format: str | None = None,
+        t: float | None = None,
+        every: int | None = None,
+        view: str | None = None,
+        baseline_mm: float | None = None,
+    ) -> Path:
+        """Write the scene as a file for other programs.
+
+        Args:
+            path: the file. It is written beside its place first, so that it is whole or not there.
+            format: one of `intrasplat export --help` (docs/export.md); None: the first whose files end like path.
+            t: the moment of formats of one moment, and of view="orbit".
+            every: of formats over time: one of so many frames.
+            view: of a video: endoscope, orbit or stereo.
+            baseline_mm: distance of the eyes of view="stereo".
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            InputError: there is no such format, an option does not fit it, or the file cannot be written.
+            LimitError: the file would be too large.
+            UnavailableError: the format needs a package that is not installed.
+
+        Example:
+            >>> scene.export(tmp / "scene.ply", t=0.4).name
+            'scene.ply'
+        """
+        target = Path(path)
+        name = format or next((each for each, one in EXPORT_FORMATS.items() if target.name.endswith(one.suffix)), None)
+        if name is None:
+            endings = ", ".join(dict.fromkeys(each.suffix for each in EXPORT_FORMATS.values()))
+            raise InputError("path", f"{target.name!r} has no known ending.", f"Use {endings}, or name a format.")
+        chosen = check_export(name, {"t": t, "every": every, "view": view, "baseline_mm": baseline_mm})
+        if EXPORT_FORMATS[name].is_stored:
+            parts = stored_parts(name, self._folder, None, installed_dashboard())
+        else:
+            parts = export_parts(self.trained, name, chosen, choose_device(self._device))
+        unfinished = target.with_name(f".{target.name}.part")
+        try:
+            with unfinished.open("wb") as file:
+                for part in parts:
+                    file.write(part)
+            unfinished.replace(target)
+        except OSError as error:
+            raise InputError("path", f"{target} cannot be written ({error.strerror}).", "Name another file.") from error
+        finally:
+            unfinished.unlink(missing_ok=True)
+        return target
+
+
+def reconstruct(
+    clip: Clip | DepthClip,
+    *,
+    method: str = "fast",
+    budget_s: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+    holdout: str = "every8",
+    device: str = "auto",
+    out: FilePath | None = None,
+    on_progress: Callable[[Progress], None] = ignore,
+    should_stop: Callable[[], bool] = never,
+    **options: object,
+) -> Scene:
+    """Train a scene from a clip.
+
+    Args:
+        clip: of `read_clip`, or of `Clip.with_depth` or `follow` in memory.
+        method: instant, fast, quality and small are ours; paper is Deform3DGS as published (docs/method.md).
+        budget_s: about how many seconds to train, often less; None: the method's own.
+        iterations: exactly how many steps instead; then the same seed gives the same bits on the same machine.
+        seed: of all random numbers.
+        holdout: frames to measure quality on, never to train on: every8, blocks8, none, or numbers such as "1,9,17".
+        device: auto, cpu or cuda.
+        out: the folder for the scene's files; the same call on the folder of a stopped run resumes it. None: a
+            temporary folder, until the scene is no longer used or `Scene.save` copies it.
+        on_progress: gets a Progress between steps; `print` will do.
+        should_stop: asked between steps; True ends the run.
+        options: eyes, use_frames, poses, min_depth_mm, max_depth_mm, keep_recorded, as `intrasplat reconstruct --help`
+            explains them.
+
+    Raises:
+        InputError: the clip or an option cannot be used; it names the argument and the remedy.
+        UnavailableError: the device is not there, or the disk is full.
+        TrainingDiverged: training left the finite numbers.
+        Cancelled: should_stop said so.
+
+    Example:
+        >>> clip = isp.read_clip(frames, depth_mm=depth_mm, intrinsics=camera)
+        >>> scene = isp.reconstruct(clip, method="fast", iterations=4, device="cpu")
+        >>> scene.report.psnr_tissue_db > 10
+        True
+    """
+    laid_out = clip.options.model_dump() if isinstance(clip, Clip) else {}
+    given = {"budget_s": budget_s, "iterations": iterations, **options}
+    named = {"preset": method, "seed": seed, "holdout": holdout} | {k: v for k, v in given.items() if v is not None}
+    try:
+        chosen = parse_options(ReconstructionOptions, {**laid_out, **named})
+    except InputError as error:
+        field = error.field.removeprefix(f"{FIELD_PREFIX}.")
+        raise InputError("method" if field == "preset" else field, error.problem, error.remedy) from error
+    hooks = TrainingHooks(on_progress=on_progress, should_stop=should_stop)
+    if out is not None and (Path(out) / MANIFEST).exists():
+        raise InputError("out", f"{os.fspath(out)} holds a finished scene.", "Name a new folder, or load() it.")
+    request = ReconstructionRequest(clip=Path(), options=chosen, device=device)
+    source = clip.source if isinstance(clip, Clip) else clip
+    segmenter = clip.segmenter if isinstance(clip, Clip) else None
+    if isinstance(source, ClipPaths):
+        request = dataclasses.replace(
+            request, clip=source.clip, right=source.right, calibration=source.calibration, masks=source.masks,
+            segmenter=segmenter,
+        )  # fmt: skip
+    elif isinstance(source, DepthClip):
+        request = dataclasses.replace(request, clip=source, segmenter=segmenter)
+    else:
+        assert isinstance(clip, Clip)
+        matched = clip.with_depth(device=device, on_progress=on_progress, options=chosen)
+        request = dataclasses.replace(request, clip=matched)
+    if out is not None:
+        run_pipeline(request, Path(out), hooks)
+        return Scene(Path(out), device)
+    folder = Path(tempfile.mkdtemp(prefix="intrasplat-"))
+    try:
+        run_pipeline(request, folder, hooks)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    scene = Scene(folder, device)
+    weakref.finalize(scene, shutil.rmtree, folder, ignore_errors=True)  # also at the end of the process
+    return scene
+
+
+def load(folder: FilePath, *, device: str = "auto") -> Scene:
+    """The scene in a folder that `Scene.save`, `reconstruct(out=...)` or the command line wrote.
+
+    Raises:
+        InputError: the folder holds no scene.
+        SceneError: a file is damaged, or of another version.
+
+    Example:
+        >>> scene.save(tmp / "again")
+        >>> isp.load(tmp / "again").intrinsics == scene.intrinsics
+        True
+    """
+    path = Path(folder)
+    if not (path / MANIFEST).is_file():
+        raise InputError("folder", f"{os.fspath(folder)} holds no scene.", "Name a folder that reconstruct wrote.")
+    scene = Scene(path, device)
+    _ = scene.trained  # damage shows here, not at the first view
+    return scene
