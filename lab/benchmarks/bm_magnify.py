@@ -5,9 +5,9 @@
 For each scene's folder and scale, over views of the endoscope and beside it: `again` is the PSNR of the render of that
 size, resized to the recording's by area averages (or by cubic interpolation, from below), against the render of the
 recording's size; `levels` its mean brightness less that one's; unseen and confidence are the layers' means; ms the
-milliseconds of the picture and of its layer confidence. With --phantom, the scenes are of `intrasplat phantom --motion
-MOTION` of any size with its other settings as they are: `truth` is the PSNR against the phantom's own picture of that
-size, of views no more than 10 degrees away.
+milliseconds of the picture and of its layer confidence. With --phantom, the scenes are of `python -m lab phantom
+--motion MOTION` of any size with its other settings as they are: `truth` is the PSNR against the phantom's own picture
+of that size, of views no more than 10 degrees away.
 """
 
 from __future__ import annotations

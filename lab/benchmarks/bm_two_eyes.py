@@ -4,9 +4,9 @@
         [--budget-s 15 60 | --iterations N ...] [--seeds 0 1 2] [--csv docs/results/two-eyes.csv]
         [--at-most N] [--again]
 
-Each run is one of `intrasplat evaluate`, and its row is kept as it ends; the same command goes on where it was stopped.
---at-most ends after so many runs; --again measures anew what has a row. A run that failed has no row, and the next
-command repeats it. At the end the medians over seeds of every row in the file are printed. The recording is found
+Each run is one of `python -m lab evaluate`, and its row is kept as it ends; the same command goes on where it was
+stopped. --at-most ends after so many runs; --again measures anew what has a row. A run that failed has no row, and the
+next command repeats it. At the end the medians over seeds of every row in the file are printed. The recording is found
 through INTRASPLAT_DATA; without it a synthetic clip is measured.
 """
 

@@ -212,10 +212,10 @@ def _read(series: str) -> tuple[str, Preset]:
     """A series' canonical name, with its changes in alphabetical order, and its preset. Raises as preset_of."""
     name = preset_name_of(series)
     if is_rival_system(series):
-        problem = f"{series!r} is no preset: `intrasplat evaluate` and `stability` alone train it."
+        problem = f"{series!r} is no preset: `python -m lab evaluate` and `stability` alone train it."
         raise InputError("--series", problem, f"Use one of: {', '.join(PRESETS)}.")
     if name not in PRESETS:
-        shorthands = f"in `intrasplat evaluate` also {', '.join(SHORTHANDS)}"
+        shorthands = f"in `python -m lab evaluate` also {', '.join(SHORTHANDS)}"
         remedy = f"Use one of: {', '.join([*PRESETS, *RIVAL_SYSTEMS])}; {shorthands}."
         raise InputError("--series", f"there is no series {series!r}.", remedy)
     preset = PRESETS[name]

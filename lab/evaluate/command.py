@@ -1,4 +1,4 @@
-"""`intrasplat evaluate`: measures the cells that have no row yet, then draws and sums up what there is."""
+"""`python -m lab evaluate`: measures the cells that have no row yet, then draws and sums up what there is."""
 
 from __future__ import annotations
 

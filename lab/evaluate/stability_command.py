@@ -1,4 +1,4 @@
-"""`intrasplat stability`: spoils synthetic clips, measures the cells that have no row yet, and draws the atlas."""
+"""`python -m lab stability`: spoils synthetic clips, measures the cells that have no row yet, and draws the atlas."""
 
 from __future__ import annotations
 

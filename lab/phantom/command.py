@@ -1,4 +1,4 @@
-"""`intrasplat phantom`: the command that writes a synthetic clip."""
+"""`python -m lab phantom`: the command that writes a synthetic clip."""
 
 from __future__ import annotations
 
