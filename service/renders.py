@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Header, Query, Request, Response
+from opentelemetry.trace import get_current_span
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
@@ -29,6 +30,7 @@ from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
 from service.listing import SceneSearch
 from service.problems import Problem
+from service.request_log import GONE
 
 router = APIRouter(tags=["renders"])
 
@@ -63,8 +65,6 @@ DEPTH_UNITS = {ImageFormat.PNG: "0.01 mm", ImageFormat.NPY: "mm"}
 """What a value of 1 of layer=depth is."""
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "busy": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
-GONE = 499
-"""For the log alone: the caller left before it was answered."""
 
 Result = TypeVar("Result")
 
@@ -208,7 +208,7 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
     caller.require(KeyScope.VIEW)
     with traces.span("find"):
         shown = await run_in_threadpool(_find, services, caller, scene)
-    traces.current().set(job_id=shown.scene_id)
+    traces.describe(get_current_span(), job_id=shown.scene_id)
     await services.audit.viewed(caller, shown.scene_id)
     return shown
 
