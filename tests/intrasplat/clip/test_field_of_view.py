@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.intrasplat.clip.calibration.test_calibration import HEIGHT, RECTIFIED, WIDTH, clip_of, raw_calibration
+from tests.intrasplat.clip.test_calibration import HEIGHT, RECTIFIED, WIDTH, clip_of, raw_calibration
 
 from intrasplat.clip.calibration import rectify
 from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
