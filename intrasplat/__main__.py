@@ -1,6 +1,6 @@
 """The `intrasplat` command.
 
-reconstruct, render, export, measure, poses and doctor work on this machine without a service. The other commands come
+reconstruct, render, export, measure, evaluate, poses and doctor work on this machine without a service. The other commands come
 with the server (the distribution intrasplat-server), which registers them (intrasplat/server_parts.py).
 """
 
