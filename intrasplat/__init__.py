@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from intrasplat.reconstruction import Scene, load, reconstruct
     from intrasplat.recording import Clip, read_clip
     from intrasplat.report import Report
+    from intrasplat.splat.rasterize import Rasterized, rasterize
     from intrasplat.view.frame import View
 
     __version__: str
@@ -48,6 +49,8 @@ _MODULES = {
     "load": "reconstruction",
     "Scene": "reconstruction",
     "View": "view.frame",
+    "rasterize": "splat.rasterize",
+    "Rasterized": "splat.rasterize",
     "orbit": "pose",
     "parse_pose": "pose",
     "Intrinsics": "camera",
@@ -74,6 +77,7 @@ __all__ = [  # in the order in which they are used
     "LimitError",
     "Notice",
     "Progress",
+    "Rasterized",
     "Report",
     "Scene",
     "SceneError",
@@ -84,6 +88,7 @@ __all__ = [  # in the order in which they are used
     "load",
     "orbit",
     "parse_pose",
+    "rasterize",
     "read_clip",
     "reconstruct",
 ]  # fmt: skip

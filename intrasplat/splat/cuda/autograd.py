@@ -7,7 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from intrasplat.splat.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, scale_gradient, stacked
+from intrasplat.splat.autograd import (
+    logit_of,
+    opacity_gradient,
+    pose_gradient,
+    rasterize_by,
+    refuse_second_derivatives,
+    scale_gradient,
+    stacked,
+)
 from intrasplat.splat.camera import Camera, Rendered
 from intrasplat.splat.cuda.rasterizer import CudaRasterizer
 from intrasplat.splat.layout import LOG_SCALE, MEAN, QUATERNION
@@ -41,6 +49,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_second_derivatives()
         scale, logit, camera_from_world = ctx.saved_tensors
         gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents)[None], pose=True)
         state = gradients.state[0].T.clone()
