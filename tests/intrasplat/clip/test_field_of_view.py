@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.intrasplat.clip.test_calibration import HEIGHT, RECTIFIED, WIDTH, clip_of, raw_calibration
 
 from intrasplat.clip.calibration import rectify
 from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
+from tests.intrasplat.clip.test_calibration import HEIGHT, RECTIFIED, WIDTH, clip_of, raw_calibration
 
 
 @pytest.mark.parametrize("kind", ["rectified", "raw"])
