@@ -147,7 +147,7 @@ def _scores(groups: Sequence[Group]) -> str:
     for holdout in holdouts:
         known = [group.median(name) for group in here if group.holdout == holdout for name in COPIED]
         copies.append(number(max((each for each in known if not math.isnan(each)), default=None), 1))
-    rows.append(["copying neighbouring frames", "–", *copies])
+    rows.append(["copying", "–", *copies])
     return table(["preset", "training, s", *(f"{holdout}, dB" for holdout in holdouts)], rows)
 
 

@@ -53,7 +53,7 @@ def post_sections(folder: Path) -> list[str]:
 def post_table(folder: Path) -> str:
     """For README: both clocks of each preset that was sent as it is, by device; empty without such rows."""
     cells = [
-        [preset, device, *(f"{_median(rows, name):.1f}" for name in ("first_view_s", "t_train_s", "t_post_s"))]
+        [preset, device.removeprefix("cuda (").rstrip(")"), *(f"{_median(rows, name):.1f}" for name in ("first_view_s", "t_train_s", "t_post_s"))]
         for (_, preset, budget_s, way, device), rows in _groups(folder).items()
         if way == "http" and not budget_s
     ]
