@@ -25,6 +25,7 @@ _COLUMNS = {
     "t_post_s": ("t_post_s", 1), "done_s": ("done", 1), "psnr_db": ("left, dB", 1), "psnr_right_db": ("right, dB", 1),
 }  # fmt: skip
 """By column: its name and digits."""
+_README_COLUMNS = ("first_view_s", "t_train_s", "t_post_s")
 _CLOCKS = ("t_train_s", "t_post_s")
 """Columns that the report's stages hold."""
 
@@ -53,7 +54,7 @@ def post_sections(folder: Path) -> list[str]:
 def post_table(folder: Path) -> str:
     """For README: both clocks of each preset that was sent as it is, by device; empty without such rows."""
     cells = [
-        [preset, device.removeprefix("cuda (").rstrip(")"), *(f"{_median(rows, name):.1f}" for name in ("first_view_s", "t_train_s", "t_post_s"))]
+        [preset, device.removeprefix("cuda (").rstrip(")"), *(f"{_median(rows, name):.1f}" for name in _README_COLUMNS)]
         for (_, preset, budget_s, way, device), rows in _groups(folder).items()
         if way == "http" and not budget_s
     ]
