@@ -111,21 +111,21 @@ gpu-check: ## with an NVIDIA GPU: check its kernels and time them; at most 7 min
 	"$$python" lab/gpu/check.py $(ARGS)
 
 evaluate: setup ## every preset on every clip, and the charts; takes hours, and resumes (CLIPS="phantom:pull ...")
-	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out docs/results
-	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out docs/results
-	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --eyes left both --out docs/results)
-	@$(EVALUATE) $(CLIPS) --series ablation --out docs/results
+	@$(EVALUATE) $(CLIPS) --series ours --seeds 0 1 2 --out lab/rows
+	@$(EVALUATE) $(CLIPS) --series fast --budget-s 15 --seeds 0 1 2 --out lab/rows
+	@$(if $(filter d4d_%,$(CLIPS)),$(EVALUATE) d4d_stereo --series instant fast --holdout every8 --eyes left both --out lab/rows)
+	@$(EVALUATE) $(CLIPS) --series ablation --out lab/rows
 	@$(BIN)/python -m lab.pages
 
 table1: setup ## the systems of the paper's table 1: presets as they are, the others for TABLE_SECONDS each; takes a day, and resumes (TABLE_CLIPS=...)
-	@$(EVALUATE) $(TABLE_CLIPS) --series paper fast --out docs/results/table1
+	@$(EVALUATE) $(TABLE_CLIPS) --series paper fast --out lab/rows/table1
 	@for seconds in $(TABLE_SECONDS); do \
-		$(EVALUATE) $(TABLE_CLIPS) --series endogaussian lerplane endonerf --budget-s $$seconds --out docs/results/table1 || exit; \
+		$(EVALUATE) $(TABLE_CLIPS) --series endogaussian lerplane endonerf --budget-s $$seconds --out lab/rows/table1 || exit; \
 	done
 	@$(BIN)/python -m lab.pages
 
 capacity: setup ## a grid of fixed capacities beside the automatic choice; takes hours, and resumes
-	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out docs/results/capacity
+	@$(EVALUATE) $(GRID_CLIPS) --series fast --grid --holdout every8 --iterations 600 --seeds 0 1 2 3 4 --out lab/rows/capacity
 	@$(BIN)/python -m lab.pages
 
 chaos: setup $(DEV_STAMP) ## kill every part of a running service at every point, and count what was lost; ARGS narrows it

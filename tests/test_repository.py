@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib
 import importlib.util
 import re
@@ -86,17 +87,49 @@ def test_the_tree_in_the_docs_names_every_room(package: str) -> None:
     assert sorted((modules | folders) - {*names_in_the_tree()}) == []
 
 
-def test_the_python_example_calls_only_what_the_client_offers() -> None:
-    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)
+MAX_README_WORDS = 700
+
+
+def python_example(page: str) -> ast.Module:
+    """The only Python example of a page."""
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     assert len(example.splitlines()) <= 20
-    offered = importlib.import_module("intrasplat_client").Client
-    called = {
+    return ast.parse(example)
+
+
+def attributes(example: ast.Module, name: str) -> set[str]:
+    """What the example takes from a variable: `scene.render` is `render` of `scene`."""
+    return {
         node.attr
-        for node in ast.walk(ast.parse(example))
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "client"
+        for node in ast.walk(example)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == name
     }
-    assert [each for each in sorted(called) if not hasattr(offered, each)] == []
+
+
+def test_the_readmes_example_uses_only_what_the_library_offers() -> None:
+    import intrasplat as isp
+
+    example = python_example("README.md")
+    used = attributes(example, "isp")
+    assert used == {"read_clip", "reconstruct", "orbit", "load"}
+    assert used <= set(isp.__all__)
+    called = attributes(example, "scene")
+    assert called == {"render", "save", "export"}
+    assert [name for name in sorted(called) if not hasattr(isp.Scene, name)] == []
+    named_in_its_comment = {"rgb", "depth_mm", "confidence"}
+    assert named_in_its_comment <= {field.name for field in dataclasses.fields(isp.View)} | set(dir(isp.View))
+
+
+def test_the_clients_example_calls_only_what_the_client_offers() -> None:
+    called = attributes(python_example("docs/client.md"), "client")
+    offered = importlib.import_module("intrasplat_client").Client
+    assert called >= {"reconstruct", "wait", "report", "render_array", "stream"}
+    assert [name for name in sorted(called) if not hasattr(offered, name)] == []
+
+
+def test_the_readme_is_short() -> None:
+    assert len((REPOSITORY / "README.md").read_text(encoding="utf-8").split()) <= MAX_README_WORDS
 
 
 def test_the_readme_says_it_is_no_medical_device() -> None:

@@ -248,7 +248,7 @@ def test_a_service_without_the_extra_says_so_and_works(tmp_path: Path) -> None:
         process.wait(20)
         server.stop()
     assert "traces are off: opentelemetry" in log.read_text()
-    assert "pip install 'intrasplat[otel]'" in log.read_text()
+    assert "pip install 'intrasplat-server[otel]'" in log.read_text()
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def add_slicer(commands: Commands) -> None:
 
 def _slicer(options: argparse.Namespace) -> int:
     if find_spec("pyigtl") is None:
-        raise UnavailableError("pyigtl is not installed.", "pip install 'intrasplat[slicer]'")
+        raise UnavailableError("pyigtl is not installed.", "pip install 'intrasplat-server[slicer]'")
     from client.slicer.bridge import Choice
 
     if not 0 <= options.port < 1 << 16:

@@ -38,7 +38,7 @@ EXPORTER, DISABLED = "OTEL_TRACES_EXPORTER", "OTEL_SDK_DISABLED"
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
 OTLP, HTTP_PROTOBUF = "otlp", "http/protobuf"
-REMEDY = "pip install 'intrasplat[otel]', or set OTEL_TRACES_EXPORTER=none."
+REMEDY = "pip install 'intrasplat-server[otel]', or set OTEL_TRACES_EXPORTER=none."
 
 logger = logging.getLogger("intrasplat.traces")
 

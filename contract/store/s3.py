@@ -76,7 +76,7 @@ class Bucket:
         try:
             s3fs = importlib.import_module("s3fs")  # not at the top: an extra, and slow to import
         except ImportError as error:
-            remedy = "pip install 'intrasplat[s3]'"
+            remedy = "pip install 'intrasplat-server[s3]'"
             raise UnavailableError("A store in a bucket needs the package s3fs.", remedy) from error
         self._name, _, prefix = url.removeprefix("s3://").strip("/").partition("/")
         self._prefix = f"{prefix}/" if prefix else ""

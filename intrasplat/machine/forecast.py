@@ -1,6 +1,6 @@
 """How long a reconstruction still takes: what its stages usually take, corrected by what they have taken so far.
 
-Seconds are those of two cores of the machine that docs/results/post.csv names, and of both eyes.
+Seconds are those of two cores of the machine that lab/rows/post.csv names, and of both eyes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Measure what each part of `fast` is worth: train with one part changed at a time.
 
-    python -m lab.benchmarks.bm_ablation [--iterations 400] [--seeds 1] [--csv docs/results/ablation.csv]
+    python -m lab.benchmarks.bm_ablation [--iterations 400] [--seeds 1] [--csv lab/rows/ablation.csv]
         [--only NAME ...]
 
 The number of iterations is fixed, so the decibels do not depend on how busy the machine is. Clips: the real recording

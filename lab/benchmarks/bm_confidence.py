@@ -1,6 +1,6 @@
 """Is the confidence layer the probability that a pixel is right, and does it rank the errors?
 
-    python -m lab.benchmarks.bm_confidence [--fit] [--csv docs/results/confidence.csv]
+    python -m lab.benchmarks.bm_confidence [--fit] [--csv lab/rows/confidence.csv]
 
 Trains `fast` for a fixed number of iterations on small stereo clips of synthetic tissue, on both eyes, and compares
 views 10 and 15 degrees off the axis and the right eye's views with the truth. Prints the rank correlations of

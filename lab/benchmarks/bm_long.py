@@ -2,7 +2,7 @@
 
     python -m lab.benchmarks.bm_long --cache FOLDER [--motions breathing pull] [--frames 1000] [--parts 0 600] [--part
         100]
-        [--width 640] [--height 512] [--seed 0] [--preset fast] [--steps-a-frame 6] [--csv docs/results/long.csv]
+        [--width 640] [--height 512] [--seed 0] [--preset fast] [--steps-a-frame 6] [--csv lab/rows/long.csv]
 
 Draws a synthetic clip of each motion in StereoMIS layout, raw frames of two eyes, into FOLDER, where the next run finds
 it. A pull takes PULL_FRAMES, a breath as many frames as the phantom's usually does. The clip and its parts, --part

@@ -1,6 +1,6 @@
 """Are measured distances true within what they state?
 
-    python -m lab.benchmarks.bm_measure [--fit] [--scenes DIR] [--csv docs/results/measure.csv]
+    python -m lab.benchmarks.bm_measure [--fit] [--scenes DIR] [--csv lab/rows/measure.csv]
 
 Trains `fast` for a fixed number of iterations on small stereo clips of synthetic tissue. Measures depths of points in
 views of several times and poses, and distances between them over all frames, and compares them with the truth: how many

@@ -1,7 +1,7 @@
 """How much memory each stage of a reconstruction takes at most.
 
     python -m lab.benchmarks.bm_memory [--motion pull] [--frames 150] [--width 640] [--height 512] [--preset fast]
-        [--iterations 60 | --budget-s S] [--cache FOLDER] [--csv docs/results/memory.csv]
+        [--iterations 60 | --budget-s S] [--cache FOLDER] [--csv lab/rows/memory.csv]
 
 Draws a synthetic clip in StereoMIS layout, raw frames of two eyes, and reconstructs it in this process as the command
 line does. Prints the peak of the process's resident memory in each stage, which the kernel keeps, and that of the

@@ -1,7 +1,7 @@
 """What a caller waits for after POST /reconstruct: the first view, the finished scene, its scores.
 
     python -m lab.benchmarks.bm_post [--clip d4d_stereo] [--presets instant fast] [--budget-s S] [--repeats 5] [--shell]
-        [--csv docs/results/post.csv]
+        [--csv lab/rows/post.csv]
 
 Starts `intrasplat up` on a data directory of its own, trains once untimed, so that the worker is warm, and then sends
 the clip again and again. Seconds from the POST, medians: first_view_s, the first answer to GET /render; good_view_s, a

@@ -1,6 +1,6 @@
 """What splatting on this CPU costs, and of what: renders and whole training steps, with the parts of each.
 
-    python -m lab.benchmarks.bm_raster [--scene FOLDER] [--repeats 31] [--csv docs/results/raster.csv] [--quick]
+    python -m lab.benchmarks.bm_raster [--scene FOLDER] [--repeats 31] [--csv lab/rows/raster.csv] [--quick]
 
 The standard scene is 640x512 with a Gaussian every 2.86 pixels each way (40,096), 0.6 of the grid's step wide, opacity
 0.88, on a curved surface at depth 60: every pixel is covered, as after fusion. A step is deformation, projection,

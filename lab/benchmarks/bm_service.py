@@ -1,7 +1,7 @@
 """What a whole installation answers under load, idle and while a job trains, side by side in one run.
 
     python -m lab.benchmarks.bm_service [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--job-only]
-        [--csv docs/results/service.csv]
+        [--csv lab/rows/service.csv]
 
 Starts `intrasplat up` on a data directory of its own, trains a synthetic clip of 640x512 and then measures:
 - GET /render as JPEG at 640x512, times and poses at random, by 1, 4 and 16 viewers that ask again when they are

@@ -1,6 +1,6 @@
 """Whether a whole installation stays as large as it is: an hour of clips, views, listeners, cancels and purges.
 
-    python -m lab.benchmarks.bm_soak [--minutes 60] [--csv docs/results/soak.csv]
+    python -m lab.benchmarks.bm_soak [--minutes 60] [--csv lab/rows/soak.csv]
 
 Starts `intrasplat up` on a data directory of its own. Round after round a small synthetic clip is uploaded (in turn in
 one request, resumable, and broken off in the middle), watched over SSE while it trains, viewed all the while by two

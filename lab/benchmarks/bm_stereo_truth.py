@@ -1,6 +1,6 @@
 """Stereo depth and its confidence against truth: one real pair, and synthetic tissue made hard to match.
 
-    python -m lab.benchmarks.bm_stereo_truth [--data FOLDER] [--device cuda] [--csv docs/results/stereo_truth.csv]
+    python -m lab.benchmarks.bm_stereo_truth [--data FOLDER] [--device cuda] [--csv lab/rows/stereo_truth.csv]
 
 FOLDER (INTRASPLAT_DATA, else ../shared/data) may hold `scared_pair`: left.png, right.png and disparity.tiff (px of the
 left eye, 0: none) of real tissue under structured light. No calibration comes with it: PAIR_FX_PX and PAIR_BASELINE_MM

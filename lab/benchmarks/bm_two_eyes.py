@@ -1,7 +1,7 @@
 """Measure what both eyes of a stereo clip teach, judged by the left eye, by the right, and by a synthetic clip's truth.
 
     python -m lab.benchmarks.bm_two_eyes [--clips d4d_stereo ...] [--holdout every8 blocks8] [--eyes left both]
-        [--budget-s 15 60 | --iterations N ...] [--seeds 0 1 2] [--csv docs/results/two-eyes.csv]
+        [--budget-s 15 60 | --iterations N ...] [--seeds 0 1 2] [--csv lab/rows/two-eyes.csv]
         [--at-most N] [--again]
 
 Each run is one of `python -m lab evaluate`, and its row is kept as it ends; the same command goes on where it was
@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     length.add_argument("--iterations", nargs="+", type=int)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--csv", type=Path, default=Path("docs/results/two-eyes.csv"))
+    parser.add_argument("--csv", type=Path, default=Path("lab/rows/two-eyes.csv"))
     parser.add_argument("--at-most", type=int)
     parser.add_argument("--again", action="store_true")
     return parser

@@ -257,7 +257,7 @@ def command_of(cell: Cell, source: Source, device: DeviceName = "auto") -> str:
     own = {"--series": cell.series, "--holdout": cell.holdout, "--seeds": cell.seed, **limit, "--out": "DIR"}
     own |= {} if device == "auto" else {"--device": device}
     options = [str(part) for option in {**given, **own}.items() for part in option]
-    return shlex.join(["intrasplat", "evaluate", source.argument, *options])
+    return shlex.join(["python", "-m", "lab", "evaluate", source.argument, *options])
 
 
 def render_ms(render: Callable[[float], object]) -> float:

@@ -151,7 +151,9 @@ def commit() -> str:
     repository."""
     try:
         found = _git("describe", "--always")
-        changed = _git("diff", "--name-only", "HEAD", "--", ":/", ":(top,exclude)docs/results")
+        changed = _git(
+            "diff", "--name-only", "HEAD", "--", ":/", ":(top,exclude)docs/results", ":(top,exclude)lab/rows"
+        )
     except OSError:
         return "unknown"
     return f"{found}{'+' * bool(changed)}" if found else "unknown"

@@ -1,1 +1,1 @@
-"""`make gpu-check`: a machine with an NVIDIA GPU in, docs/results/gpu-*.csv out; check.py runs the parts."""
+"""`make gpu-check`: a machine with an NVIDIA GPU in, lab/rows/gpu-*.csv out; check.py runs the parts."""

@@ -1,6 +1,6 @@
 """Check and time the GPU kernels: one command that ends within seven minutes and needs no network.
 
-    make gpu-check [PYTHON=python3] [ARGS="--clip FOLDER --out docs/results"]
+    make gpu-check [PYTHON=python3] [ARGS="--clip FOLDER --out lab/rows"]
     python -m lab.gpu.check --interpret --out FOLDER     the same on tiny sizes, in Triton's interpreter
 
 Three parts run in this order: correct.py checks the kernels, speed.py times steps and pictures, train.py measures how
@@ -28,7 +28,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent.parent
-RESULTS = REPOSITORY / "docs" / "results"
+ROWS = REPOSITORY / "lab" / "rows"
 UNAVAILABLE = 5
 """As intrasplat/commands/exits.py has it."""
 CLIP_HAS = ("images", "depth", "poses_bounds.npy")
@@ -65,13 +65,13 @@ PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 160))
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clip", type=Path, help="folder of a recording in the EndoNeRF layout")
-    parser.add_argument("--out", type=Path, help="folder of the CSV files (default: docs/results)")
+    parser.add_argument("--out", type=Path, help="folder of the CSV files (default: lab/rows)")
     parser.add_argument("--only", nargs="*", choices=[part.name for part in PARTS], help="these parts alone")
     parser.add_argument("--seed", type=int, help="of all that is random (default: another every time; it is printed)")
     parser.add_argument("--interpret", action="store_true", help="tiny sizes in Triton's interpreter; needs --out")
     arguments = parser.parse_args()
-    if arguments.interpret and (arguments.out or RESULTS).resolve() == RESULTS:
-        parser.error("--interpret measures nothing: name a folder for its files with --out, other than docs/results")
+    if arguments.interpret and (arguments.out or ROWS).resolve() == ROWS:
+        parser.error("--interpret measures nothing: name a folder for its files with --out, other than lab/rows")
     if arguments.clip and (problem := clip_problem(arguments.clip)):
         parser.error(problem)
     missing, remedy = ("", "") if arguments.interpret else what_is_missing()
@@ -80,7 +80,7 @@ def main() -> int:
         print("gpu-check: nothing was checked and nothing was written.", file=sys.stderr)
         return UNAVAILABLE
     seed = int(time.time()) if arguments.seed is None else arguments.seed
-    out = (arguments.out or RESULTS).resolve()
+    out = (arguments.out or ROWS).resolve()
     out.mkdir(parents=True, exist_ok=True)
     chosen = [part for part in PARTS if arguments.only is None or part.name in arguments.only]
     print(f"gpu-check: seed {seed}, rows in {out}", flush=True)

@@ -5,185 +5,157 @@ Every sentence with a figure in it is made from rows; the others hold whatever t
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mode
 
-from lab.evaluate.cells import GRID_BASES, GRID_POINTS, OURS, base_of, expected_beside
+from lab.evaluate.cells import GRID_BASES, GRID_POINTS, OURS, PUBLISHED, base_of, expected_beside
 from lab.evaluate.charts import clip_alone
-from lab.evaluate.published import ABLATION, RESULTS, Published
-from lab.evaluate.rows import Results, Row
+from lab.evaluate.command import SUMMARY
+from lab.evaluate.published import ABLATION
+from lab.evaluate.rows import CURVES, RUNS, Results, Row
 from lab.evaluate.summary import Capacity, Group, Sooner, capacities, groups_of, orderings, sooner
-from lab.pages.markdown import number, origin, table
-from lab.pages.post import post_claim
-from lab.pages.right_eye import RIGHT_EYE_CHARTS, both_eyes, right_eye_claim, two_eyes
+from lab.pages.markdown import number, origin, source, table
+from lab.pages.post import post_table
 
 CAPACITY = "capacity"
 """The folder beside runs.csv that holds the grid of capacities."""
+COPIED = ("copy_blend_db", "copy_flow_db")
+"""The columns of what copying the neighbouring frames scores."""
 MARKS = ("<!-- evaluation -->", "<!-- /evaluation -->")
 """Everything between them in README.md is replaced."""
-_ONE_MINUTE = (
-    Published("LerPlane", "EndoNeRF", 22.75, 60, None),
-    Published("EndoGaussian", "EndoNeRF", 35.81, 60, None),
-    Published("Deform3DGS", "EndoNeRF", 37.90, 60, None),
-)
-"""Table 2 of the paper of published.py: about one minute of training each."""
-
 _CHARTS = {
     "curves": """
 ### Quality over time
 
+One line is one run, the strong one the seed that ends in the middle; dashed is what copying the neighbouring frames
+scores. A copy has no other pose, no depth and nothing behind the instrument.
+
 ![Held-out psnr_tissue against seconds of training, one panel a clip and way of holding out](curves.png)
-
-Each line is one run, the strong one the seed that ends in the middle; the clock counts what
-[conventions](../conventions.md) call `t_train_s`, so neither compilation nor the scoring of held-out frames nor, after
-the last step, storing (`finish_s` and `shrink_s` of the column `seconds`). Rates fall and rise in cycles, and so do the
-curves of ours; each ends with the score of the stored scene. Dashed is what copying the neighbouring frames scores:
-where a curve stays below, a copy is the better picture from the endoscope's own pose, and has no other pose, no depth
-and nothing behind the instrument.
-
-![Held-out SSIM against seconds of training](curves-ssim.png)
-
-![Median depth error of held-out frames against seconds of training](curves-depth.png)
-
-SSIM weighs structure, decibels every error alike. Depth is compared with what training was given for its own frames:
-true depth on synthetic clips, stereo's on recorded ones, so that there it shows agreement and not truth.
-""",
-    "curves-post": """
-![Held-out psnr_tissue against seconds since the request](curves-post.png)
-
-The same curves by the clock of the user, `t_post_s`: it also counts decoding, stereo and compilation before training,
-and the scoring of held-out frames in it. A point is the moment of its step; the stored scene follows some seconds
-after the last one. Curves that were measured before points had this clock are not drawn.
 """,
     "pareto": """
 ### Seconds against decibels
 
-![Final psnr_tissue against seconds of training; discs are the scenes' sizes, hollow marks are published](pareto.png)
+Medians over seeds, discs are scenes on disk, and the line joins what nothing is both sooner and better than. Hollow
+marks are published, for other clips on other hardware in `psnr_paper`, so no distance from them is a measurement.
 
-A mark is the median of all seeds, its disc the scene on disk, and the line joins what nothing is both sooner and better
-than. `hexplane` has no kernels of its own here and moves its Gaussians in torch, so its seconds say more about that
-than about the method. The hollow marks are what papers print for other clips on other hardware, in `psnr_paper`, which
-is higher: they say where the field stands, and no distance from them to ours is a measurement.
+![Final psnr_tissue against seconds of training](pareto.png)
 """,
-    "pareto-post": """
-![Final psnr_tissue against seconds from the request to the scene](pareto-post.png)
-
-By the clock of the user, `t_post_s`, the scene is there some seconds later: decoding, stereo, compilation and storing
-come on top. Papers print no such seconds. {scored_first}
-""",
-    **RIGHT_EYE_CHARTS,
     "frames": """
 ### Images a second against decibels
 
-![Final psnr_tissue against images rendered a second at the clip's size](frames.png)
+Each image is rendered at its own time, the median of forty; encoding and sending come on top. `hexplane` has no kernels
+of its own and moves its Gaussians in torch.
 
-Each image is deformed, projected and blended at its own time, the median of forty, with the machine's other work
-beside it; encoding and sending come on top. `hexplane` is slow for the reason given above.
+![Final psnr_tissue against images rendered a second at the clip's size](frames.png)
 """,
 }
 _INTRODUCTION = """
 ## Speed against accuracy
 
-`make evaluate` ([runs.csv](runs.csv), a row a run with its command, which looks for `d4d_endonerf` in the folder
-`INTRASPLAT_DATA` names; [curves.csv](curves.csv); [summary.csv](summary.csv), medians over seeds). `intrasplat evaluate
---redraw --out docs/results` draws all charts anew from the rows, as PNG and SVG. {count}
+Every preset on every clip: {count}
+"""
+_SOONER = """
+### How much sooner
+
+`fast` against the score that `paper` ends with, medians over seeds, of the first moment at which a curve reaches it
+([how](../decisions/evaluation.md#claims-come-from-rows-and-motion-is-judged-where-the-picture-is-made)).
+{claim}
 """
 _TRUTH = """
 ### What copying cannot do
 
-Synthetic clips know the truth ([truth.py](../../lab/evaluate/truth.py) defines each column). Views are 10 and 15
-degrees off the endoscope's, judged where a training frame saw the tissue. Highlights lie elsewhere for every eye, and a
-clip from one place cannot tell where: `bound` is what a perfect shape with the colours the endoscope sees would score,
-`baked` is the score against exactly that. `hidden` is behind the instrument. `motion` is the median end-point error
-over all tissue, `moving` that over what has moved by 1 mm or more, beside how far it has: a model that does not move at
-all would score that.
+Synthetic clips know the truth ([truth.py](../../lab/evaluate/truth.py) defines each column): a view 10 degrees beside
+the endoscope, with the `bound` that its highlights set; the tissue behind the instrument; depth; and the error of
+points that moved by 1 mm or more, beside how far they moved. Held out: {holdout}. {hidden}
 """
 _ABLATION = """
 ### The paper's ablation, on our clips
 
-Median psnr_tissue after each preset's own number of iterations; the first row is what the paper prints (`psnr_paper`,
-its own clips). Differences of a tenth of a decibel are within what another seed gives.
+psnr_tissue after each variant's own number of iterations; the first row is published (`psnr_paper`, other clips).
+{count}
 """
 _PARSIMONY = """
-### No more than a scene needs
+### Every preset on every clip
 
-Floats are those of the model for each Gaussian; bytes those of the scene on disk: ours in whole numbers
-([why](../decisions/scenes.md)), the published method and its variants as floats, as published.
-`loss` is what storing it costs on held-out frames against the model as training left it, in dB; `spread` is the best
-seed less the worst. Sizes, seconds and loss are those with {holdout}. Rates, iterations and start differ between
-presets as well, so a row is not the effect of its size alone: the grid of capacities varies nothing else.
+Medians over seeds; sizes and seconds are those with {holdout}. MB is the scene on disk: ours in whole numbers, the
+published method as floats ([why](../decisions/scenes.md)).
 """
 _CAPACITY = """
 ### The automatic choice against a grid of fixed ones
 
-`make capacity` ([capacity/runs.csv](capacity/runs.csv)): {bases} bases x {points} points an image, everything
-else equal, the same number of iterations.
+{bases} bases x {points} points an image with equal iterations; the star in the chart is the preset's choice. The best
+of the grid is chosen on the frames that score it, which flatters it. {within}
 
 ![Held-out psnr_tissue against the scene's bytes for every fixed capacity, and the automatic choice](capacity/knee.png)
-
-The star is the preset: its bases are chosen from training frames alone, its points are the most that fast ever takes;
-each line adds Gaussians at a fixed number of bases. The best of the grid is picked by the very frames it is scored on,
-so that it is flattered and the choice is not.
 """
+_COMPARED = ("fast", "paper")
+"""The series of the table of truth."""
 
 
-def sections(folder: Path) -> list[str]:
-    """Markdown of everything that has rows in folder; nothing without rows."""
+def sections(folder: Path, pictures: Path) -> list[str]:
+    """Markdown of everything that has rows in `folder`, with the charts in `pictures`; nothing without rows."""
     results = Results(folder)
     groups = [group for group in groups_of(results.runs) if group.series == base_of(group.series)]
     parts = []
     if any(group.rows for group in groups):
-        parts += [_INTRODUCTION.format(count=_counted(results.runs)), _headline(sooner(results.curves))]
-        said = {"scored_first": _scored_first(results.runs)}
-        parts += [text.format(**said) for name, text in _CHARTS.items() if (folder / f"{name}.png").exists()]
-        parts += [both_eyes(groups), _truth(groups), _ablation(groups), _parsimony(groups), _published()]
+        parts += [_INTRODUCTION.format(count=_counted(results.runs)), source("make evaluate", RUNS, CURVES, SUMMARY)]
+        parts += [_headline(sooner(results.curves)), _presets(groups)]
+        parts += [text for name, text in _CHARTS.items() if (pictures / f"{name}.png").exists()]
+        parts += [_truth(groups), _ablation(groups), origin(results.runs)]
     grid = Results(folder / CAPACITY)
     if found := capacities(groups_of(grid.runs)):
-        parts += [
-            _CAPACITY.format(bases=_listed(GRID_BASES), points=_listed(GRID_POINTS)),
-            _capacity(found),
-            origin(grid.runs),
-        ]
-    return [*parts, origin(results.runs)] if results.runs else parts
+        parts += [_capacity(found), origin(grid.runs)]
+    return parts
 
 
-def write_readme(readme: Path, folder: Path) -> None:
-    """Put the chart and the headline between the marks; without rows the README stays as it is."""
-    results = Results(folder)
-    found, chart = sooner(results.curves), folder / "pareto-one-clip.png"
+def write_readme(readme: Path, folder: Path, pictures: Path) -> None:
+    """Put one chart and two small tables between the marks; without rows or chart the README stays as it is."""
+    results, chart = Results(folder), pictures / "pareto-one-clip.png"
     text = readme.read_text()
-    if not found or not chart.exists() or any(mark not in text for mark in MARKS):
+    if not results.runs or not chart.exists() or any(mark not in text for mark in MARKS):
         return
-    place = chart.relative_to(readme.parent)
-    picture = f"![Seconds of training, and since the request, against held-out decibels, for every preset]({place})"
-    clip = clip_alone(groups_of(results.runs))
-    caption = (
-        f"*Held-out frames of `{clip}`, medians over seeds, by both clocks: `t_train_s` and, since the request, "
-        "`t_post_s`. Discs show the scene's size on disk; the line joins the best trade-offs; dashed and dotted lines "
-        "are copies of the neighbouring frames; hollow marks are published, on other hardware and data. "
-        "[docs/conventions.md](docs/conventions.md) defines clocks, every8, blocks8 and psnr_tissue.*"
+    groups = groups_of(results.runs)
+    page = (pictures / "index.md").relative_to(readme.parent)
+    picture = f"![Seconds against held-out decibels, for every preset]({chart.relative_to(readme.parent)})"
+    scores = (
+        f"Held-out psnr_tissue of `{clip_alone(groups)}`, a real da Vinci clip, on two cores ([all results]({page})):"
     )
-    usual = [each for each in found if each.our_limit == _usual_limit(found, each.holdout)]
-    page = f"[All charts and figures]({folder.relative_to(readme.parent)}/index.md)"
+    waiting = post_table(folder)
+    parts = [picture, f"{scores}\n{_scores(groups)}"]
+    if waiting:
+        parts.append(f"Seconds since the POST of the same clip as raw stereo to a warm worker:\n{waiting}")
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
-    claims = filter(None, (_claim(usual), right_eye_claim(two_eyes(folder) or groups_of(results.runs)), f"{page}."))
-    parts = (MARKS[0], picture, caption, post_claim(folder), " ".join(claims), MARKS[1])
-    body = "\n\n".join(filter(None, parts))
+    body = "\n\n".join([MARKS[0], *(part.rstrip("\n") for part in parts), MARKS[1]])
     readme.write_text(f"{before}{body}{after}")
 
 
-_METHOD = (
-    "Medians over the seeds that were run (one seed of a published method), on one kind of machine and this program's "
-    "kernels, at the commits named below the last table of this part. The moment is that of the first crossing: a "
-    "curve may fall below the score again before its end, and one that over-fits, as `paper` does where many frames "
-    "are held out in a row, passes its last score long before. Between two samples of a curve the moment is "
-    "interpolated, the logarithm of time being linear in dB, and a curve that is there at its first sample counts "
-    "from that one: it was sooner. Samples are scored on at most sixteen of the held-out frames, ends on all."
-)
+def _scores(groups: Sequence[Group]) -> str:
+    """For README: each preset's score of the one clip for each way of holding out, and that of copying."""
+    here = [group for group in groups if group.clip == clip_alone(groups) and group.rows]
+    holdouts = list(dict.fromkeys(group.holdout for group in here))
+    rows = []
+    for series in (*OURS, PUBLISHED):
+        usual = [group for group in here if (group.series, group.limit) == (series, _longest_limit(here, series))]
+        if usual:
+            scores = {group.holdout: group.median("psnr_tissue_db") for group in usual}
+            seconds = number(usual[0].median("t_train_s"), 0)
+            rows.append([series, seconds, *(number(scores.get(holdout), 1) for holdout in holdouts)])
+    copies = []
+    for holdout in holdouts:
+        known = [group.median(name) for group in here if group.holdout == holdout for name in COPIED]
+        copies.append(number(max((each for each in known if not math.isnan(each)), default=None), 1))
+    rows.append(["copying", "–", *copies])
+    return table(["preset", "training, s", *(f"{holdout}, dB" for holdout in holdouts)], rows)
+
+
+def _longest_limit(groups: Sequence[Group], series: str) -> str:
+    """The limit of the series' longest runs."""
+    found = [group for group in groups if group.series == series]
+    timed = [group for group in found if group.rows]
+    return max(timed, key=lambda group: group.median("t_train_s")).limit if timed else found[0].limit if found else ""
 
 
 def _usual_limit(found: Sequence[Sooner], holdout: str) -> str:
@@ -192,7 +164,7 @@ def _usual_limit(found: Sequence[Sooner], holdout: str) -> str:
 
 
 def _claim(found: Sequence[Sooner]) -> str:
-    """The headline for each way of holding out, for runs of the limit that most clips were given."""
+    """A sentence for each way of holding out, on the runs of the limit that most clips were given."""
     sentences = []
     for holdout in dict.fromkeys(each.holdout for each in found):
         usual = _usual_limit(found, holdout)
@@ -201,54 +173,42 @@ def _claim(found: Sequence[Sooner]) -> str:
         said = f"With {holdout}, `fast` reaches the score that `paper` ends with on {len(reached)} of {len(here)} clips"
         if reached:
             seconds = _span(each.times_in_seconds or math.nan for each in reached)
-            first = _span(each.times_from_their_first or math.nan for each in reached)
             iterations = _span(each.times_in_iterations or math.nan for each in reached)
+            first = _span(each.times_from_their_first or math.nan for each in reached)
             said += (
-                f": {seconds} times sooner than `paper` ends, {first} times sooner than `paper` first reaches "
-                f"it, and in {iterations} times fewer iterations"
+                f": {seconds} times sooner than `paper` ends, {first} times sooner than `paper` first reaches it, and "
+                f"in {iterations} times fewer iterations"
             )
-        others = [
-            f"`{each.clip}` {each.times_in_seconds:.1f} times sooner when given {each.our_limit} instead of {usual}"
-            for each in found
-            if each.holdout == holdout and each.our_limit != usual and each.times_in_seconds
-        ]
-        said += f"; {', '.join(others)}" if others else ""
         sentences.append(f"{said}.")
     return " ".join(sentences)
 
 
 def _headline(found: Sequence[Sooner]) -> str:
-    header = ["clip", "held out", "dB that paper ends with", "paper, s", "iterations", "paper first there, s",
-              "fast given", "fast, s", "iterations", "times sooner, s", "than paper first", "iterations"]  # fmt: skip
+    header = ["clip", "held out", "paper, dB", "paper, s", "fast, s", "iterations", "times sooner", "than paper first"]
     rows = [
-        [each.clip, each.holdout, f"{each.target_db:.2f}", f"{each.their_s:.0f}", f"{each.their_iterations:.0f}",
-         f"{each.their_first_s:.1f}", each.our_limit, number(each.our_s, 1), number(each.our_iterations, 0),
-         number(each.times_in_seconds, 1), number(each.times_from_their_first, 1),
-         number(each.times_in_iterations, 1)]
-        for each in found
+        [each.clip, each.holdout, f"{each.target_db:.2f}", f"{each.their_s:.0f}", number(each.our_s, 1),
+         number(each.our_iterations, 0), number(each.times_in_seconds, 1),
+         number(each.times_from_their_first, 1)]
+        for each in found if each.our_limit == _usual_limit(found, each.holdout)
     ]  # fmt: skip
-    if not rows:
-        return ""
-    return f"\n### How much sooner\n\n{_claim(found)} {_METHOD}\n{table(header, rows)}"
+    return _SOONER.format(claim=_claim(found)) + table(header, rows) if rows else ""
 
 
 def _truth(groups: Sequence[Group]) -> str:
-    names = {"psnr_view10_db": 1, "bound10_db": 1, "psnr_baked10_db": 1, "psnr_view15_db": 1, "bound15_db": 1,
-             "psnr_baked15_db": 1, "psnr_hidden_db": 1, "depth_error_mm": 2, "motion_error_mm": 2,
-             "moving_error_mm": 2, "moving_mm": 2}  # fmt: skip
-    known = [group for group in groups if not math.isnan(group.median("psnr_view10_db"))]
-    header = ["clip", "held out", "series", "limit", "10°, dB", "bound", "baked", "15°, dB", "bound", "baked",
-              "hidden, dB", "depth, mm", "motion, mm", "moving, mm", "moved by, mm"]  # fmt: skip
+    """A row a clip and series of _COMPARED, for the first way of holding out."""
+    names = {"psnr_view10_db": 1, "bound10_db": 1, "psnr_hidden_db": 1, "depth_error_mm": 2, "moving_error_mm": 2,
+             "moving_mm": 2}  # fmt: skip
+    known = [group for group in groups if not math.isnan(group.median("psnr_view10_db")) and group.series in _COMPARED]
+    if not known:
+        return ""
+    holdout = known[0].holdout
+    header = ["clip", "series", "10°, dB", "bound", "hidden, dB", "depth, mm", "moving, mm", "moved by, mm"]
     rows = [
-        [
-            *group.place,
-            group.series,
-            group.limit,
-            *(number(group.median(name), digits) for name, digits in names.items()),
-        ]
-        for group in known
+        [group.clip, group.series, *(number(group.median(name), digits) for name, digits in names.items())]
+        for group in sorted(known, key=lambda group: (group.clip, _COMPARED.index(group.series)))
+        if group.holdout == holdout
     ]
-    return f"{_TRUTH}{table(header, rows)}\n{_hidden(known)}\n" if rows else ""
+    return _TRUTH.format(holdout=holdout, hidden=_hidden(known)) + table(header, rows)
 
 
 def _hidden(groups: Sequence[Group]) -> str:
@@ -277,94 +237,69 @@ def _ablation(groups: Sequence[Group]) -> str:
     confirmed = sum(each.agreeing == each.pairs for each in decided)
     first = sum(next(iter(each.scores_db)) == "paper" for each in decided)
     said = (
-        f"Clips where all four were run: {len(decided)}. Of them confirm the paper's whole order: {confirmed}; have "
-        f"FDM with MAPF first, as the paper has: {first}."
+        f"The paper's whole order holds on {confirmed} of {len(decided)} clips; FDM with MAPF is first, as in the "
+        f"paper, on {first}."
     )
-    return f"{_ABLATION}\n{said}\n{table(['clip', 'held out', *ABLATION, 'the order'], rows)}"
+    return _ABLATION.format(count=said) + table(["clip", "held out", *ABLATION, "the order"], rows)
 
 
-def _parsimony(groups: Sequence[Group]) -> str:
-    """A row a clip, series and limit; sizes and seconds are those of the first way of holding out."""
+def _presets(groups: Sequence[Group]) -> str:
+    """A row a clip and preset, of its longest runs; sizes and seconds are those of the first way of holding out."""
+    usual = [group for group in groups if group.limit == _longest_limit(groups, group.series)]
+    shown = [group for group in usual if group.series.partition(":")[0] in (*OURS, PUBLISHED) or group.errors]
     clips, holdouts = (list(dict.fromkeys(each)) for each in zip(*(group.place for group in groups), strict=True))
-    found = {(group.clip, group.series, group.limit, group.holdout): group for group in groups}
+    found = {(group.clip, group.series, group.holdout): group for group in shown}
     rows, not_run = [], []
     for clip in clips:
-        keys = dict.fromkeys(key[:3] for key in found if key[0] == clip)
-        for key in keys:
+        for key in dict.fromkeys(key[:2] for key in found if key[0] == clip):
             here = [found.get((*key, holdout)) for holdout in holdouts]
             rows.append([*key, *_size(next(each for each in here if each)), *map(_score, here)])
-        there = {key[1] for key in keys}
+        there = {group.series for group in groups if group.clip == clip}
         absent = [series for series in expected_beside(there) if series not in there]
         not_run += [f"{clip}: {', '.join(absent)}"] if absent else []
-    header = ["clip", "series", "limit", *_SIZES, *(f"{holdout}, dB" for holdout in holdouts)]
+    header = ["clip", "series", *_SIZES, *(f"{holdout}, dB" for holdout in holdouts)]
     said = f"\nNot run. {'; '.join(not_run)}.\n" if not_run else ""
     return _PARSIMONY.format(holdout=f"`{holdouts[0]}`") + table(header, rows) + said
 
 
-_SIZES = ("Gaussians", "bases", "floats", "MB", "loss", "t_train_s", "step, ms", "images/s", "seeds")
+_SIZES = ("Gaussians", "MB", "t_train_s", "images/s")
 
 
 def _size(group: Group) -> list[str]:
     return [
-        *(number(group.median(name), 0) for name in ("gaussians", "bases", "floats_a_gaussian")),
+        number(group.median("gaussians"), 0),
         number(group.median("scene_bytes") / 1e6, 2),
-        number(group.median("stored_loss_held_out_db"), 3),
-        *(number(group.median(name), 1) for name in ("t_train_s", "step_ms")),
+        number(group.median("t_train_s"), 1),
         number(group.median("render_fps"), 0),
-        str(len(group.rows)),
     ]
 
 
 def _score(group: Group | None) -> str:
-    """`38.07 (spread 0.11; training frames +0.92)`; or why there is none."""
+    """`38.07`; or why there is none."""
     if group is None:
         return "–"
-    if not group.rows:
-        return f"failed: {group.errors[0]}"
-    found, trained = group.median("psnr_tissue_db"), group.median("train_psnr_tissue_db")
-    spread = f"spread {group.summary()['spread_db']}" if len(group.rows) > 1 else ""
-    gap = "" if math.isnan(trained) else f"training frames {trained - found:+.2f}"
-    said = "; ".join(filter(None, (spread, gap)))
-    return f"{number(found, 2)} ({said})" if said else number(found, 2)
-
-
-def _published() -> str:
-    def cells(rows: Iterable[Published], table: str) -> list[list[str]]:
-        return [
-            [table, each.data, each.method, f"{each.psnr_paper_db:.2f}", f"{each.train_s:.0f}", number(each.fps, 2)]
-            for each in rows
-        ]
-
-    said = (
-        "\n### Published figures\n\nYang et al., Deform3DGS, MICCAI 2024, one NVIDIA RTX A5000: other hardware, other "
-        "data, `psnr_paper`. Nothing here was measured by us.\n"
-    )
-    rows = cells(RESULTS, "1") + cells(_ONE_MINUTE, "2: about a minute each")
-    return said + table(["table", "data", "method", "psnr_paper", "training, s", "images/s"], rows)
+    return number(group.median("psnr_tissue_db"), 2) if group.rows else f"failed: {group.errors[0]}"
 
 
 def _capacity(found: Sequence[Capacity]) -> str:
-    header = ["clip", "held out", "preset", "limit", "chosen, dB", "best of the grid", "its dB", "difference",
-              "deviation", "seeds", "chosen, MB", "best, MB", "difference from the best at no more bytes"]  # fmt: skip
+    header = ["clip", "held out", "chosen, dB", "best of the grid", "its dB", "difference", "chosen, MB", "best, MB",
+              "difference from the best at no more bytes"]  # fmt: skip
     rows = [
-        [*each.chosen.place, each.chosen.series, each.chosen.limit, number(each.chosen.median("psnr_tissue_db"), 2),
-         each.best.series.partition(":")[2], number(each.best.median("psnr_tissue_db"), 2),
-         f"{each.difference_db:+.2f}", number(each.deviation_db, 2), str(each.seeds),
-         number(each.chosen.median("scene_bytes") / 1e6, 2), number(each.best.median("scene_bytes") / 1e6, 2),
+        [*each.chosen.place, number(each.chosen.median("psnr_tissue_db"), 2),
+         each.best.series.partition(":")[2].replace(",", ", "), number(each.best.median("psnr_tissue_db"), 2),
+         f"{each.difference_db:+.2f}", number(each.chosen.median("scene_bytes") / 1e6, 2),
+         number(each.best.median("scene_bytes") / 1e6, 2),
          "none so small" if math.isnan(each.at_bytes_db) else f"{each.at_bytes_db:+.2f}"]
         for each in found
     ]  # fmt: skip
-    within = [each for each in found if each.difference_db >= -0.1]
-    smaller = sum(each.chosen.median("scene_bytes") <= each.best.median("scene_bytes") for each in within)
+    best = sum(each.difference_db >= -0.1 for each in found)
     at_bytes = sum(each.at_bytes_db >= -0.1 for each in found)
-    said = (
-        f"\nWithin 0.1 dB of the best or above it: {len(within)} of {len(found)}, of them {smaller} at no more bytes. "
-        f"Within 0.1 dB of the best that takes no more bytes than the choice, or above it: {at_bytes} of {len(found)}; "
-        "where that difference is +0.00 the choice is itself a point of the grid, and none with fewer bytes is better. "
-        "The dB are medians; a difference is the mean, and a deviation the standard deviation, of the differences seed "
-        "by seed."
+    within = (
+        f"Within 0.1 dB of the best or above it: {best} of {len(found)}; of the best that takes no more bytes: "
+        f"{at_bytes} of {len(found)}."
     )
-    return f"{said}\n{table(header, rows)}"
+    said = _CAPACITY.format(bases=_listed(GRID_BASES), points=_listed(GRID_POINTS), within=within)
+    return said + source("make capacity", f"{CAPACITY}/{RUNS}") + table(header, rows)
 
 
 def _counted(runs: Sequence[Row]) -> str:
@@ -374,14 +309,6 @@ def _counted(runs: Sequence[Row]) -> str:
     return (
         f"{len(runs)} runs, {failed} of them failed; ours are {ours}, all others the published method and its variants."
     )
-
-
-def _scored_first(runs: Sequence[Row]) -> str:
-    """How many of the runs are from when a scene was scored before it was published; their reports lack a clock."""
-    ended = [json.loads(row["seconds"]) for row in runs if row["t_post_s"] and row["seconds"]]
-    earlier = sum("t_first_view_s" not in seconds for seconds in ended)
-    what = "were measured when a scene was scored before it was published: there `t_post_s` contains `score_s`"
-    return f"{earlier} of {len(ended)} runs {what}." if earlier else ""
 
 
 def _listed(values: Sequence[int]) -> str:

@@ -2,65 +2,76 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
+from lab.evaluate.rows import Row, read_rows
 from lab.pages.markdown import table
 
-Row = dict[str, str]
-_OF_STEPS = ("step", "part: ", "peak memory", "instances")
+_OF_STEPS = ("step, as trained", "peak memory")
+_LEFT_OUT = ("kernel: ", "part: ", "instances", "step, ")
 ORIGIN = ("machine", "gpu", "driver", "torch", "triton", "commit")
 
 _MEASURED = """
 ## On a GPU
 
-`make gpu-check` ([gpu.md](../gpu.md)): rows are in `gpu-*.csv` beside this page.
+`make gpu-check` ([gpu.md](../gpu.md)), rows in `lab/rows/gpu-*.csv`.
 """
 _TITLES = {
-    "correct": "Whether the kernels are right: worst errors over the largest values (gpu-correct.csv).",
-    "speed": "Medians of durations; the standard grid of 40,096 Gaussians at 640x512, by form of motion and frames a "
-    "step (gpu-speed.csv, which has single kernels, too).",
-    "train": "How soon it is how good (gpu-train.csv; curves in gpu-curves.csv).",
+    "speed": "Medians of durations with 40,096 Gaussians at 640x512, by form of motion and frames per step.",
+    "train": "Training on synthetic tissue; the last two columns are seconds until `paper`'s final score, and in all.",
 }
+_COLUMNS = {
+    "speed": {"what": "what", "scene": "scene", "frames": "frames", "value": "value", "unit": "unit"},
+    "train": {
+        "preset": "preset", "frames_a_step": "frames per step", "seed": "seed", "iterations": "iterations",
+        "final_db": "dB", "s_to_paper_db": "s to paper", "t_train_s": "t_train_s",
+    },
+}  # fmt: skip
+"""By part and column of its rows: what the table calls it."""
 
 
-def gpu_sections(results: Path) -> list[str]:
-    """Those whose CSV files are there."""
-    sections = []
-    measured = {name: _read(results / f"gpu-{name}.csv") for name in _TITLES}
-    if any(measured.values()):
-        sections.append(_MEASURED)
+def gpu_sections(folder: Path) -> list[str]:
+    """What `make gpu-check` found, of the parts whose CSV files are there."""
+    checks = read_rows(folder / "gpu-correct.csv")
+    measured = {name: read_rows(folder / f"gpu-{name}.csv") for name in _TITLES}
+    parts = [_MEASURED] if checks or any(measured.values()) else []
+    if checks:
+        parts.append(_checked(checks))
     for name, rows in measured.items():
         if rows:
-            shown = _speed(rows) if name == "speed" else [_plain(rows)]
-            sections += [f"\n{_TITLES[name]}\n", *shown, _origin(rows)]
-    return sections
+            shown = _speed(rows) if name == "speed" else [_plain(rows, _COLUMNS[name])]
+            parts += [f"\n{_TITLES[name]}\n", *shown]
+    return [*parts, *dict.fromkeys(_origin(rows) for rows in (checks, *measured.values()) if rows)]
 
 
-def _read(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+def _checked(rows: list[Row]) -> str:
+    """How many checks of the kernels hold, and the error that comes nearest to its limit."""
+    failed = [row["check"] for row in rows if row["ok"] != "True"]
+    bounded = [row for row in rows if float(row["limit"] or 0)]
+    worst = max(bounded, key=lambda row: float(row["worst"]) / float(row["limit"]), default=None)
+    said = f"\n{len(rows) - len(failed)} of {len(rows)} checks of the kernels hold"
+    said += f"; failed: {', '.join(failed)}" if failed else ""
+    if worst:
+        error, limit = _shown(worst["worst"]), _shown(worst["limit"])
+        said += f'. The error nearest to its limit is that of "{worst["check"]}": {error}, limit {limit}'
+    return f"{said}.\n"
 
 
-def _plain(rows: list[Row]) -> str:
-    hidden = (*ORIGIN, "believed", "detail")
-    columns = [name for name in rows[0] if name not in hidden and any(row[name] for row in rows)]
-    return table(columns, [[_shown(row[name]) for name in columns] for row in rows])
+def _plain(rows: list[Row], columns: dict[str, str]) -> str:
+    return table(list(columns.values()), [[_shown(row[name]) for name in columns] for row in rows])
 
 
 def _speed(rows: list[Row]) -> list[str]:
-    """A column for each form of motion and number of frames a step; then the rest. Kernels stay in the file."""
+    """A column for each form of motion and number of frames a step; then pictures and compilation."""
     of_steps = [row for row in rows if row["what"].startswith(_OF_STEPS)]
-    others = [row for row in rows if row not in of_steps and not row["what"].startswith("kernel: ")]
+    others = [row for row in rows if row not in of_steps and not row["what"].startswith(_LEFT_OUT)]
     places = sorted({(row["scene"], row["frames"]) for row in of_steps}, key=lambda place: (place[0], int(place[1])))
     found: dict[str, dict[tuple[str, str], str]] = {}
     for row in of_steps:
         found.setdefault(f"{row['what']}, {row['unit']}", {})[row["scene"], row["frames"]] = row["value"]
     header = ["", *(f"{scene}, {frames}" for scene, frames in places)]
     cells = [[name, *(_shown(values.get(place, "")) for place in places)] for name, values in found.items()]
-    return [table(header, cells), *([_plain(others)] if others else [])]
+    return [table(header, cells), *([_plain(others, _COLUMNS["speed"])] if others else [])]
 
 
 def _shown(value: str) -> str:
@@ -75,6 +86,6 @@ def _shown(value: str) -> str:
 def _origin(rows: list[Row]) -> str:
     first = rows[0]
     where = ", ".join(first[name] if name in ("machine", "gpu") else f"{name} {first[name]}" for name in ORIGIN)
-    doubts = {row["believed"] for row in rows} - {"yes"}
-    doubt = f" **Not to be believed: {'; '.join(sorted(doubts))}.**" if doubts else ""
+    unsure = {row["believed"] for row in rows} - {"yes"}
+    doubt = f" **Not to be believed: {'; '.join(sorted(unsure))}.**" if unsure else ""
     return f"\nMeasured on {where}.{doubt}\n"

@@ -7,72 +7,44 @@ from pathlib import Path
 from statistics import fmean
 
 from lab.conditions import CLEAN, CONDITIONS, SEVERITIES
-from lab.evaluate.atlas import WORST_FIRST, count_outcomes, map_name, places_of, series_in
+from lab.evaluate.atlas import WORST_FIRST, count_outcomes, places_of, series_in
 from lab.evaluate.rows import Row, read_rows
 from lab.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, STABILITY
-from lab.pages.markdown import number
+from lab.evaluate.stability_command import TABLE
+from lab.pages.markdown import number, origin, source, table
 
 _COMPARED = (3, 5)
 """The severities at which methods are compared."""
 _PLACES = len(CONDITIONS) * len(_COMPARED)
+MAP = "stability-fast.png"
 _INTRODUCTION = f"""
 ## Where methods break, and whether they say so
 
-`python -m lab stability --out docs/results` ([{STABILITY}]({STABILITY})) spoils a synthetic clip in {len(CONDITIONS)}
-ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the truth. Harmed is what loses more than
-{MAX_LOSS_DB:g} dB to the clean clip, or {MAX_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and
-the report has no warning that the clean clip's has not. What the user is told of each stands in
-[stability.md](stability.md), how it is judged in [evaluation.md](../decisions/evaluation.md). Each method is compared
-with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
-and not which method is better: one that has hardly learnt loses little. The table counts severities
-{" and ".join(map(str, _COMPARED))}, beside the score on the clean clip. The report of a method from another paper has
-the checks of the clip that ours have: they are this program's, not its authors'.
-
-| | clean, dB | measured | {" | ".join(WORST_FIRST)} | map |
-|---|---|---|{"---|" * len(WORST_FIRST)}---|
+A synthetic clip is spoilt in {len(CONDITIONS)} ways at {len(SEVERITIES)} severities; the table counts severities
+{" and ".join(map(str, _COMPARED))}. Silent is the defect: a loss of more than {MAX_LOSS_DB:g} dB against the method's
+own clean clip, or of {MAX_DEPTH_LOSS_MM:g} mm of depth, without a warning ([how it is judged, and why some are
+silent](../decisions/evaluation.md#clips-are-spoilt-on-purpose-silent-harm-is-the-defect)).
 """
-_MAP = """
-![Decibels lost of each condition at five severities, marked where the user was told and where not](stability-fast.png)
+_MAP = f"""
+![Decibels lost of each condition at five severities, marked where the report warns and where not]({MAP})
 """
-_WHY_SILENT = {
-    ("wrong_baseline",): """
-**Why a wrong baseline is silent.** Depth is focal length times baseline over disparity: a wrong baseline scales every
-distance, and the tissue's motion with it, and changes no pixel of either eye. The rows of the eyes match as well, the
-scene renders as well, so no check of one stereo pair's pictures can find it; only a length known beforehand could,
-such as an instrument's width, and none is asked for. Every report on stereo names the baseline it took among its
-assumptions, right or wrong alike, so that does not count as told here: compare it with your endoscope's.
-""",
-    ("fast_pull", "cutting"): """
-**Why fast pulls and cuts are silent.** Much of what they lose lies behind the instrument, which moves as the tissue
-does and hides a few hundredths of the judged picture while the tissue there goes on unseen; a calm clip's instrument
-rests, and what it hides throughout is not judged. No score of training or of held-out frames looks there: none has a
-picture of it. What the frames do show loses 1 to 4 dB beside the calm clip and stays near what a clip that breathes
-comes to, and the speed of visible tissue is no sign either: good clips, the real one among them, move as fast.
-A warning wherever an instrument hides tissue that
-moves would stand in every report. It is told by the pixel instead: in a render, `confidence` falls where tissue was
-hidden for part of the clip. What is shown behind an instrument is a guess.
-""",
-}
-"""By the conditions, why nothing is said; shown where one of them is silent."""
 
 
-def stability_sections(results: Path) -> list[str]:
-    """Markdown; none where there are no rows."""
-    rows = read_rows(results / STABILITY)
+def stability_sections(folder: Path, pictures: Path) -> list[str]:
+    """Markdown of the rows in `folder`, with the map if `pictures` holds it; none where there are no rows."""
+    rows = read_rows(folder / STABILITY)
     if not rows:
         return []
-    lines, silent = [], set()
+    cells = []
     for series in series_in(rows):
-        places = places_of(rows, series)
-        counted = count_outcomes({key: place for key, place in places.items() if key[1] in _COMPARED})
-        silent |= {condition for (condition, _), place in places.items() if place.outcome == "silent"}
-        measured = f"{sum(counted.values())} of {_PLACES}"
-        counts = " | ".join(str(counted.get(outcome, 0)) for outcome in WORST_FIRST)
-        name = f"{map_name(series)}.png"
-        shown = f"[{name}]({name})" if (results / name).exists() else ""
-        lines.append(f"| {series} | {_clean_db(rows, series)} | {measured} | {counts} | {shown} |\n")
-    drawn = [_MAP] if (results / "stability-fast.png").exists() else []
-    return [_INTRODUCTION, *lines, *drawn, *(why for names, why in _WHY_SILENT.items() if silent & {*names})]
+        compared = {key: place for key, place in places_of(rows, series).items() if key[1] in _COMPARED}
+        counted = count_outcomes(compared)
+        counts = [str(counted.get(outcome, 0)) for outcome in WORST_FIRST]
+        cells.append([series, _clean_db(rows, series), f"{sum(counted.values())} of {_PLACES}", *counts])
+    command = "python -m lab stability --out lab/rows"
+    drawn = [_MAP] if (pictures / MAP).exists() else []
+    header = ["", "clean, dB", "measured", *WORST_FIRST]
+    return [_INTRODUCTION, source(command, STABILITY, TABLE), table(header, cells), *drawn, origin(rows)]
 
 
 def _clean_db(rows: Sequence[Row], series: str) -> str:

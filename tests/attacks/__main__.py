@@ -1,6 +1,6 @@
 """`make attacks`: replay what stopped everybody once, and measure what the other tenant feels of it.
 
-python -m tests.attacks --seconds 10 --rounds 3 --out docs/results/attacks.md
+python -m tests.attacks --seconds 10 --rounds 3 --out lab/rows/attacks.md
 
 Starts `intrasplat up` on a folder of its own, with two tenants. One attacks; the other asks for one view of 320x256 of
 its own scene after the other. Its p99 during an attack is compared with that of the quiet seconds before and after.

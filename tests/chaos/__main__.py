@@ -1,6 +1,6 @@
 """`make chaos`: kill every process at every point of a clip's way, many times, and check what became of every clip.
 
-python -m tests.chaos --kills 310 --deployments 6 --out docs/results/chaos.md
+python -m tests.chaos --kills 310 --deployments 6 --out lab/rows/chaos.md
 """
 
 from __future__ import annotations

