@@ -25,7 +25,7 @@ from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
-from intrasplat.view.frame import View, render_frame
+from intrasplat.view.render import Frame, render_frame
 from lab.phantom.scene import Phantom, make_phantom
 from lab.phantom.settings import MOTIONS, PhantomSettings
 
@@ -59,7 +59,7 @@ def main() -> None:
 
 def _frame(
     scene: TrainedScene, orbit: tuple[float, float, float] | None, camera: Intrinsics
-) -> tuple[View, float, float]:
+) -> tuple[Frame, float, float]:
     """The view, and the milliseconds of the picture and of its confidence; the second time, with buffers made."""
     pose = _pose(scene, orbit)
     render_frame(scene, T, pose, camera)
@@ -85,7 +85,7 @@ def _truth(
     return phantom.render(T * scene.frame_count, _pose(scene, orbit), camera)[0]
 
 
-def _line(own: View, frame: View, picture_ms: float, layer_ms: float, truth: NDArray[np.float32] | None) -> str:
+def _line(own: Frame, frame: Frame, picture_ms: float, layer_ms: float, truth: NDArray[np.float32] | None) -> str:
     size = own.depth_mm.shape[::-1]
     smaller = frame.rgb.shape[0] < own.rgb.shape[0]
     again = cv2.resize(frame.rgb.astype(np.float32), size, interpolation=cv2.INTER_CUBIC if smaller else cv2.INTER_AREA)

@@ -37,8 +37,8 @@ from intrasplat.train.presets import PRESETS
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units
-from intrasplat.view.frame import render_frame
-from intrasplat.view.unseen import blended_values, hatched, unseen_pixels
+from intrasplat.view.render import render_frame
+from intrasplat.view.unseen import blended_values, hatched, missing_pixels, unseen_pixels
 from lab.phantom import MOTIONS, PhantomSettings, make_phantom
 
 ASIDE_DEG = ((12, 0), (-12, 0), (0, 12))
@@ -91,8 +91,8 @@ def differs(scene: TrainedScene) -> float:
         *_, alpha, blended = model.render(vector(scene, pose), 0.5, blended_values(seen)).copy()
         seen_weight = model.blend_values((seen > 0).astype(np.float32))
         solid = alpha >= COVERED_ALPHA
-        by_majority = unseen_pixels(solid & (seen_weight >= 0.5 * alpha), None)
-        found.append(float((unseen_pixels(solid, blended) != by_majority).mean()))
+        by_majority = unseen_pixels(~(solid & (seen_weight >= 0.5 * alpha)))
+        found.append(float((unseen_pixels(missing_pixels(solid, blended)) != by_majority).mean()))
     return mean(found)
 
 
