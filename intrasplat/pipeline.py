@@ -51,8 +51,8 @@ from intrasplat.train.resume import resume
 from intrasplat.train.run import Run, write_curve
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup, length_of
-from intrasplat.view.frame import SceneRenderer
 from intrasplat.view.recorded import EYES, kept_frames
+from intrasplat.view.render import SceneRenderer
 
 FINISHING_STEPS = 7
 """Of finish(), when three steps of rounding are tried."""

@@ -40,7 +40,8 @@ from intrasplat.stereo import ClipPaths
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.view.camera import camera_of, pose_of
-from intrasplat.view.frame import View, render_frame
+from intrasplat.view.frame import View
+from intrasplat.view.render import render_frame
 
 MAX_RENDER_PIXELS = 8192 * 8192
 

@@ -11,7 +11,7 @@ from contract.wire.rendering import MeasureRequest
 from intrasplat.camera import Intrinsics
 from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
 from tests.cameras import CAMERAS, FRAMES, RATE_HZ
-from worker.serve import Reply
+from worker.reply import Reply
 
 DEPTH_MM, UNCERTAINTY_MM = 60.0, 0.4
 RANGE_MM = (45.0, 78.0)

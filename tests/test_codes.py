@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 import intrasplat.files.disk_errors  # noqa: F401
-import worker.serve  # noqa: F401
+import worker.reply  # noqa: F401
 from contract.wire.checks import FindingCode
 from contract.wire.webhooks import TryFailure
 from intrasplat.errors import ErrorCode, IntrasplatError

@@ -19,7 +19,7 @@ import pytest
 
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime.settings import Settings
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.archives import archived, files_of, small_scene
 
 pytest.importorskip("s3fs")

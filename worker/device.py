@@ -17,7 +17,6 @@ from contract.queue.embedded import short_socket_path
 from contract.runtime.settings import Settings
 from contract.store.store import Store, open_store
 from contract.wire.job import JobProgress, JobRecord
-from contract.wire.rendering import SceneRequest
 from intrasplat.commands.exits import ExitCode, leave_last_words
 from intrasplat.decode import keep_decoder_ready
 from intrasplat.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
@@ -54,7 +53,8 @@ from worker.orders import (
     job_progress,
 )
 from worker.pace import SHARE, Pace
-from worker.serve import Reply, RequestServer
+from worker.scheduler import Scheduler
+from worker.serve import RequestServer
 from worker.snapshot import Snapshots
 from worker.views import Views
 
@@ -111,26 +111,20 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
-    def answer(request: SceneRequest) -> Reply:
-        with alone(is_alone=pace.trains):
-            return views.answer(request)
-
     def report_held_scenes() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
-    server = RequestServer(
-        endpoint,
-        answer,
+    scheduler = Scheduler(
+        views.answer_in_parts,
+        pace,
         cost=views.cost,
-        between=report_held_scenes,
-        pace=pace,
+        within=lambda: alone(is_alone=pace.trains),  # shares in the pool would make those of a training step wait
         spent_s=cpu_time_s,  # with what this thread waits for a GPU: it asks again and again
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
-        render_secret=settings.render_secret,
     )
-    views.pause, views.level = server.pause, server.level
+    server = RequestServer(endpoint, scheduler, between=report_held_scenes, render_secret=settings.render_secret)
     with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)

@@ -89,7 +89,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
     from intrasplat.view.encode import encode_layer
-    from intrasplat.view.frame import render_frame, renderer_of
+    from intrasplat.view.render import render_frame, renderer_of
 
     device = choose_device(options.device)
     if not (options.scene / MANIFEST).is_file():

@@ -11,7 +11,7 @@ import numpy as np
 
 from intrasplat.export.npy import npy_head
 from intrasplat.export.target import Target
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 
 
 def depth_parts(target: Target) -> Iterator[bytes]:

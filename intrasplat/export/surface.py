@@ -23,7 +23,7 @@ from intrasplat.errors import InputError
 from intrasplat.export.target import Target
 from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.view.camera import endoscope_pose
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 
 SIDE_DEG = 8.0
 """How far the views around stand from the endoscope's, about the middle of what it sees."""

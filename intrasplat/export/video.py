@@ -21,7 +21,7 @@ from intrasplat.machine.opencv import silent_stderr
 from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
 from intrasplat.view.camera import endoscope_pose
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 
 CODECS = {"webm": "VP80", "mp4": "vp09"}

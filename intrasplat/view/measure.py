@@ -27,8 +27,8 @@ from intrasplat.splat.metrics import COVERED_ALPHA
 from intrasplat.train.targets import solid_depth_mm
 from intrasplat.view.camera import as_recorded, endoscope_pose
 from intrasplat.view.confidence import confidence, evidence
-from intrasplat.view.frame import renderer_of
-from intrasplat.view.unseen import unseen_pixels
+from intrasplat.view.render import renderer_of
+from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
 WINDOW_PX = 64
 """Side of the part of the picture that is drawn about a pixel. Gaussians whose centres lie outside it change its middle
@@ -134,7 +134,7 @@ class _View:
         if own_depth_mm <= 0:
             own_depth_mm = depth_mm
         sigma_mm = uncertainty_mm(scene, own_depth_mm, spread_mm, likely)
-        unseen = bool(unseen_pixels(solid, blended, camera.width)[i, j])
+        unseen = bool(unseen_pixels(missing_pixels(solid, blended), camera.width)[i, j])
         return Place(point_mm, ray, depth_mm, own_depth_mm, sigma_mm, likely, unseen, gaussians, shares)
 
     def _ray(self, x: float, y: float) -> NDArray[np.float64]:

@@ -10,8 +10,8 @@ from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, P
 from intrasplat.notices import Notice
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
-from intrasplat.view.frame import held_in_clip, renderer_of
 from intrasplat.view.measure import MIN_CONFIDENCE, Distances, Place, distances, places_at
+from intrasplat.view.render import held_in_clip, renderer_of
 
 OTHER_PLACE = "Choose another place or another moment."
 EXPANDED = 2.0

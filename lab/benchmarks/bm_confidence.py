@@ -35,7 +35,7 @@ from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import TrainingFrames
 from intrasplat.view.camera import view_camera
 from intrasplat.view.confidence import LEAST_DISAGREEMENT, evidence, seen_from_endoscope
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.evaluate.ranking import rank_scores, reliability
 from lab.evaluate.rows import commit, machine
 from lab.evaluate.sources import open_source, source_of

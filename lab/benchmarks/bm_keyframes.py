@@ -33,7 +33,7 @@ from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.benchmarks.bm_poses import PATHS, write
 from lab.evaluate.rows import commit
 from lab.evaluate.seen import seen_points, share_covered

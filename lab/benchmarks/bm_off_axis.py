@@ -38,7 +38,7 @@ from intrasplat.train.presets import preset_named
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 from lab.evaluate.sources import OpenClip, open_source, source_of
 from lab.evaluate.truth import Expected, SceneCandidate, Truth, seen_now

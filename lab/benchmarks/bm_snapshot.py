@@ -40,7 +40,7 @@ from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from lab.phantom import PhantomSettings, make_phantom
 from worker.pace import Pace
-from worker.serve import NotYetError
+from worker.reply import NotYetError
 from worker.snapshot import Snapshots
 from worker.views import Views
 

@@ -9,7 +9,7 @@ import numpy as np
 from intrasplat.clip import DepthClip
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.train.scoring import judged_pixels, sample_frames
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.evaluate.ranking import PixelErrors, pixel_errors, rank_scores, together
 
 JUDGED_FRAMES = 8

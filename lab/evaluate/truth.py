@@ -45,7 +45,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.metrics import COVERED_ALPHA, depth_agreement_mm, depth_errors_mm, psnr_tissue
 from intrasplat.train.scoring import sample_frames
 from intrasplat.view.camera import view_camera
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.evaluate.ranking import PixelErrors, pixel_errors, rank_scores, together
 from lab.evaluate.thinned import lattice
 from lab.phantom import Phantom

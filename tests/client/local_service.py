@@ -27,11 +27,13 @@ from intrasplat.picture import MEDIA_TYPES, Highlights, Unseen
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.answers import at_once
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
 from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from worker.serve import Reply, RequestServer
+from worker.reply import Reply
+from worker.serve import RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
@@ -107,7 +109,7 @@ class LocalService:
 def local_service(data_dir: Path, **changes: Any) -> Iterator[LocalService]:
     service = LocalService(data_dir, **changes)
     try:
-        with RequestServer(service.endpoint, paint):
+        with RequestServer(service.endpoint, at_once(paint)):
             service.announce()
             yield service
     finally:

@@ -50,12 +50,14 @@ from intrasplat.scene.scene import TrainedScene
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.answers import at_once
 from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
 from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.pace import Pace
-from worker.serve import Reply, RequestServer
+from worker.reply import Reply
+from worker.serve import RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 15.0
@@ -250,7 +252,7 @@ def site_at(data_dir: Path, answer: Callable[[SceneRequest], Reply] | None = Non
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, answer or painter.answer, pace=pace, max_wait_s=MAX_WAIT_S):
+    with RequestServer(endpoint, at_once(answer or painter.answer, pace, max_wait_s=MAX_WAIT_S)):
         site = Site(data_dir, endpoint, painter, pace, **changes)
         try:
             yield site

@@ -20,7 +20,7 @@ from client.page import DASHBOARD
 from intrasplat.pose import parse_pose
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import pose_of
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 from service.guard import ANSWER_HEADERS
 from tests.client.page import GRAPHICS, browser

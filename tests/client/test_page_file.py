@@ -23,7 +23,7 @@ from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.inline import CannotInlineError, inlined
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 from tests.archives import ORIGIN, small_scene, stored
 from tests.client.page import browser

@@ -20,7 +20,7 @@ from tests.client.player import drawing_browser
 from tests.client.test_player import scattered
 from tests.client.words import say
 from tests.intrasplat.scenes import random_scene
-from worker.serve import Reply
+from worker.reply import Reply
 from worker.views import Views
 
 

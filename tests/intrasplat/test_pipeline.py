@@ -41,8 +41,8 @@ from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.rate_distortion import TOLERANCE_DB, round_model
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import camera_in_units
-from intrasplat.view.frame import render_frame
 from intrasplat.view.recorded import stored_frame
+from intrasplat.view.render import render_frame
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 

@@ -14,7 +14,7 @@ from intrasplat.formats import EXPORT_FORMATS
 from service import exports
 from tests.service.live import live_service
 from tests.service.under_test import ServiceUnderTest, assert_problem
-from worker.serve import Reply
+from worker.reply import Reply
 
 PARTS = 5
 

@@ -21,7 +21,7 @@ from intrasplat.picture import Highlights, Unseen
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from tests.service.under_test import CAMERA
-from worker.serve import NotYetError, Reply
+from worker.reply import NotYetError, Reply
 
 TIMEOUT_S = 10.0
 LARGE = 4 * 2**20

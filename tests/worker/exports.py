@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from contract.wire.rendering import ExportRequest, SceneRequest
 from intrasplat.formats import check_export
-from worker.serve import Reply
+from worker.reply import Reply
 
 
 def export_request(scene_id: str, name: str = "ply", **options: object) -> ExportRequest:

@@ -16,6 +16,7 @@ from intrasplat.errors import SceneError, UnavailableError
 from intrasplat.export import EXPORTS, export_parts
 from intrasplat.export.target import Target
 from intrasplat.scene.checkpoint import save_scene
+from tests.answers import at_once
 from tests.intrasplat.scenes import random_scene
 from tests.worker.exports import export_request, exported
 from tests.worker.test_serve import ask, connected
@@ -49,7 +50,7 @@ def scene_id(store: Store) -> str:
 @pytest.fixture
 def worker(tmp_path: Path) -> Iterator[zmq.Socket[bytes]]:
     endpoint = f"ipc://{short_socket_path(tmp_path, 'worker.sock')}"
-    with RequestServer(endpoint, Views(Store(tmp_path)).answer), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(Views(Store(tmp_path)).answer)), connected(endpoint) as socket:
         yield socket
 
 

@@ -21,7 +21,7 @@ from intrasplat.scene.checkpoint import save_scene
 from intrasplat.view.recorded import EYES, kept_frames
 from tests.intrasplat.scenes import FRAMES, random_scene
 from tests.reports import REPORT_OF_A_SCENE
-from worker.serve import NotYetError
+from worker.reply import NotYetError
 from worker.snapshot import Snapshots
 from worker.views import Views
 

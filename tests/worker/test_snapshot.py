@@ -26,11 +26,11 @@ from intrasplat.train.loop import train
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import HeldOutScore
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.intrasplat.phantoms import bits, phantom_clip, prepared, view
 from tests.intrasplat.scenes import random_scene
-from worker.serve import NotYetError
+from worker.reply import NotYetError
 from worker.snapshot import Snapshots
 from worker.views import Views
 

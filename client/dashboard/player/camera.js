@@ -5,7 +5,7 @@
 const MEDIAN_DEPTH_UNITS = 60;
 /** Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2). */
 const FADING = 1.0;
-/** Pixels in which a picture is judged at most (intrasplat/view/frame.py). */
+/** Pixels in which a picture is judged at most (intrasplat/view/render.py). */
 const MAX_JUDGED_PIXELS = 2 ** 21;
 
 /** @typedef {number[][]} Matrix */

@@ -6,7 +6,7 @@ import { CannotDrawError, Drawing } from "./draw.js";
 import { patternsAt } from "./motion.js";
 import { readTable } from "./table.js";
 
-/** Of intrasplat/view/frame.py. */
+/** Of intrasplat/view/render.py. */
 const FAR_POSE = 0.35;
 const MAX_UNSEEN_SHARE = 0.05;
 const MAX_LOW_SHARE = 0.1;
@@ -140,7 +140,7 @@ export class Player {
     this.sortedFor = key;
   }
 
-  /** As intrasplat/view/frame.py warns of a frame. */
+  /** As intrasplat/view/render.py warns of a frame. */
   #warnings(view, t, unseen, hardlySeen) {
     const warnings = [...this.poseWarnings];
     const tell = (code, text) => warnings.push({ code, text });

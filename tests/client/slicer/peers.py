@@ -25,12 +25,13 @@ from contract.queue.embedded import short_socket_path
 from contract.store.store import Store
 from intrasplat.names import REPORT
 from intrasplat.scene.checkpoint import save_scene
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.client.page import Painter, Site
 from tests.intrasplat.export.sheet import tissue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.test_repository import REPOSITORY
 from worker.pace import Pace
+from worker.scheduler import Scheduler
 from worker.serve import RequestServer
 from worker.views import Views
 
@@ -199,7 +200,7 @@ def rendering_site(data_dir: Path) -> Iterator[Site]:
     store = Store(data_dir)
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, Views(store).answer, pace=pace):
+    with RequestServer(endpoint, Scheduler(Views(store).answer_in_parts, pace)):
         site, ended = Site(data_dir, endpoint, Painter(), pace), threading.Event()
         heart = threading.Thread(target=_beat, args=(site, ended))
         heart.start()

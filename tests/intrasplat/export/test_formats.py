@@ -20,7 +20,7 @@ from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
 from intrasplat.poses.trajectory import read_tum
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.constants import SH_C0
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.intrasplat.scenes import FRAMES, KINDS, random_scene
 
 

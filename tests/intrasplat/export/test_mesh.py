@@ -18,7 +18,7 @@ from intrasplat.formats import ExportOptions
 from intrasplat.outcome import scene_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import endoscope_pose
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.phantom import PhantomSettings, make_phantom
 from tests.intrasplat.export.sheet import tissue
 from tests.intrasplat.phantoms import prepared, trained

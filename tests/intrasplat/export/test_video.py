@@ -20,7 +20,7 @@ from intrasplat.export.video import CIRCLE_S, STILL_RATE_HZ
 from intrasplat.formats import check_export
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import endoscope_pose
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 from tests.intrasplat.export.sheet import tissue
 from tests.intrasplat.scenes import FRAMES

@@ -24,7 +24,7 @@ from intrasplat.report import Imported, Report
 from intrasplat.scene.archive import read_archive
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.imported import take_scene
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.archives import HOSTILE, ORIGIN, Files, archived, files_of, relisted, small_scene, zipped
 from tests.intrasplat.scenes import KINDS, random_scene
 

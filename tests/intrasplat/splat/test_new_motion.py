@@ -21,7 +21,7 @@ from intrasplat.train.densify import DensifySettings
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.presets import PRESETS
 from intrasplat.train.request import ReconstructionRequest
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.intrasplat.phantoms import phantom_clip
 
 

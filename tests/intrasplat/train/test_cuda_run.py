@@ -23,7 +23,7 @@ from intrasplat.train.prepare import prepare
 from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.train.setup import Setup
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.helpers import assert_close
 from tests.intrasplat.clips import plane_clip
 from tests.intrasplat.phantoms import keep, kept

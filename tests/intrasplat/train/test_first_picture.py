@@ -9,7 +9,7 @@ from intrasplat.errors import InputError
 from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.first_picture import first_picture
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from lab.phantom import PhantomSettings, make_phantom
 
 

@@ -17,7 +17,7 @@ from intrasplat.splat.layout import ENLARGED, POSE, RECORDED
 from intrasplat.splat.step import camera_vector
 from intrasplat.train.targets import camera_in_units
 from intrasplat.view.camera import FADING, endoscope_pose, gloss_seen, nearest_recorder, view_camera
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import render_frame
 from tests.intrasplat.scenes import random_scene
 
 RIGHT_EYE_MM = (3.0, 0.0, 4.0)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from intrasplat.machine.parts import whole
 from intrasplat.outcome import snapshot_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.coarse import LEVELS, thinned
-from intrasplat.view.frame import render_frame
+from intrasplat.view.render import ViewRequest, frame_in_parts, render_frame
 from tests.intrasplat.phantoms import phantom_clip, prepared, trained
 
 
@@ -25,13 +26,12 @@ def test_a_coarse_picture_resembles_the_whole_one_and_leaves_no_gaps(
     scene: TrainedScene, level: int, least_db: float
 ) -> None:
     detail, clip = LEVELS[level], scene.intrinsics
-    whole = render_frame(scene, 0.4)
+    sharp = render_frame(scene, 0.4)
     camera = clip.resized(clip.width // detail.pixels, clip.height // detail.pixels)
-    coarse = render_frame(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True).enlarged(
-        clip.width, clip.height
-    )
-    solid = whole.depth_mm > 0
-    assert psnr_tissue(coarse.rgb, whole.rgb, solid) > least_db
+    view = ViewRequest(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True)
+    coarse = whole(frame_in_parts(view)).enlarged(clip.width, clip.height)
+    solid = sharp.depth_mm > 0
+    assert psnr_tissue(coarse.rgb, sharp.rgb, solid) > least_db
     assert (coarse.depth_mm[solid] > 0).mean() > 0.98
 
 

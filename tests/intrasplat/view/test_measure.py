@@ -16,7 +16,6 @@ from intrasplat.notices import NoticeCode
 from intrasplat.outcome import scene_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.deformation import SharedBasis
-from intrasplat.view.frame import render_frame, renderer_of
 from intrasplat.view.measure import (
     DISPARITY_PX,
     MIN_CONFIDENCE,
@@ -26,6 +25,7 @@ from intrasplat.view.measure import (
     uncertainty_mm,
 )
 from intrasplat.view.measured import EXPANDED, measured
+from intrasplat.view.render import render_frame, renderer_of
 from lab.phantom import Phantom, PhantomSettings, make_phantom, orbit_pose
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained
 

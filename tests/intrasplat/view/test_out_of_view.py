@@ -10,8 +10,8 @@ import torch
 
 from intrasplat.scene.model import model_of
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.view.frame import render_frame
 from intrasplat.view.out_of_view import FADES_IN_S, LEFT_TRUST, OutOfView
+from intrasplat.view.render import render_frame
 from tests.intrasplat.scenes import random_scene
 
 FRAMES = 12

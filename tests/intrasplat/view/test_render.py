@@ -21,7 +21,9 @@ from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.view.camera import endoscope_pose
-from intrasplat.view.frame import FAR_POSE, judged_camera, render_frame, renderer_of
+from intrasplat.view.frame import View
+from intrasplat.view.lenses import judged_camera
+from intrasplat.view.render import FAR_POSE, ViewRequest, frame_in_parts, render_frame, renderer_of
 from lab.phantom import orbit_pose
 from tests.helpers import assert_close
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
@@ -234,18 +236,36 @@ def test_sizes_come_and_go_without_changing_a_picture(scene: TrainedScene) -> No
     np.testing.assert_array_equal(render_frame(scene, 0.2).rgb, first)
 
 
-def test_a_view_of_the_same_size_in_a_pause_changes_nothing(scene: TrainedScene) -> None:
-    renderer, camera = renderer_of(scene), scene.intrinsics.resized(1100, 1000)
-    poses = [orbit_pose(yaw_deg, 0.0) for yaw_deg in (0.0, 10.0)]
-    alone = [renderer.layers(0.5, pose, camera)[0] for pose in poses]
-    in_pauses: list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]] = []
-    shown, _ = renderer.layers(
-        0.5, poses[0], camera, pause=lambda: in_pauses.append(renderer.layers(0.5, poses[1], camera)[0])
-    )
-    np.testing.assert_array_equal(shown, alone[0])
-    assert len(in_pauses) > 3
-    for each in in_pauses:
-        np.testing.assert_array_equal(each, alone[1])
+def test_frames_of_one_size_that_are_made_in_turn_part_by_part_are_what_each_is_alone(scene: TrainedScene) -> None:
+    camera = scene.intrinsics.resized(1100, 1000)
+    views = [ViewRequest(scene, 0.5, orbit_pose(yaw_deg, 0.0), camera) for yaw_deg in (0.0, 10.0)]
+    alone = [render_frame(scene, 0.5, each.pose, camera) for each in views]
+    under_way = {place: frame_in_parts(each, with_confidence=place == 1) for place, each in enumerate(views)}
+    made: dict[int, View] = {}
+    rounds = 0
+    while under_way:
+        rounds += 1
+        for place, parts in list(under_way.items()):
+            try:
+                next(parts)
+            except StopIteration as end:
+                made[place] = end.value
+                del under_way[place]
+    assert rounds > 8
+    for place, expected in enumerate(alone):
+        for name in ("rgb", "depth_mm", "unseen", "confidence"):
+            np.testing.assert_array_equal(getattr(made[place], name), getattr(expected, name))
+        assert (made[place].unseen_share, made[place].warnings) == (expected.unseen_share, expected.warnings)
+
+
+def test_a_frame_that_is_abandoned_leaves_the_next_as_it_is(scene: TrainedScene) -> None:
+    camera = scene.intrinsics.resized(1100, 1000)
+    expected = render_frame(scene, 0.5, None, camera).rgb
+    parts = frame_in_parts(ViewRequest(scene, 0.2, None, camera))
+    next(parts)
+    next(parts)
+    parts.close()
+    np.testing.assert_array_equal(render_frame(scene, 0.5, None, camera).rgb, expected)
 
 
 def test_a_scene_that_is_dropped_takes_its_renderer_along() -> None:
