@@ -223,7 +223,8 @@ def _times_s(given: NDArray[Any] | None, rgb: NDArray[Any]) -> NDArray[np.float6
     times_s = np.asarray(given, np.float64)
     if times_s.shape != (len(rgb),) or not np.isfinite(times_s).all() or not (np.diff(times_s) > 0).all():
         raise _shape_error("frame_times_s", times_s, f"[{len(rgb)}] finite seconds that rise")
-    return times_s - times_s[0]
+    from_first: NDArray[np.float64] = times_s - times_s[0]
+    return from_first
 
 
 def _tissue(masks: FilePath | NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:

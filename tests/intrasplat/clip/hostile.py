@@ -19,7 +19,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-VIDEO = Path(__file__).resolve().parents[3] / "data" / "stereo_sbs_h264.mp4"
+VIDEO = Path(__file__).resolve().parents[2] / "data" / "stereo_sbs_h264.mp4"
 CALIBRATION = (
     b'{"model": "rectified", "width": 96, "height": 80, "fx_px": 90, "fy_px": 90, "cx_px": 48, "cy_px": 40, '
     b'"baseline_mm": 4}'

@@ -13,7 +13,7 @@ from intrasplat.clip import ClipLimits, StereoClip, find_calibration, open_clip
 from intrasplat.errors import InputError, LimitError
 from tests.intrasplat.clips import open_with
 
-LIVE = Path(__file__).parents[3] / "data/stereo_sbs_live.webm"  # declares no length
+LIVE = Path(__file__).parents[2] / "data/stereo_sbs_live.webm"  # declares no length
 PATTERNS = [
     ("clip/left/{}.png", "clip/right/{}.png"),
     ("clip/{}l.png", "clip/{}r.png"),

@@ -15,7 +15,7 @@ from intrasplat.clip.split import PAUSE_FRAMES, REPEAT_LEVELS, find_repeats
 from intrasplat.errors import InputError
 from intrasplat.notices import NoticeCode
 
-REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[4].parent / "shared/data"))
+REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[3].parent / "shared/data"))
 
 
 def clip_of(rgb: NDArray[np.uint8]) -> DepthClip:

@@ -15,10 +15,10 @@ from intrasplat.errors import InputError, LimitError
 from intrasplat.intake.limits import HELD_BYTES_PER_PIXEL
 from tests.intrasplat.clips import open_with
 
-DATA = Path(__file__).parents[3] / "data"
+DATA = Path(__file__).parents[2] / "data"
 SBS_H264 = DATA / "stereo_sbs_h264.mp4"
 TB_HEVC = DATA / "stereo_tb_hevc.mov"
-REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[4].parent / "shared/data"))
+REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[3].parent / "shared/data"))
 HELD_BYTES = 12 * 96 * 80 * HELD_BYTES_PER_PIXEL  # of the twelve frames in tests/data, once they are reconstructed
 LOSSY_LEVELS = 8.0  # mean error of strongly compressed 8-bit frames
 
