@@ -17,6 +17,7 @@ from pathlib import Path
 
 from intrasplat.clip import DepthClip, open_clip, split_frames
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
 from intrasplat.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
@@ -24,7 +25,6 @@ from intrasplat.scene.model import model_of
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.rate_distortion import round_model
 from intrasplat.train.scoring import HeldOutScore, held_out_score
 from intrasplat.train.setup import Setup

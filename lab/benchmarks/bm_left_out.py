@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from intrasplat.clip import DepthClip, StereoClip, split_frames
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
+from intrasplat.methods.registry import preset_named
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.metrics import psnr_tissue
@@ -37,7 +38,6 @@ from intrasplat.stereo.opening import match_eyes
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import preset_named
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import HeldOutScore, frame_renderer
 from intrasplat.train.setup import Setup

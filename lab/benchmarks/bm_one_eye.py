@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.machine.hooks import Hooks
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import preset_named
 from intrasplat.options import ReconstructionOptions
 from intrasplat.quality.right_eye import warped_left
 from intrasplat.splat.cpu import compile_kernels
@@ -33,7 +35,6 @@ from intrasplat.splat.metrics import clear_of_highlights, psnr_tissue
 from intrasplat.splat.optimize import Rate
 from intrasplat.train.loop import step
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import Preset, preset_named
 from intrasplat.train.run import Run
 from intrasplat.train.schedule import Schedule
 from intrasplat.train.scoring import frame_renderer, judged_pixels

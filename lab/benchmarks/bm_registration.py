@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from intrasplat.clip import DepthClip, Eye, held_out_frames, split_frames
 from intrasplat.clip.calibration import RectifiedClip, rectify
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.metrics import psnr_tissue
@@ -32,7 +33,6 @@ from intrasplat.stereo.turn import Turn
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import HeldOutScore, frame_renderer
 from intrasplat.train.setup import Setup

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, FrameSplit, split_frames
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
 from intrasplat.pose import OrbitPose, world_from_camera
@@ -33,7 +34,6 @@ from intrasplat.splat.step import camera_vector
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units

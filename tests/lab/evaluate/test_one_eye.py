@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from intrasplat.train.presets import preset_named
+from intrasplat.methods.registry import preset_named
 from lab.benchmarks.bm_one_eye import colours_alone, main
 
 LINES = ["warp", "warp by flow", "left eye", "both eyes", "left's colours"]
