@@ -37,7 +37,7 @@ from intrasplat.scene.results import add_scores, without_scores
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
 from intrasplat.splat.cpu import compile_kernels
-from intrasplat.splat.deformation import HexPlane
+from intrasplat.splat.deformation import motion_named
 from intrasplat.stereo import ClipPaths
 from intrasplat.stereo import open_with_depth as open_paths
 from intrasplat.train.first_picture import first_picture
@@ -170,7 +170,8 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     timings.add("compile_s", compile_coder())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
-    torch.set_num_threads(cores() if preset.deformation == HexPlane.kind else 1)  # else kernels do what takes time
+    by_kernels = motion_named(preset.deformation).has_kernels  # they have threads of their own, so torch needs one
+    torch.set_num_threads(1 if by_kernels else cores())
     idle = device != choose_device(request.device)
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 

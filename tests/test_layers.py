@@ -56,6 +56,7 @@ ORDER = {
         "fusion",
         "splat",
         "scene",
+        "methods",
         "train",
         "view",
         "export",

@@ -7,6 +7,7 @@ from functools import partial
 
 from intrasplat.fusion import fuse
 from intrasplat.machine.memory import LITTLE_BYTES, keep_free_memory
+from intrasplat.methods.method import Preset
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.tracks import Tracks, moved_along
 from intrasplat.notices import Notice
@@ -15,7 +16,6 @@ from intrasplat.splat.deformation import SharedBasis
 from intrasplat.splat.model import Model
 from intrasplat.train.calibrate import measured_schedule, warm_up
 from intrasplat.train.densify import Densifier
-from intrasplat.train.presets import Preset
 from intrasplat.train.run import Box, Run
 from intrasplat.train.schedule import Schedule, validation_frames
 from intrasplat.train.setup import Setup

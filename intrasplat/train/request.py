@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from intrasplat.clip import ClipLimits, DepthClip
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import preset_named
 from intrasplat.options import ReconstructionOptions
-from intrasplat.train.presets import Preset, preset_named
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from typing import Any
 from torch import Tensor
 
 from intrasplat.errors import ResumeMismatch, SceneError
+from intrasplat.methods.method import Preset
 from intrasplat.notices import Notice
 from intrasplat.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from intrasplat.splat.model import Model, state_of
 from intrasplat.train.prepare import begun, examine_device, frames_of
-from intrasplat.train.presets import Preset
 from intrasplat.train.run import CurvePoint, Run
 from intrasplat.train.schedule import Schedule
 from intrasplat.train.setup import Setup

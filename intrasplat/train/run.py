@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from intrasplat.machine.hooks import Progress
+from intrasplat.methods.method import Preset
 from intrasplat.names import Eyes
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import Device
 from intrasplat.splat.model import Model
 from intrasplat.train.average import RunningMean
 from intrasplat.train.densify import Densifier
-from intrasplat.train.presets import Preset
 from intrasplat.train.schedule import Schedule, validation_frames
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import TrainingFrames

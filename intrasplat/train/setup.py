@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 from intrasplat.clip import DepthClip, Eye, FrameSplit
 from intrasplat.machine.timing import Stopwatch, Timings
+from intrasplat.methods.method import Preset
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.train.hooks import TrainingHooks
-from intrasplat.train.presets import Preset
 
 
 @dataclass(frozen=True, eq=False)

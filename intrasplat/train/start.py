@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.fusion import FusionSettings, PointCloud, nearest_pixels
+from intrasplat.methods.method import Preset
 from intrasplat.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, mean_floor_error, try_bases
 from intrasplat.motion.tracks import GUESSED, Tracks, fit_tracks
 from intrasplat.notices import Notice, NoticeCode
@@ -23,7 +24,6 @@ from intrasplat.splat.deformation import AtRest, SharedBasis, motion_named
 from intrasplat.splat.gaussians import NEIGHBOURS, Gaussians, initial_gaussians
 from intrasplat.splat.layout import COLOUR, MEAN, ROWS
 from intrasplat.splat.model import Model
-from intrasplat.train.presets import Preset
 from intrasplat.train.run import Box
 from intrasplat.train.setup import Setup
 

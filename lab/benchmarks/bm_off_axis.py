@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import split_frames
 from intrasplat.machine.hooks import Hooks
+from intrasplat.methods.registry import preset_named
 from intrasplat.names import Eyes
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
@@ -34,7 +35,6 @@ from intrasplat.splat.cpu import compile_kernels
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import preset_named
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS

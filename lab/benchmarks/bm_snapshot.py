@@ -26,6 +26,7 @@ from contract.store.store import Store
 from contract.wire.rendering import RenderRequest
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import snapshot_of
 from intrasplat.picture import ImageFormat
@@ -35,7 +36,6 @@ from intrasplat.splat.cpu.threads import cpu_time_s, thread_count
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from lab.phantom import PhantomSettings, make_phantom

@@ -25,6 +25,7 @@ from lab.evaluate.measure import Bench
 from lab.evaluate.rows import Results, adding_alone, write_rows
 from lab.evaluate.sources import PHANTOM_SPELLING, source_of
 from lab.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
+from lab.evaluate.variants import register_variants
 from lab.rivals import RIVAL_SYSTEMS
 
 SUMMARY = "summary.csv"
@@ -85,6 +86,7 @@ def run_cli(options: argparse.Namespace) -> int:
             this machine lacks; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
+    register_variants()
     out: Path = options.out
     if options.redraw == bool(options.clips):
         remedy = "Name one or more clips, or say --redraw alone."

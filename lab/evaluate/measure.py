@@ -36,7 +36,7 @@ from intrasplat.splat.step import camera_vector
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import camera_in_units
-from lab.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, is_rival_system, options_of, preset_of
+from lab.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_rival_system, options_of, own_preset_of
 from lab.evaluate.right_eye import right_eye_ranks
 from lab.evaluate.rows import COPIES, KEY, NO_RESULT, SCORES, commit, machine
 from lab.evaluate.sources import OpenClip, Source, open_source
@@ -116,7 +116,7 @@ class Bench:
         request = ReconstructionRequest(
             clip=opened.clip,
             options=options_of(cell),
-            own_preset=preset_of(cell.series) if is_changed(cell.series) else None,
+            own_preset=own_preset_of(cell.series),
             device=self.device,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )

@@ -18,6 +18,7 @@ from lab.conditions import CONDITIONS, SEVERITIES
 from lab.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
 from lab.evaluate.rows import Row, adding_alone, read_rows
 from lab.evaluate.stability import STABILITY, Grid, StabilityBench, StabilityCell, plan
+from lab.evaluate.variants import register_variants
 from lab.rivals import RIVAL_SYSTEMS
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
@@ -62,6 +63,7 @@ def run_cli(options: argparse.Namespace) -> int:
         UnavailableError: this machine lacks something; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
+    register_variants()
     out: Path = options.out
     if not options.redraw:
         width, height = options.size

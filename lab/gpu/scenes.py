@@ -13,11 +13,13 @@ from torch import Tensor
 from intrasplat.splat import reference
 from intrasplat.splat.cpu import padded
 from intrasplat.splat.cuda.rasterizer import CudaRasterizer
-from intrasplat.splat.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from intrasplat.splat.deformation import Deformation, GaussianFdm, SharedBasis
 from intrasplat.splat.layout import CAMERA
 from intrasplat.splat.loss import LossSettings, training_loss
 from intrasplat.splat.step import Target, TrainingFrame
 from intrasplat.stereo.matching import MatchPlan
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 from tests.intrasplat.splat.scenes import SplatScene, pixels_near_a_cut
 
 LOSS = LossSettings(depth_weight=20.0, colour_huber_delta=0.05, depth_huber_delta=1e-3)

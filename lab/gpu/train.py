@@ -20,13 +20,14 @@ import numpy as np
 
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.errors import Cancelled
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.train import loop as training
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.run import CurvePoint, Run
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup

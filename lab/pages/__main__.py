@@ -17,7 +17,6 @@ from lab.pages.gpu import gpu_sections
 from lab.pages.moving import moving_sections
 from lab.pages.post import post_sections
 from lab.pages.programs import (
-    ablation_sections,
     long_sections,
     memory_sections,
     raster_sections,
@@ -55,7 +54,6 @@ def main() -> None:
         _INTRODUCTION,
         *sections(ROWS, PICTURES),
         *post_sections(ROWS),
-        *ablation_sections(ROWS),
         *table1_sections(ROWS),
         *two_eyes_sections(ROWS),
         *off_axis_sections(PICTURES),

@@ -7,12 +7,6 @@ from pathlib import Path
 from lab.evaluate.rows import Row, read_rows
 from lab.pages.markdown import median_of, origin, source, table
 
-_ABLATION = """
-## What each part of fast is worth
-
-Held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
-320x256 and hold 20 k points at most, so rows that name fewer points equal `fast` there.
-"""
 _RASTER = """
 ## Splatting on the CPU
 
@@ -61,23 +55,6 @@ _LONG_COLUMNS = {
     "whole_psnr_db": "whole", "train_mib": "MiB in training", "finish_mib": "in finishing",
 }  # fmt: skip
 _SERVICE_FIGURES = {"p50_ms": "p50 ms", "p99_ms": "p99 ms", "per_s": "a second", "slower": "training slower by"}
-
-
-def ablation_sections(folder: Path) -> list[str]:
-    """The table of bm_ablation.py, the last row of each run; nothing without rows."""
-    latest = {tuple(row[name] for name in ("change", "clip", "holdout", "seed")): row
-              for row in read_rows(folder / "ablation.csv")}  # fmt: skip
-    rows = list(latest.values())
-    if not rows:
-        return []
-    columns = list(dict.fromkeys((row["clip"], row["holdout"]) for row in rows))
-    cells = []
-    for change in dict.fromkeys(row["change"] for row in rows):
-        changed = [row for row in rows if row["change"] == change]
-        cells.append([change, *(_score(changed, *column) for column in columns)])
-    command = "python -m lab.benchmarks.bm_ablation --iterations 300 --csv lab/rows/ablation.csv"
-    header = ["", *(f"{clip}, {holdout}" for clip, holdout in columns)]
-    return [_ABLATION, source(command, "ablation.csv"), table(header, cells), origin(rows)]
 
 
 def _score(rows: list[Row], clip: str, holdout: str) -> str:

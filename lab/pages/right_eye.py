@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from intrasplat.train.presets import PRESETS
+from intrasplat.methods.registry import PRESETS
 from lab.evaluate.rows import read_rows
 from lab.evaluate.summary import Group, groups_of
 from lab.pages.markdown import number, origin, source, table

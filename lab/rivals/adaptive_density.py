@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from intrasplat.errors import TrainingDiverged
+from intrasplat.methods.method import DensifySettings
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.reference import rotation
-from intrasplat.train.densify import SPLIT_SHRINK, DensifySettings, successors
+from intrasplat.train.densify import SPLIT_SHRINK, successors
 
 PARAMETERS = 6
 """Of Gaussians, each in a group of its own, and these the optimiser's first groups: mean [N, 3] in units,

@@ -21,11 +21,11 @@ from torch import Tensor, nn
 
 from intrasplat.camera import Intrinsics
 from intrasplat.errors import TrainingDiverged
+from intrasplat.methods.method import DensifySettings
 from intrasplat.splat.camera import Camera, Rendered
 from intrasplat.splat.gaussians import Gaussians, initial_gaussians, sh_colour
 from intrasplat.splat.loss import LossSettings, training_loss
 from intrasplat.splat.metrics import COVERED_ALPHA
-from intrasplat.train.densify import DensifySettings
 from intrasplat.train.hooks import RenderedFrame
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 from lab.rivals.adaptive_density import AdaptiveDensity

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.cpu import padded
 from intrasplat.splat.cpu.model import CpuModel
-from intrasplat.splat.deformation import GaussianFdm, HexPlane, SharedBasis
+from intrasplat.splat.deformation import GaussianFdm, SharedBasis
 from intrasplat.splat.gaussians import Gaussians, initial_gaussians
 from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.model import Model
 from intrasplat.splat.optimize import StepRates
 from intrasplat.splat.step import StepSums, Target, TrainingFrame, camera_vector
+from lab.evaluate.variants.hexplane import HexPlane
 
 WIDTH, HEIGHT = 64, 48
 RATES = StepRates(

@@ -10,12 +10,13 @@ import numpy as np
 
 from intrasplat.clip import DepthClip, FrameSplit, split_frames
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.resume import begin_save, resume
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import HeldOutScore, frame_renderer

@@ -7,8 +7,11 @@ import torch
 
 from intrasplat.camera import Intrinsics
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.splat.deformation import Deformation, GaussianFdm, HexPlane, PolynomialFourier, QuarticFdm, SharedBasis
+from intrasplat.splat.deformation import Deformation, GaussianFdm, SharedBasis
 from intrasplat.splat.gaussians import Gaussians
+from lab.evaluate.variants.hexplane import HexPlane
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 
 KINDS = ("fdm-gaussian", "fdm-quartic", "shared", "pfs", "hexplane")
 FRAMES = 6

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -17,11 +16,10 @@ import torch
 
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
-from intrasplat.names import CURVE, RECORDED, REPORT, PresetName
+from intrasplat.names import CURVE, RECORDED, REPORT
 from intrasplat.notices import NoticeCode
 from intrasplat.report import Report
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
-from intrasplat.train.presets import PRESETS
 from lab.__main__ import main as laboratory
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
@@ -251,7 +249,3 @@ def test_consume_without_a_queue_says_what_to_do(
     monkeypatch.delenv("REDIS_URL", raising=False)
     assert main(["consume"]) == ExitCode.UNAVAILABLE
     assert "intrasplat up" in capsys.readouterr().err
-
-
-def test_the_contract_names_the_presets_that_there_are() -> None:
-    assert set(get_args(PresetName)) == set(PRESETS)

@@ -23,7 +23,9 @@ import torch
 from intrasplat.clip import DepthClip, open_clip, split_frames
 from intrasplat.errors import Cancelled, InputError, SceneError, TrainingDiverged, UnavailableError
 from intrasplat.machine.hooks import Progress
-from intrasplat.names import KEPT, MANIFEST, RECORDED, REPORT, RESUME
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import PRESETS
+from intrasplat.names import KEPT, LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions, parse_options
 from intrasplat.outcome import scene_of
@@ -37,7 +39,6 @@ from intrasplat.splat.metrics import coverage, psnr_tissue
 from intrasplat.splat.optimize import Rate
 from intrasplat.splat.step import camera_vector
 from intrasplat.train.hooks import TrainingHooks
-from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.rate_distortion import TOLERANCE_DB, round_model
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import camera_in_units
@@ -108,6 +109,8 @@ def run(clip: Path, out: Path, hooks: TrainingHooks | None = None, **options: An
 
 def request(clip: Path, **options: Any) -> ReconstructionRequest:
     options = {"iterations": ITERATIONS, **options}
+    if options.get("preset") in LABORATORY_PRESETS:
+        options["preset"] = PRESETS[options["preset"]]
     if isinstance(options.get("preset"), Preset):
         options["own_preset"] = options.pop("preset")
     fields = {field.name for field in dataclasses.fields(ReconstructionRequest)}
@@ -137,7 +140,7 @@ def stopping_after(iterations: int) -> TrainingHooks:
     return TrainingHooks(lambda progress: stages.add(progress.stage), should_stop)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", [*PRESETS, *LABORATORY_PRESETS])
 def test_every_preset_makes_a_scene_that_renders(name: str, whole: Whole) -> None:
     report, out = whole(name)
     assert files(out) == SCENE_FILES

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from intrasplat.splat.constants import MIN_WIDTH, QUARTIC_FLOOR
+from intrasplat.splat.constants import MIN_WIDTH
 from intrasplat.splat.deformation.base import AtRest, Deformation, add_offsets
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import CHANNELS
@@ -37,7 +37,7 @@ class FlexibleDeformation(Deformation):
 
     has_kernels: ClassVar[bool] = True
     quartic: ClassVar[bool]
-    """Which of the two forms of b_j it is, for the kernels."""
+    """Which form of b_j the kernels compute; the quartic one is that of the released code (docs/deformation.md)."""
 
     def __post_init__(self) -> None:
         shapes = {tuple(each.shape) for each in self.parameters().values()}
@@ -91,13 +91,3 @@ class GaussianFdm(FlexibleDeformation):
     def basis(self, t: float) -> Tensor:
         variance = torch.clamp(self.width**2, min=MIN_WIDTH**2)
         return torch.exp(-((t - self.centre) ** 2) / (2 * variance))
-
-
-class QuarticFdm(FlexibleDeformation):
-    """The released code's form: b_j(t) = exp(-((t - theta_j)^2 / (sigma_j^2 + QUARTIC_FLOOR))^2)."""
-
-    kind = "fdm-quartic"
-    quartic = True
-
-    def basis(self, t: float) -> Tensor:
-        return torch.exp(-(((t - self.centre) ** 2 / (self.width**2 + QUARTIC_FLOOR)) ** 2))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import DepthClip, split_frames
+from intrasplat.methods.registry import PRESETS
 from intrasplat.motion.capacity import (
     BASES,
     MAX_COARSENING,
@@ -23,7 +24,6 @@ from intrasplat.motion.capacity import (
 )
 from intrasplat.motion.tracks import Tracks, track
 from intrasplat.motion.trials import FitError
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.start import MIN_STRIDE, basis_values, fusion_for, settled
 from lab.phantom import Motion
 from tests.intrasplat.phantoms import phantom_clip, prepared_on

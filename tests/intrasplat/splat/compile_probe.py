@@ -16,11 +16,13 @@ from numba.core.dispatcher import Dispatcher
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.cpu import compile_kernels, rasterize
 from intrasplat.splat.cpu.model import CpuModel
-from intrasplat.splat.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from intrasplat.splat.deformation import Deformation, GaussianFdm, SharedBasis
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.optimize import StepRates
 from intrasplat.splat.step import Target, TrainingFrame, camera_vector
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 
 COUNT, WIDTH, HEIGHT = 50, 37, 35
 

@@ -11,9 +11,9 @@ import torch
 
 from intrasplat.errors import InputError, UnavailableError
 from intrasplat.machine.gpu import Gpu
+from intrasplat.methods.registry import PRESETS
 from intrasplat.splat.backend import CPU, CPU_BY_VARIABLE, Device, choose_device, device_for, gpu_is_lost, make_model
 from intrasplat.splat.cpu.model import CpuModel
-from intrasplat.train.presets import PRESETS
 from tests.intrasplat.models import HEIGHT, WIDTH, moving_fdm, moving_hexplane, moving_shared, wall
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0")

@@ -23,19 +23,14 @@ from intrasplat.splat.camera import Camera
 from intrasplat.splat.cpu import Rasterizer, padded
 from intrasplat.splat.cpu.model import CpuModel
 from intrasplat.splat.cpu.motion import NEGLIGIBLE, FdmMotion, LinearMotion, motion_of
-from intrasplat.splat.deformation import (
-    FlexibleDeformation,
-    GaussianFdm,
-    PolynomialFourier,
-    QuarticFdm,
-    SharedBasis,
-    restore,
-)
+from intrasplat.splat.deformation import FlexibleDeformation, GaussianFdm, SharedBasis, restore
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import COLOUR_CHANNELS, ROWS
 from intrasplat.splat.loss import LossSettings, training_loss
 from intrasplat.splat.optimize import StepRates
 from intrasplat.splat.step import Target, TrainingFrame, camera_vector
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 from tests.helpers import assert_close
 from tests.intrasplat.splat.scenes import SplatScene, opaque_wall, pixels_near_a_cut, random_scene
 

@@ -16,17 +16,19 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
+from intrasplat.methods.method import MAX_FRAMES_A_STEP
 from intrasplat.splat.cpu import padded
 from intrasplat.splat.cpu.model import CpuModel
 from intrasplat.splat.cuda.bins import MAX_FRAMES
 from intrasplat.splat.cuda.model import CHECK_EVERY, CudaModel
-from intrasplat.splat.deformation import FlexibleDeformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from intrasplat.splat.deformation import FlexibleDeformation, GaussianFdm, SharedBasis
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import POSE, SIDE
 from intrasplat.splat.layout import WIDTH as WIDTH_PLACE
 from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.step import Target, TrainingFrame, camera_vector
-from intrasplat.train.presets import MAX_FRAMES_A_STEP
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 from tests.helpers import assert_close
 from tests.intrasplat import models
 from tests.intrasplat.splat import replays

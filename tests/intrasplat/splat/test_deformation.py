@@ -10,18 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from intrasplat.splat.deformation import (
-    Deformation,
-    FlexibleDeformation,
-    GaussianFdm,
-    HexPlane,
-    PolynomialFourier,
-    QuarticFdm,
-    SharedBasis,
-    restore,
-)
+from intrasplat.splat.deformation import Deformation, FlexibleDeformation, GaussianFdm, SharedBasis, restore
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import CHANNELS
+from lab.evaluate.variants.hexplane import HexPlane
+from lab.evaluate.variants.polynomial import PolynomialFourier
+from lab.evaluate.variants.quartic import QuarticFdm
 from tests.helpers import assert_close
 
 COUNT = 6

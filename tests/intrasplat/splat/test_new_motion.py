@@ -1,4 +1,4 @@
-"""A motion from outside the tree: one line in the registry, and it trains, is stored, loaded and rendered."""
+"""A motion from outside the tree: one call of register_motion, and it trains, is stored, loaded and rendered."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from intrasplat.methods.method import DensifySettings
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
 from intrasplat.scene.checkpoint import load_scene
-from intrasplat.splat.deformation import MOTIONS, AtRest, Deformation, LinearDeformation, add_offsets
+from intrasplat.splat.deformation import AtRest, Deformation, LinearDeformation, add_offsets, register_motion
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import CHANNELS
-from intrasplat.train.densify import DensifySettings
 from intrasplat.train.hooks import TrainingHooks
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.view.render import render_frame
 from tests.intrasplat.phantoms import phantom_clip
@@ -67,10 +67,8 @@ class LinearDrift(LinearDeformation):
 
 
 @pytest.mark.parametrize("motion", [ConstantVelocity, LinearDrift], ids=lambda motion: motion.kind)
-def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(
-    motion: type[Deformation], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(MOTIONS, motion.kind, motion)
+def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(motion: type[Deformation], tmp_path: Path) -> None:
+    register_motion(motion)
     clip = phantom_clip()
     preset = dataclasses.replace(
         PRESETS["paper"],

@@ -16,10 +16,11 @@ from intrasplat.splat import reference
 from intrasplat.splat.cpu.model import CpuModel
 from intrasplat.splat.cpu.motion import FdmMotion, LinearMotion, motion_of
 from intrasplat.splat.cpu.unfused import AutogradMotion
-from intrasplat.splat.deformation import Deformation, HexPlane
+from intrasplat.splat.deformation import Deformation
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.loss import LossSettings, training_loss
 from intrasplat.splat.step import StepSums, TrainingFrame, camera_vector
+from lab.evaluate.variants.hexplane import HexPlane
 from tests.helpers import assert_close
 from tests.intrasplat.models import (
     HEIGHT,

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from intrasplat.methods.registry import PRESETS
 from intrasplat.train import aside
 from intrasplat.train.average import PREFIX, RunningMean
-from intrasplat.train.presets import PRESETS
 from tests.intrasplat.phantoms import phantom_clip, prepared
 
 Parameters = dict[str, Tensor]

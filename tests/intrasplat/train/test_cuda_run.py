@@ -14,13 +14,13 @@ import pytest
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
 from intrasplat.clip import DepthClip, FrameSplit, split_frames
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cuda.model import CudaModel
 from intrasplat.train.loop import step
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.train.setup import Setup
 from intrasplat.view.render import render_frame

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from intrasplat.errors import TrainingDiverged
+from intrasplat.methods.method import DensifySettings
 from intrasplat.scene.resume_file import begin_resume, load_resume
 from intrasplat.splat.cpu.model import CpuModel
 from intrasplat.splat.cpu.unfused import AutogradMotion
@@ -22,7 +23,7 @@ from intrasplat.splat.layout import LOG_SCALE, MEAN
 from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.model import Model
 from intrasplat.splat.step import camera_vector
-from intrasplat.train.densify import Densifier, DensifySettings
+from intrasplat.train.densify import Densifier
 from tests.intrasplat.models import (
     HEIGHT,
     RATES,

@@ -11,6 +11,7 @@ import pytest
 
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.machine.hooks import Progress
+from intrasplat.methods.registry import PRESETS
 from intrasplat.names import KEPT, PREPARED
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import make
@@ -34,9 +35,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def request_of(clip: Path, preset: str = "fast", iterations: int = ITERATIONS) -> ReconstructionRequest:
-    options = ReconstructionOptions.model_validate({"preset": preset, "iterations": iterations})
     return ReconstructionRequest(
-        clip / "stereo.webm", options, calibration=clip / "calibration.json", masks=clip / "masks.zip"
+        clip / "stereo.webm",
+        ReconstructionOptions(iterations=iterations),
+        calibration=clip / "calibration.json",
+        masks=clip / "masks.zip",
+        own_preset=PRESETS[preset],
     )
 
 
@@ -95,7 +99,7 @@ def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
 def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("intrasplat.train.presets.USUAL_BASES", 1)  # what a long clip has more of
+    monkeypatch.setattr("intrasplat.methods.method.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
     monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
     monkeypatch.setattr("intrasplat.train.aside.LARGE_BYTES", 1 << 12)

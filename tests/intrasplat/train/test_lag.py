@@ -13,6 +13,7 @@ import torch
 
 from intrasplat.errors import TrainingDiverged
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.splat.cpu.model import CpuModel
 from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.optimize import StepRates
@@ -20,7 +21,6 @@ from intrasplat.splat.step import StepSums, TrainingFrame
 from intrasplat.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule, warm_up
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.train.schedule import Schedule
 from tests.intrasplat.phantoms import bits, phantom_clip, prepared, trained
@@ -138,7 +138,7 @@ def test_warming_up_leaves_a_model_as_it_was(name: str) -> None:
         assert torch.equal(values, before[key]), key
 
 
-@pytest.mark.parametrize("name", [name for name in PRESETS if name != "hexplane"])
+@pytest.mark.parametrize("name", [*PRESETS, "paper-released", "pfs"])
 def test_what_is_stored_of_a_model_holds_its_gaussians_and_no_padding(name: str) -> None:
     """So that a run stored on one device goes on on another, whose kernels pad otherwise."""
     model = prepared(phantom_clip(), name)[0].model

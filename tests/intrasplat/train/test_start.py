@@ -13,6 +13,8 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.fusion import PointCloud, fuse
 from intrasplat.fusion.points import cells_of
+from intrasplat.methods.method import Preset
+from intrasplat.methods.registry import PRESETS
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.lifted import cell_means
 from intrasplat.motion.tracks import moved_along
@@ -20,7 +22,6 @@ from intrasplat.notices import NoticeCode
 from intrasplat.scene.compact import MAX_WEIGHTS
 from intrasplat.splat.layout import ROWS
 from intrasplat.splat.model import Model
-from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.start import MIN_STRIDE, bounded, fusion_for, settled, start_model
 from intrasplat.train.targets import units_per_mm
 from lab.phantom import PhantomSettings, make_phantom

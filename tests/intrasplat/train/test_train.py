@@ -18,13 +18,13 @@ from intrasplat.clip import DepthClip, split_frames
 from intrasplat.errors import Cancelled, ResumeMismatch, TrainingDiverged
 from intrasplat.machine.hooks import Progress
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.method import DensifySettings, Preset
+from intrasplat.methods.registry import PRESETS
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.splat.optimize import Rate
 from intrasplat.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule
-from intrasplat.train.densify import DensifySettings
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
-from intrasplat.train.presets import PRESETS, Preset
 from intrasplat.train.resume import resume
 from intrasplat.train.run import CurvePoint, Run, frames_at, write_curve
 from intrasplat.train.schedule import Schedule

@@ -12,12 +12,12 @@ import pytest
 
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.clip.calibration import rectify
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import Eyes, ReconstructionOptions
 from intrasplat.splat.optimize import rates_at
 from intrasplat.stereo import estimate_depth
 from intrasplat.train.loop import step
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup

@@ -14,6 +14,7 @@ import pytest
 from intrasplat.clip import DepthClip, FrameSplit, split_frames
 from intrasplat.errors import Cancelled
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import snapshot_of
 from intrasplat.splat.metrics import psnr_tissue
@@ -21,7 +22,6 @@ from intrasplat.splat.model import Model
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run, frames_at
 from intrasplat.train.schedule import AVERAGED, Schedule, validation_frames
 from intrasplat.train.scoring import HeldOutScore

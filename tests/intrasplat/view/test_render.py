@@ -13,12 +13,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from intrasplat.camera import Intrinsics
+from intrasplat.methods.registry import PRESETS
+from intrasplat.names import LABORATORY_PRESETS
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.outcome import scene_of, snapshot_of
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.scene import POSE_DOUBTS, TrainedScene
 from intrasplat.splat.metrics import psnr_tissue
-from intrasplat.train.presets import PRESETS
 from intrasplat.train.run import Run
 from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.frame import View
@@ -217,7 +218,7 @@ def test_a_view_of_nothing_is_empty_and_says_so(scene: TrainedScene) -> None:
     assert NoticeCode.UNSEEN in [warning.code for warning in frame.warnings]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", [*PRESETS, *LABORATORY_PRESETS])
 def test_a_stored_scene_renders_as_the_model_did(preset: str, tmp_path: Path) -> None:
     run, scene = made(preset)
     save_scene(tmp_path, scene)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from intrasplat.errors import TrainingDiverged
+from intrasplat.methods.method import DensifySettings
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.reference import project
-from intrasplat.train.densify import DensifySettings
 from lab.rivals.adaptive_density import AdaptiveDensity
 
 SETTINGS = DensifySettings(max_count=20)

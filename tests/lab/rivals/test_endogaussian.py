@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from intrasplat.methods.method import DensifySettings
 from intrasplat.splat.camera import Rendered
-from intrasplat.train.densify import DensifySettings
 from lab.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
 from lab.rivals.planes import Smoothness
 from lab.rivals.rival import Seen

@@ -14,9 +14,9 @@ from intrasplat.clip import FrameSplit
 from intrasplat.clip.sampling import most_frames
 from intrasplat.errors import Cancelled, InputError, TrainingDiverged
 from intrasplat.machine.timing import Stopwatch
+from intrasplat.methods.registry import PRESETS
 from intrasplat.splat.backend import choose_device
 from intrasplat.train.hooks import TrainingHooks
-from intrasplat.train.presets import PRESETS
 from lab.evaluate import stability
 from lab.evaluate.cells import Cell, capacity_grid, options_of, plan, preset_of
 from lab.evaluate.measure import OF_WHOLE_PICTURES, OPAQUE, Bench
