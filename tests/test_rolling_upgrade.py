@@ -35,12 +35,13 @@ LONG, SHORT = 300, 20
 
 
 @pytest.fixture(scope="module")
-def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tree of the older version."""
+def old(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tree of the older version, where pytest keeps it: Numba knows what it compiled by the path of its source."""
     found = subprocess.run(["git", "archive", OLDER], cwd=NEW, capture_output=True)
     if found.returncode:
         pytest.skip(f"this tree has no git history with {OLDER}")
-    folder = tmp_path_factory.mktemp("old")
+    kept = getattr(pytestconfig, "cache", None)
+    folder = tmp_path_factory.mktemp("old") if kept is None else Path(kept.mkdir(f"tree-{OLDER}"))
     with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
         archive.extractall(folder, filter="data")
     return folder
