@@ -41,8 +41,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_CONSTRAINTS := <(grep -E '^(torch|triton)[<>=]' constraints.txt)
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 HAS_CUDA := import sys, torch; sys.exit(torch.version.cuda is None)
-PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do \
+# found once, and only where a recipe asks: each try starts an interpreter
+FOUND_PYTHON = $(shell for each in python3 python3.13 python3.12 python3.11; do \
 	"$$each" -c '$(NEW_ENOUGH)' 2>/dev/null && { echo "$$each"; break; }; done)
+PYTHON ?= $(eval PYTHON := $(FOUND_PYTHON))$(PYTHON)
 
 # What `make evaluate` measures. It takes hours, keeps each row as it finishes, and resumes
 CLIPS ?= d4d_endonerf phantom:still phantom:breathing phantom:pull phantom:cut
@@ -84,8 +86,9 @@ $(DEV_STAMP): $(STAMP)
 demo: setup ## reconstruct a synthetic clip of tissue and render it without the instrument
 	@$(BIN)/python -m lab.demo
 
-# the whole suite runs a file on each core, up to four at a time
-WHOLE_SUITE := -n auto --maxprocesses 4 --dist loadfile
+# the whole suite runs a file on each core, up to four at a time. Files go out in their order: else those of few tests
+# come last, and they are the longest
+WHOLE_SUITE := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: setup $(DEV_STAMP) ## the whole test suite; ARGS="tests/test_layers.py -k law" narrows it
 	@$(BIN)/python -m pytest $(or $(ARGS),$(WHOLE_SUITE))

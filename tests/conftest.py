@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from intrasplat.machine.gpu import find_gpu
+from intrasplat.machine.cores import keep_libraries_to_one_thread
+
+keep_libraries_to_one_thread()  # as every program of ours does, before NumPy is imported
+
+import numpy as np  # noqa: E402
+
+from intrasplat.machine.gpu import find_gpu  # noqa: E402
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SEED = 20240527

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -14,8 +12,9 @@ import pytest
 
 from intrasplat_client import Client, JobRejected, JobState
 from lab.demo import started_service
+from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
 
-WIDTH, HEIGHT, FRAMES = 160, 128, 12
+WIDTH, HEIGHT, FRAMES = 96, 80, 12
 MIN_PSNR_DB = 20.0
 """Far below what thirty iterations reach, far above an empty, inverted or shifted picture."""
 
@@ -23,8 +22,7 @@ MIN_PSNR_DB = 20.0
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "clip"
-    size = ["--frames", str(FRAMES), "--width", str(WIDTH), "--height", str(HEIGHT)]
-    subprocess.run([sys.executable, "-m", "lab", "phantom", *size, "--out", str(folder)], check=True, timeout=120)
+    write_stereo_video(make_phantom(PhantomSettings(width=WIDTH, height=HEIGHT, frames=FRAMES)), folder)
     return folder
 
 
@@ -43,7 +41,7 @@ def assert_renders(client: Client, scene: str) -> None:
     assert pixels(client.render(0.0, scene=scene, unseen="guess").content).shape == (HEIGHT, WIDTH, 3)
     assert client.render(0.0, scene=scene).content == first.content
     assert client.render(0.5, pose="orbit:10,0,1").content != first.content
-    assert pixels(client.render(0.5, scene=scene, width=80).content).shape == (HEIGHT // 2, WIDTH // 2, 4)
+    assert pixels(client.render(0.5, scene=scene, width=WIDTH // 2).content).shape == (HEIGHT // 2, WIDTH // 2, 4)
     depth_mm = client.render(0.5, scene=scene, layer="depth", format="npy").array()
     assert depth_mm.shape == (HEIGHT, WIDTH)
     assert 10 < np.median(depth_mm[depth_mm > 0]) < 300

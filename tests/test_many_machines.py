@@ -20,6 +20,7 @@ import pytest
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime.settings import Settings
 from intrasplat.view.render import render_frame
+from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
 from tests.archives import archived, files_of, small_scene
 
 pytest.importorskip("s3fs")
@@ -27,7 +28,7 @@ moto_server: Any = pytest.importorskip("moto.server")
 boto3: Any = pytest.importorskip("boto3")
 
 PATIENCE_S = 120.0
-ITERATIONS = 600
+ITERATIONS = 300
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 
 
@@ -128,10 +129,7 @@ def opened(folder: Path) -> Iterator[dict[str, Any]]:
 
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
-    size = ["--frames", "10", "--width", "96", "--height", "80"]
-    subprocess.run(
-        [sys.executable, "-m", "lab", "phantom", *size, "--out", str(tmp_path / "clip")], check=True, timeout=120
-    )
+    write_stereo_video(make_phantom(PhantomSettings(width=96, height=80, frames=10)), tmp_path / "clip")
     return tmp_path / "clip"
 
 

@@ -23,22 +23,25 @@ from contract.queue.interface import Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
+from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
 from tests.receiver import Receiver
 from tests.test_many_machines import end_process, eventually, free_port, opened
 
 NEW = Path(__file__).resolve().parents[1]
 OLDER = "6f3874b"
 """The first commit whose services read what later workers report. A release takes its place."""
-ITERATIONS = 300
+LONG, SHORT = 300, 20
+"""Iterations of a job that a worker is to be stopped in, and of the others."""
 
 
 @pytest.fixture(scope="module")
-def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tree of the older version."""
+def old(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tree of the older version, where pytest keeps it: Numba knows what it compiled by the path of its source."""
     found = subprocess.run(["git", "archive", OLDER], cwd=NEW, capture_output=True)
     if found.returncode:
         pytest.skip(f"this tree has no git history with {OLDER}")
-    folder = tmp_path_factory.mktemp("old")
+    kept = getattr(pytestconfig, "cache", None)
+    folder = tmp_path_factory.mktemp("old") if kept is None else Path(kept.mkdir(f"tree-{OLDER}"))
     with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
         archive.extractall(folder, filter="data")
     return folder
@@ -92,8 +95,8 @@ class Site:
         found: dict[str, Any] = answer.json()
         return found
 
-    def send(self, clip: Path) -> str:
-        data = {"options": f'{{"iterations": {ITERATIONS}}}', "callback_url": f"{self.receiver.origin}/"}
+    def send(self, clip: Path, iterations: int) -> str:
+        data = {"options": f'{{"iterations": {iterations}}}', "callback_url": f"{self.receiver.origin}/"}
         with opened(clip) as files:
             sent = self.http.post("/reconstruct", files=files, data=data)
         assert sent.status_code == 202, sent.text
@@ -103,10 +106,10 @@ class Site:
         """How many webhooks about the job have come."""
         return sum(each.document["data"]["job_id"] == job_id for each in self.receiver.all)
 
-    def assert_is_shown(self, job_id: str) -> None:
+    def assert_is_shown(self, job_id: str, iterations: int) -> None:
         """The job is done, and what a caller asks of its scene is answered."""
         assert self.job(job_id)["state"] == JobState.DONE
-        assert self.http.get(f"/scenes/{job_id}").json()["iterations"] == ITERATIONS
+        assert self.http.get(f"/scenes/{job_id}").json()["iterations"] == iterations
         assert job_id in {each["id"] for each in self.http.get("/scenes").json()}
         for layer in ("rgb", "depth", "confidence"):
             view = self.http.get("/render", params={"scene": job_id, "t": 0.5, "layer": layer})
@@ -124,15 +127,14 @@ def site(tmp_path: Path) -> Iterator[Site]:
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("phantom") / "clip"
-    size = ["--frames", "10", "--width", "96", "--height", "80"]
-    subprocess.run([sys.executable, "-m", "lab", "phantom", *size, "--out", str(folder)], check=True, timeout=300)
+    write_stereo_video(make_phantom(PhantomSettings(width=96, height=80, frames=10)), folder)
     return folder
 
 
 def test_worker_and_then_service_are_replaced_under_a_job_and_back_again(site: Site, old: Path, clip: Path) -> None:
     service, worker = site.start_service(old), site.start_worker(old)
-    first = site.send(clip)
-    waiting = site.send(clip)
+    first = site.send(clip, LONG)
+    waiting = site.send(clip, SHORT)
     eventually(lambda: bool(site.job(first)["iteration"]))
     end_process(worker, 60.0)
     assert site.job(first)["state"] == JobState.QUEUED
@@ -140,22 +142,22 @@ def test_worker_and_then_service_are_replaced_under_a_job_and_back_again(site: S
     worker = site.start_worker(NEW)
     eventually(lambda: site.job(first)["state"] in ("done", "failed"))
     assert site.job(first)["attempt"] == 2
-    site.assert_is_shown(first)
+    site.assert_is_shown(first, LONG)
     eventually(lambda: site.job(waiting)["state"] in ("done", "failed"))
-    site.assert_is_shown(waiting)
+    site.assert_is_shown(waiting, SHORT)
 
     end_process(service, 60.0)
     service = site.start_service(NEW)
-    site.assert_is_shown(first)
-    site.assert_is_shown(waiting)
+    site.assert_is_shown(first, LONG)
+    site.assert_is_shown(waiting, SHORT)
     eventually(lambda: site.told(first) == 1)
     assert site.http.post(f"/jobs/{first}/deliveries").status_code == 202
     eventually(lambda: site.told(first) == 2)
 
     end_process(worker, 60.0)
     site.start_worker(old)
-    later = site.send(clip)
+    later = site.send(clip, SHORT)
     eventually(lambda: site.job(later)["state"] in ("done", "failed"))
-    site.assert_is_shown(later)
-    site.assert_is_shown(first)
+    site.assert_is_shown(later, SHORT)
+    site.assert_is_shown(first, LONG)
     eventually(lambda: {each.document["data"]["job_id"] for each in site.receiver.all} == {first, waiting, later})

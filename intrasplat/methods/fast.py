@@ -28,8 +28,8 @@ resumed must start with the same points."""
 DEPARTURES = (
     # Points
     #
-    # A grid on the first frame; tissue that is hidden there comes from later frames (intrasplat/fusion/fill.py). The paper
-    # draws a tenth of the pixels at random.
+    # A grid on the first frame; tissue that is hidden there comes from later frames (intrasplat/fusion/fill.py). The
+    # paper draws a tenth of the pixels at random.
     # Gain: phantom-pull +1.01 dB, +3 s; d4d-a-320x256 +7.17 dB, +3 s.
     Departure(
         "grid of points",
@@ -111,8 +111,8 @@ DEPARTURES = (
     # Schedule and end
     #
     # Rates rise again when the iterations have doubled, and the last models of each cycle are averaged
-    # (intrasplat/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one number.
-    # Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
+    # (intrasplat/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one
+    # number. Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
     Departure("warm restarts and averages", {"warm_restarts": True}, needs=("no densification",)),
     # A run with a budget ends when doubling its iterations gained less on validation frames (docs/decisions/017).
     # Gain: phantom-pull -0.15 dB, -19 s; d4d-a-320x256 -0.08 dB, +2 s.

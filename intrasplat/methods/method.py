@@ -68,8 +68,8 @@ class Preset:
         points_by_budget  whether budget_s decides points_per_image instead (registry.preset_named)
     Motion
         deformation       name of a motion in the registry (intrasplat/splat/deformation)
-        bases             B of the deformation; None: as many as the scene's motion needs (intrasplat/motion/capacity.py)
-        max_bases         limit for `bases` where the scene decides; None: no limit
+        bases             B of the deformation; None: as many as the scene's motion needs
+        (intrasplat/motion/capacity.py) max_bases         limit for `bases` where the scene decides; None: no limit
         tracks            whether optical-flow tracks start the motion (deformation "shared" alone)
         start_width       sigma of a basis at the start, model time; None where the deformation has its own
     Start
@@ -85,8 +85,8 @@ class Preset:
         densify           when Gaussians are split and pruned; None: their number stays
     Schedule and end
         warm_restarts     whether rates rise again when the iterations have doubled, if there are enough for two cycles,
-                          and the last models of each are averaged (intrasplat/train/schedule.py); else rates fall once and
-                          nothing is averaged
+                          and the last models of each are averaged (intrasplat/train/schedule.py); else rates fall once
+                          and nothing is averaged
         min_gain_db       a run with budget_s stops early where doubling its iterations gains less; None: no early
                           stopping
         iterations        of a run without budget_s and iterations; None: budget_s

@@ -12,10 +12,13 @@ import pytest
 import torch
 
 from intrasplat.machine.gpu import find_gpu
+from intrasplat.train.run import CurvePoint
 from lab.gpu import check
 from tests.conftest import REPOSITORY
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
+
+from lab.gpu.train import seconds_to
 
 GPU = REPOSITORY / "lab" / "gpu"
 NOT_THERE = (
@@ -37,29 +40,35 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_its_parts_import_nothing_but_what_is_there() -> None:
     names = sorted(path.stem for path in GPU.glob("*.py"))
+    assert "check" in names
     blocked = f"import sys; sys.path.insert(0, {str(REPOSITORY)!r})\n"
     blocked += f"for each in {NOT_THERE}: sys.modules[each] = None\n"
     answer = run("-c", blocked + "\n".join(f"import lab.gpu.{name}" for name in names))
     assert answer.returncode == 0, answer.stderr
 
 
-def test_its_checks_pass_in_the_interpreter(tmp_path: Path) -> None:
-    options = ("--interpret", "--out", str(tmp_path), "--only", "correct", "--seed", "1")
-    answer = run(str(GPU / "check.py"), *options)
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of what the checks and the training wrote."""
+    out = tmp_path_factory.mktemp("gpu")
+    options = ("--interpret", "--out", str(out), "--only", "correct", "train", "--seed", "1")
+    answer = run(str(GPU / "check.py"), *options, timeout_s=330.0)
     assert answer.returncode == 0, answer.stdout + answer.stderr
-    checks = rows(tmp_path / "gpu-correct.csv")
+    return out
+
+
+def test_its_checks_pass_in_the_interpreter(checked: Path) -> None:
+    checks = rows(checked / "gpu-correct.csv")
     assert len(checks) == 10
     assert {row["ok"] for row in checks} == {"True"}
     assert {row["gpu"] for row in checks} == {"none: Triton's interpreter"}
 
 
-def test_training_leaves_a_row_of_each_run_and_its_curve(tmp_path: Path) -> None:
-    answer = run(str(GPU / "check.py"), "--interpret", "--out", str(tmp_path), "--only", "train", "--seed", "1")
-    assert answer.returncode == 0, answer.stdout + answer.stderr
-    runs = rows(tmp_path / "gpu-train.csv")
+def test_training_leaves_a_row_of_each_run_and_its_curve(checked: Path) -> None:
+    runs = rows(checked / "gpu-train.csv")
     told = [(row["preset"], row["frames_a_step"], row["iterations"], row["note"]) for row in runs]
     assert told == [("paper", "1", "2", ""), ("fast", "1", "2", ""), ("fast", "2", "2", "")]
-    curves = rows(tmp_path / "gpu-curves.csv")
+    curves = rows(checked / "gpu-curves.csv")
     for row in runs:
         curve = [each for each in curves if all(each[name] == row[name] for name in ("preset", "frames_a_step"))]
         assert float(curve[-1]["psnr_tissue_db"]) == pytest.approx(float(row["final_db"]), rel=1e-5)
@@ -89,15 +98,9 @@ def test_a_clip_that_is_none_is_refused_before_anything_is_done(tmp_path: Path, 
 
 
 def test_how_soon_training_is_good_is_told_by_what_paper_ends_with() -> None:
-    code = (
-        f"import sys; sys.path.insert(0, {str(REPOSITORY)!r})\n"
-        "from lab.gpu.train import seconds_to\n"
-        "from intrasplat.train.loop import CurvePoint\n"
-        "curve = [CurvePoint(t, 10, db) for t, db in ((0.5, 24.0), (1.0, 27.5), (2.0, 30.0))]\n"
-        "print(list(seconds_to(curve, 29.0).values()), list(seconds_to(curve, None).values()))\n"
-    )
-    answer = run("-c", code)
-    assert answer.stdout == "[1.0, 1.0, 2.0, None] [None, None, None, None]\n", answer.stderr
+    curve = [CurvePoint(t, 10, db) for t, db in ((0.5, 24.0), (1.0, 27.5), (2.0, 30.0))]
+    assert list(seconds_to(curve, 29.0).values()) == [1.0, 1.0, 2.0, None]
+    assert list(seconds_to(curve, None).values()) == [None] * 4
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -15,13 +15,14 @@ from intrasplat.machine.timing import Timings
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.poses import camera_rests, with_poses
-from intrasplat.poses.estimate import find_path
+from intrasplat.poses.estimate import FoundPath, find_path
 from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import trajectory_error
 from intrasplat.stereo import match_eyes
 from lab.phantom import CameraPath, Motion, PhantomSettings, make_phantom
 
 FRAMES = 24
+TRAIN = training_frames(FRAMES, "every8")
 
 
 @cache
@@ -41,6 +42,13 @@ def clip_of(motion: Motion, *camera: CameraPath, period_frames: float = 12.0) ->
     drawn = phantom.stereo_recording()
     clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
     return clip, np.stack([phantom.world_from_camera(i) for i in range(FRAMES)])
+
+
+@cache
+def path_of(motion: Motion, *camera: CameraPath, period_frames: float = 12.0) -> FoundPath:
+    """What find_path finds in clip_of the same. Callers share it."""
+    clip, _ = clip_of(motion, *camera, period_frames=period_frames)
+    return find_path(clip, TRAIN)
 
 
 def posed(clip: DepthClip, poses: str = "auto") -> DepthClip:
@@ -65,18 +73,17 @@ def test_a_camera_over_still_tissue_is_found() -> None:
 
 def test_held_out_frames_change_no_other_pose() -> None:
     clip, _ = clip_of("still", "turn")
-    train = training_frames(FRAMES, "every8")
     spoilt = clip.rgb.copy()
-    held_out = sorted(set(range(FRAMES)) - set(train))
+    held_out = sorted(set(range(FRAMES)) - set(TRAIN))
     spoilt[held_out] = 255 - spoilt[held_out]
-    one, two = (find_path(each, train) for each in (clip, replace(clip, rgb=spoilt)))
-    assert (one.world_from_camera[train] == two.world_from_camera[train]).all()
+    one, two = path_of("still", "turn"), find_path(replace(clip, rgb=spoilt), TRAIN)
+    assert (one.world_from_camera[TRAIN] == two.world_from_camera[TRAIN]).all()
     assert one.period_frames == two.period_frames
 
 
 def test_a_fixed_camera_leaves_the_clip_as_it_is() -> None:
     clip, _ = clip_of("still")
-    assert camera_rests(clip, training_frames(FRAMES, "every8"))
+    assert camera_rests(clip, TRAIN)
     found = posed(clip)
     assert found.poses is not None
     assert found.poses.source == "fixed"
@@ -87,7 +94,7 @@ def test_a_fixed_camera_leaves_the_clip_as_it_is() -> None:
 
 def test_tissue_that_breathes_is_not_taken_for_a_camera() -> None:
     clip, _ = clip_of("breathing")
-    assert not camera_rests(clip, training_frames(FRAMES, "every8"))
+    assert not camera_rests(clip, TRAIN)
     found = posed(clip)
     assert found.poses is not None
     assert found.poses.source == "fixed"
@@ -106,22 +113,24 @@ def test_a_camera_that_cannot_be_followed_is_told() -> None:
 
 
 def test_a_fast_pan_is_followed() -> None:
-    clip, true = clip_of("still", "pan")
-    path = find_path(clip, training_frames(FRAMES, "every8"))
+    _, true = clip_of("still", "pan")
+    path = path_of("still", "pan")
     error = trajectory_error(path.world_from_camera, true)
     assert error.mm < 1.5  # of 127 mm in a second; frames share half of their view with the next but one
     assert error.deg < 1
 
 
 @pytest.mark.parametrize("camera", ["advance", "turn", "shake"])
-def test_less_than_a_breath_tells_no_camera_from_tissue_and_says_so(camera: CameraPath) -> None:
+def test_less_than_a_breath_tells_no_camera_from_tissue_and_says_so(
+    camera: CameraPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clip, true = clip_of("breathing", camera, period_frames=36.0)
-    train = training_frames(FRAMES, "every8")
-    path = find_path(clip, train)
-    error = trajectory_error(path.world_from_camera[train], true[train])
+    path = path_of("breathing", camera, period_frames=36.0)
+    error = trajectory_error(path.world_from_camera[TRAIN], true[TRAIN])
     assert error.mm > 1.5
     assert path.sigma_mm > error.mm / 2
     assert path.confused
+    monkeypatch.setattr("intrasplat.poses.estimate.find_path", lambda *_: path)  # which posed() would find again
     assert NoticeCode.CAMERA_OR_TISSUE in [each.code for each in posed(clip).warnings]
 
 
@@ -130,7 +139,7 @@ def test_frames_that_show_nothing_of_the_others_are_told() -> None:
     random = np.random.default_rng(0)
     rgb = clip.rgb.copy()
     rgb[10] = random.integers(0, 255, rgb[10].shape, np.uint8)
-    path = find_path(replace(clip, rgb=rgb), training_frames(FRAMES, "every8"))
+    path = find_path(replace(clip, rgb=rgb), TRAIN)
     assert path.unsure == (10,)
     assert not path.confused
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,9 +24,15 @@ from lab.phantom import PhantomSettings, make_phantom
 from lab.phantom.scene import Phantom
 
 
+@cache
+def drawn(path: str) -> DepthClip:
+    """Callers share the arrays."""
+    return open_source(source_of(f"phantom:breathing+{path}:96x80:32frames"), "none", Hooks()).clip
+
+
 def brought(path: str, noise_mm: float) -> tuple[DepthClip, DepthClip]:
     """A clip with depth and its true poses, and the same with poses that err."""
-    clip = open_source(source_of(f"phantom:breathing+{path}:96x80:32frames"), "none", Hooks()).clip
+    clip = drawn(path)
     poses = noisy(clip.world_from_camera, noise_mm, np.random.default_rng(1))
     return clip, replace(clip, world_from_camera=poses)
 

@@ -24,7 +24,7 @@ from intrasplat.splat.layout import ROWS
 from intrasplat.splat.model import Model
 from intrasplat.train.start import MIN_STRIDE, bounded, fusion_for, settled, start_model
 from intrasplat.train.targets import units_per_mm
-from lab.phantom import PhantomSettings, make_phantom
+from lab.phantom import Phantom, PhantomSettings, make_phantom
 from tests.helpers import assert_close
 from tests.intrasplat.phantoms import phantom_clip
 
@@ -119,36 +119,49 @@ def test_what_the_instrument_hides_at_first_moves_like_the_tissue_about_it() -> 
     assert np.median(apart) < 0.3 * np.median(np.linalg.norm(moved[later], axis=1))
 
 
-def test_tissue_that_comes_into_view_later_starts_with_its_own_motion() -> None:
+@dataclasses.dataclass(frozen=True)
+class Pan:
+    """A phantom whose camera pans, its clip, and a model before its first step on it."""
+
+    phantom: Phantom
+    clip: DepthClip
+    model: Model
+    cloud: PointCloud
+    units_per_mm: float
+
+
+@pytest.fixture(scope="module")
+def pan() -> Pan:
     phantom = make_phantom(PhantomSettings(160, 128, 40, camera=("pan",)))
     clip = phantom.depth_clip()
-    model, cloud, scale = started(clip, PRESETS["fast"])
+    return Pan(phantom, clip, *started(clip, PRESETS["fast"]))
+
+
+def test_tissue_that_comes_into_view_later_starts_with_its_own_motion(pan: Pan) -> None:
+    phantom, clip, cloud = pan.phantom, pan.clip, pan.cloud
     later = np.flatnonzero(cloud.frame > 20)
     assert len(later) > 0.3 * len(cloud)
-    nearest = np.zeros(len(later), np.intp)
+    nearest, off_mm = np.zeros(len(later), np.intp), np.zeros((len(later), 3))
     for frame in np.unique(cloud.frame[later]):
         there = cloud.frame[later] == frame
-        nearest[there] = cKDTree(phantom.surface.vertices_mm(frame)).query(cloud.points_mm[later[there]])[1]
-    off_mm = cloud.points_mm[later] - np.stack(
-        [phantom.surface.vertices_mm(frame)[point] for frame, point in zip(cloud.frame[later], nearest, strict=True)]
-    )
+        points_mm, vertices_mm = cloud.points_mm[later[there]], phantom.surface.vertices_mm(frame)
+        nearest[there] = cKDTree(vertices_mm).query(points_mm)[1]
+        off_mm[there] = points_mm - vertices_mm[nearest[there]]
     k, errors_mm, moved_mm = clip.intrinsics, [], []
     for frame in range(0, 40, 4):
         true_mm = phantom.surface.vertices_mm(frame)[nearest] + off_mm
         seen = cells_of(true_mm, k, clip.world_from_camera[frame], stride=1)[1]
-        shown_mm = model.deformed_mean(float(clip.t[frame])).T[later] / scale
+        shown_mm = pan.model.deformed_mean(float(clip.t[frame])).T[later] / pan.units_per_mm
         errors_mm.append(np.linalg.norm(shown_mm - true_mm, axis=1)[seen])
         moved_mm.append(np.linalg.norm(cloud.points_mm[later] - true_mm, axis=1)[seen])
     assert np.median(np.concatenate(moved_mm)) > 1
     assert np.median(np.concatenate(errors_mm)) < 0.5 * np.median(np.concatenate(moved_mm))
 
 
-def test_points_cover_what_every_frame_of_a_pan_shows() -> None:
-    phantom = make_phantom(PhantomSettings(160, 128, 40, camera=("pan",)))
-    clip = phantom.depth_clip()
-    model, _, scale = started(clip, PRESETS["fast"])
+def test_points_cover_what_every_frame_of_a_pan_shows(pan: Pan) -> None:
+    clip = pan.clip
     for frame in range(0, 40, 3):
-        shown_mm = model.deformed_mean(float(clip.t[frame])).T / scale
+        shown_mm = pan.model.deformed_mean(float(clip.t[frame])).T / pan.units_per_mm
         cells, _ = cells_of(shown_mm, clip.intrinsics, clip.world_from_camera[frame], stride=4)
         tissue = cell_means(clip.tissue[frame].astype(np.float32), 4).ravel() == 1
         assert np.isin(np.flatnonzero(tissue), cells).mean() > 0.98
