@@ -10,7 +10,7 @@ from contract.access.keys import KeyFile
 from contract.queue.embedded import find_server
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.settings import GIB, Settings
-from intrasplat.commands.doctor import Finding, package_findings
+from intrasplat.commands.doctor import Diagnosis, package_findings
 from intrasplat.errors import UnavailableError
 
 PACKAGES = (
@@ -34,7 +34,7 @@ OPTIONAL_PACKAGES = {
 }
 
 
-def server_findings(settings: Settings | None = None) -> list[Finding]:
+def server_findings(settings: Settings | None = None) -> list[Diagnosis]:
     """What the server needs, in the order it is printed. settings: None means those of the environment.
 
     Raises:
@@ -45,40 +45,40 @@ def server_findings(settings: Settings | None = None) -> list[Finding]:
     return [*packages, *_queue(settings), *_disk(settings), *_keys(settings)]
 
 
-def _queue(settings: Settings) -> list[Finding]:
+def _queue(settings: Settings) -> list[Diagnosis]:
     if settings.redis_url is not None:
         queue = RedisQueue(settings.redis_url)
         try:
             queue.ping()
         except UnavailableError as error:
-            return [Finding("queue", f"REDIS_URL is set; {error.problem}", error.remedy)]
+            return [Diagnosis("queue", f"REDIS_URL is set; {error.problem}", error.remedy)]
         finally:
             queue.close()
-        return [Finding("queue", "REDIS_URL; it answers")]
+        return [Diagnosis("queue", "REDIS_URL; it answers")]
     try:
         server = find_server()
     except UnavailableError as error:
-        return [Finding("queue", error.problem, error.remedy)]
-    return [Finding("queue", f"`up` starts {server.path.name} from {server.origin}")]
+        return [Diagnosis("queue", error.problem, error.remedy)]
+    return [Diagnosis("queue", f"`up` starts {server.path.name} from {server.origin}")]
 
 
-def _disk(settings: Settings) -> list[Finding]:
+def _disk(settings: Settings) -> list[Diagnosis]:
     folder = settings.data_dir.expanduser()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free_bytes = shutil.disk_usage(existing).free
     found = f"{free_bytes / GIB:.1f} GiB free for {folder}"
     if not os.access(existing, os.W_OK):
-        return [Finding("data directory", f"{existing} cannot be written", "set INTRASPLAT_DATA_DIR", blocks=True)]
+        return [Diagnosis("data directory", f"{existing} cannot be written", "set INTRASPLAT_DATA_DIR", blocks=True)]
     remedy = "free some space, or set INTRASPLAT_DATA_DIR" if free_bytes < settings.min_free_bytes else None
-    return [Finding("data directory", found, remedy)]
+    return [Diagnosis("data directory", found, remedy)]
 
 
-def _keys(settings: Settings) -> list[Finding]:
+def _keys(settings: Settings) -> list[Diagnosis]:
     try:
         file = KeyFile(settings.data_dir)
         keys, soon = file.list(), file.expiring(time.time())
     except UnavailableError as error:
-        return [Finding("keys", error.problem, error.remedy, blocks=True)]
+        return [Diagnosis("keys", error.problem, error.remedy, blocks=True)]
     found = f"{len(keys)}, {len(soon)} of which expire within 14 days"
     names = ", ".join(key.key_id for key in soon)
-    return [Finding("keys", found, f"intrasplat keys rotate: {names}" if soon else None)] if keys else []
+    return [Diagnosis("keys", found, f"intrasplat keys rotate: {names}" if soon else None)] if keys else []

@@ -20,8 +20,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
+from client.disk_warnings import RoomWatch
 from client.page import DASHBOARD
-from client.up_room import RoomWatch
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer, ServerEnd
 from contract.runtime.locks import FolderLock

@@ -19,7 +19,7 @@ from intrasplat.clip.sampling import most_frames, sampled
 from intrasplat.errors import Cancelled, InputError, TrainingDiverged
 from intrasplat.instruments import zipped_masks
 from intrasplat.machine.cores import cores
-from intrasplat.machine.forecast import Forecast
+from intrasplat.machine.forecast import TimeEstimate
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from intrasplat.machine.timing import Timings
@@ -42,8 +42,8 @@ from intrasplat.stereo import ClipPaths
 from intrasplat.stereo import open_with_depth as open_paths
 from intrasplat.train.first_picture import first_picture
 from intrasplat.train.hooks import TrainingHooks
-from intrasplat.train.keep import Keeper, keeping
 from intrasplat.train.loop import train
+from intrasplat.train.persistence import Keeper, keeping
 from intrasplat.train.prepare import prepare
 from intrasplat.train.rate_distortion import QuantizedScene, round_model
 from intrasplat.train.request import ReconstructionRequest
@@ -97,7 +97,7 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
     kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
     """
     length, tell = length_of(request.options, request.preset), hooks.on_progress
-    forecast = Forecast(*length, most_frames(request.options))
+    forecast = TimeEstimate(*length, most_frames(request.options))
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
     with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)

@@ -52,14 +52,14 @@ class Caller:
         if scope not in self.scopes:
             remedy = f"Use a key that has it: `intrasplat keys create --scopes {scope}`."
             detail = f"This key lacks the scope {scope.value!r}."
-            raise Refusal(403, detail, remedy, address=self.address, caller=self)
+            raise AccessRefusal(403, detail, remedy, address=self.address, caller=self)
 
     def owns(self, record: JobRecord) -> bool:
         """Whether the job is the caller's tenant's; if not, the caller hears what it would hear of no job at all."""
         return record.tenant == self.tenant
 
 
-class Refusal(Problem):
+class AccessRefusal(Problem):
     """A caller asked for what it may not have; recorded in the audit (service/audit.py) where it leaves a route."""
 
     def __init__(
@@ -110,11 +110,11 @@ class Access:
         key: ApiKey | None = self._keys.find(text)
         if key is None:
             self._wrong_keys.admit(address)
-            raise Refusal(401, "This key is not known.", KEY_REMEDY, address=address)
+            raise AccessRefusal(401, "This key is not known.", KEY_REMEDY, address=address)
         caller = Caller(key.tenant, key.scopes, key.key_id, address, key.expires_at_s)
         if key.has_expired(time.time()):
             detail, code = "This key has expired.", ErrorCode.KEY_EXPIRED
-            raise Refusal(401, detail, EXPIRED_REMEDY, address=address, caller=caller, code=code)
+            raise AccessRefusal(401, detail, EXPIRED_REMEDY, address=address, caller=caller, code=code)
         return caller
 
     @contextmanager
@@ -130,9 +130,9 @@ class Access:
             self._strangers -= 1
 
 
-def key_missing(address: str) -> Refusal:
+def key_missing(address: str) -> AccessRefusal:
     """The answer to a request that needs a key and has none."""
-    return Refusal(401, "A key is needed.", KEY_REMEDY, address=address)
+    return AccessRefusal(401, "A key is needed.", KEY_REMEDY, address=address)
 
 
 def _is_forwarded(headers: Mapping[str, str]) -> bool:

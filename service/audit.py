@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.audit import AuditAction, AuditEntry, AuditLog, utc_now
 from contract.runtime.logs import current_request_id
 from intrasplat.errors import UnavailableError
-from service.access import Caller, Refusal
+from service.access import AccessRefusal, Caller
 from service.problems import Problem
 
 Note = tuple[str, tuple[str | None, ...]]
@@ -45,7 +45,7 @@ class Audit:
         if not self._is_noted(entry):
             await run_in_threadpool(self._once_a_minute, entry)
 
-    async def refused(self, refusal: Refusal) -> None:
+    async def refused(self, refusal: AccessRefusal) -> None:
         """Record a refusal, once a minute for each caller and reason. It stands even if it cannot be recorded."""
         entry = _entry(AuditAction.REFUSED, refusal.caller, refusal.job_id, str(refusal.status))
         try:
@@ -92,8 +92,8 @@ def install_refusal_handler(app: FastAPI, audit: Audit) -> None:
     answer: Any = app.exception_handlers[Problem]
 
     async def on_refusal(connection: Any, error: Exception) -> Any:
-        assert isinstance(error, Refusal)
+        assert isinstance(error, AccessRefusal)
         await audit.refused(error)
         return await answer(connection, error)
 
-    app.add_exception_handler(Refusal, on_refusal)
+    app.add_exception_handler(AccessRefusal, on_refusal)

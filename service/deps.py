@@ -20,7 +20,7 @@ from contract.runtime.settings import Settings
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
 from contract.wire.job import JobRecord
-from service.access import Access, Caller, Refusal, key_missing
+from service.access import Access, AccessRefusal, Caller, key_missing
 from service.audit import Audit
 from service.done import DoneJobs
 from service.events import Feeds
@@ -132,4 +132,4 @@ def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobR
     """The 404 of what is not there and of what is another tenant's: alike, but the latter is recorded in the audit."""
     if record is None:
         return Problem(404, detail, field=field, remedy=remedy)
-    return Refusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=record.job_id)
+    return AccessRefusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=record.job_id)

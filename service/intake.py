@@ -22,7 +22,7 @@ MIN_BYTES = 4096
 
 
 @dataclass(eq=False)
-class Place:
+class UploadSlot:
     """One of the uploads that are being received, and the bytes on disk that are kept for what it has yet to bring."""
 
     kept_bytes: int
@@ -35,10 +35,10 @@ class Intake:
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
         self._store = store
-        self._places: set[Place] = set()
+        self._places: set[UploadSlot] = set()
 
     @contextmanager
-    def place(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[Place]:
+    def place(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[UploadSlot]:
         """A place among the uploads that are received at once, with room for `declared_bytes`. part: what is sent.
 
         Raises:
@@ -54,7 +54,7 @@ class Intake:
             raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
         if declared_bytes:
             self.check(tenant, declared_bytes, part)
-        place = Place(declared_bytes, tenant)
+        place = UploadSlot(declared_bytes, tenant)
         self._places.add(place)
         try:
             yield place
@@ -100,7 +100,7 @@ class Intake:
         places = sum(place.kept_bytes for place in self._places if tenant in (None, place.tenant))
         return places + promised_bytes(self._store, tenant)
 
-    async def body(self, request: Request, place: Place | None = None) -> AsyncIterator[bytes]:
+    async def body(self, request: Request, place: UploadSlot | None = None) -> AsyncIterator[bytes]:
         """The pieces of a request's body as they come.
 
         Raises:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from fastapi import Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from contract.queue.interface import MAX_LISTED, Place, place_of
+from contract.queue.interface import MAX_LISTED, ListingPosition, place_of
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import folded
 from intrasplat.errors import InputError
@@ -42,7 +42,7 @@ PAGED: dict[int | str, dict[str, Any]] = {
 }
 """What a route with pages says of its answer."""
 
-Find = Callable[[int, Place | None], Sequence[JobRecord]]
+Find = Callable[[int, ListingPosition | None], Sequence[JobRecord]]
 """At most so many records of the caller's tenant, newest first, after a place; empty only at the end."""
 
 
@@ -87,7 +87,7 @@ class Page:
     """Records, newest first, and the place after which the next page begins; None: there is none."""
 
     records: list[JobRecord]
-    end: Place | None
+    end: ListingPosition | None
 
 
 def find_page(search: SceneSearch, tenant: str, find: Find, state: JobState | None = None) -> Page:
@@ -99,7 +99,7 @@ def find_page(search: SceneSearch, tenant: str, find: Find, state: JobState | No
     fits = _condition(search, state)
     place = None if search.cursor is None else _place_of_cursor(search.cursor, tenant)
     if search.created_until_s is not None:
-        newest = Place(search.created_until_s, LAST_ID)
+        newest = ListingPosition(search.created_until_s, LAST_ID)
         place = newest if place is None else min(place, newest)
     found: list[JobRecord] = []
     looked_at, all_fit = 0, state is None and not (search.q or search.metadata or search.preset)
@@ -154,17 +154,17 @@ def _entry(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _cursor_of(place: Place, tenant: str) -> str:
+def _cursor_of(place: ListingPosition, tenant: str) -> str:
     text = f"{place.created_at_s!r} {place.job_id}"
     return base64.urlsafe_b64encode(f"{text} {_seal(text, tenant)}".encode()).decode().rstrip("=")
 
 
-def _place_of_cursor(cursor: str, tenant: str) -> Place:
+def _place_of_cursor(cursor: str, tenant: str) -> ListingPosition:
     try:
         text = base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode("ascii")
         created, job_id, seal = text.split(" ")
         if seal == _seal(f"{created} {job_id}", tenant):
-            return Place(float(created), job_id)
+            return ListingPosition(float(created), job_id)
     except (ValueError, binascii.Error):
         pass
     raise InputError("cursor", "it is none of yours.", f"Send what {NEXT_HEADER} said, or nothing for the first page.")

@@ -31,7 +31,7 @@ from contract.runtime import traces
 from contract.wire.job import JobState
 from contract.wire.rendering import PictureCamera
 from intrasplat.notices import Notice
-from service.access import Caller, Refusal, key_missing
+from service.access import AccessRefusal, Caller, key_missing
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services, address_of
 from service.problems import API_REMEDY, Problem, fault, problem_of
@@ -198,14 +198,14 @@ class _Viewer:
             problem = fault()
         if problem.status == 401:
             raise _HangUp(NOT_ALLOWED, problem)
-        if isinstance(problem, Refusal):
+        if isinstance(problem, AccessRefusal):
             await self._services.audit.refused(problem)
         document = {**problem.document(), "id": message_id}
         async with asyncio.timeout(SEND_TIMEOUT_S):
             await self._websocket.send_text(json.dumps(document))
 
     async def _hang_up(self, reason: _HangUp) -> None:
-        if isinstance(reason.problem, Refusal):
+        if isinstance(reason.problem, AccessRefusal):
             await self._services.audit.refused(reason.problem)
         with contextlib.suppress(*GONE):
             async with asyncio.timeout(SEND_TIMEOUT_S):

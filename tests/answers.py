@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from intrasplat.machine.parts import Parts
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.reply import Reply
 from worker.scheduler import Scheduler
 
 
-def at_once(answer: Callable[[Any], Reply], pace: Pace | None = None, **settings: Any) -> Scheduler:
+def at_once(answer: Callable[[Any], Reply], pace: RenderPace | None = None, **settings: Any) -> Scheduler:
     """A scheduler whose answers have one part each. settings: as of Scheduler."""
 
     def parts(request: Any, level: int) -> Parts[Reply]:
@@ -19,4 +19,4 @@ def at_once(answer: Callable[[Any], Reply], pace: Pace | None = None, **settings
         return answer(request)
         yield
 
-    return Scheduler(parts, pace or Pace(), **settings)
+    return Scheduler(parts, pace or RenderPace(), **settings)

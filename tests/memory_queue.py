@@ -22,9 +22,9 @@ from contract.queue.interface import (
     Admission,
     Claim,
     Event,
+    ListingPosition,
     Order,
     Pace,
-    Place,
     QueueFigures,
     Waiting,
     asked_training_s,
@@ -188,7 +188,7 @@ class MemoryQueue:
             return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
     def records(
-        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: ListingPosition | None = None
     ) -> list[JobRecord]:
         with self._changed:
             chosen = [record for record in self._records.values() if tenant in (None, record.tenant)]

@@ -25,13 +25,13 @@ from contract.wire.job import JobProgress, JobRecord, JobState
 from intrasplat.errors import ErrorCode, IntrasplatError, UnavailableError
 from intrasplat.files.disk_errors import StoreFullError
 from worker.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
+from worker.claim_file import HeldClaim
+from worker.disk_space import Room
 from worker.hang import HangDetector
 from worker.heartbeat import Heartbeat
-from worker.held import HeldClaim
 from worker.job_errors import describe
 from worker.job_spans import StageSpans, attempt_span
 from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
-from worker.room import Room
 from worker.scores import AwaitedScores, LeftScores
 
 CLAIM_TIMEOUT_S = 1.0

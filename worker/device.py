@@ -52,7 +52,7 @@ from worker.orders import (
     Stopped,
     job_progress,
 )
-from worker.pace import SHARE, Pace
+from worker.pace import SHARE, RenderPace
 from worker.scheduler import Scheduler
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots
@@ -99,7 +99,11 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     if settings.segmenter is not None:
         load_segmenter(settings.segmenter)  # says now what every job without masks would fail by
     store, snapshots = open_store(settings), Snapshots()
-    pace = Pace(thread_count(), used_s=time.process_time) if device == CPU else Pace(max_debt_s=MAX_GPU_REST_S * SHARE)
+    pace = (
+        RenderPace(thread_count(), used_s=time.process_time)
+        if device == CPU
+        else RenderPace(max_debt_s=MAX_GPU_REST_S * SHARE)
+    )
     # Clips are unpacked inside the data directory, in a folder that the next start empties.
     tempfile.tempdir = str(store.scratch_folder(settings.worker_name))
     started_s = time.monotonic()
@@ -140,7 +144,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
             obey(task, settings, snapshots, pace, channel)
 
 
-def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: Pace, channel: Channel) -> None:
+def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace, channel: Channel) -> None:
     """Do what was ordered, and report it."""
     order, limits = task.order, settings.clip_limits
     if order.record.imported is not None:

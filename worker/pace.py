@@ -27,7 +27,7 @@ MAX_SAVED_S = 0.1
 """Enough for a few renders when a viewer opens. More would disturb the 0.3 s in which training times its steps."""
 
 
-class Pace:
+class RenderPace:
     """Rations renders; for one thread that trains and one that renders.
 
     Args:

@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from contract.wire.rendering import RenderRequest, SceneRequest
 from intrasplat.machine.parts import Parts
 from intrasplat.view.encode import FOR_EYES
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.reply import Reply
-from worker.turn_spans import answer_span, shared_span
-from worker.turns import COARSEST, Turn, Turns
+from worker.request_queue import COARSEST, Turns, WaitingRequest
+from worker.request_spans import answer_span, shared_span
 
 SMALL_SHARE = 0.25
 """An answer that takes less than this share of a larger one's time is made between the parts of that one."""
@@ -42,7 +42,7 @@ class Answered:
     seconds: wall time from the first part to the last, with all that was done in between
     """
 
-    turns: tuple[Turn, ...]
+    turns: tuple[WaitingRequest, ...]
     outcome: Reply | Exception
     seconds: float
 
@@ -51,7 +51,7 @@ class Answered:
 class _Task:
     """An answer in progress. small_s: CPU seconds that smaller answers may take before its next part."""
 
-    turn: Turn
+    turn: WaitingRequest
     parts: Parts[Reply]
     context: Context = field(default_factory=copy_context)
     small_s: float = 0.0
@@ -73,7 +73,7 @@ class Scheduler:
     def __init__(
         self,
         answer: Answer,
-        pace: Pace,
+        pace: RenderPace,
         *,
         cost: Callable[[SceneRequest], float] = lambda request: 0.0,
         within: Callable[[], AbstractContextManager[None]] = nullcontext,
@@ -98,7 +98,7 @@ class Scheduler:
         """
         cost = self._cost(request)
         seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
-        turn = Turn(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
+        turn = WaitingRequest(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
         if (wait_s := self._wait_s(turn)) > self._max_wait_s:
             return wait_s
         self._turns.add(turn)
@@ -128,14 +128,14 @@ class Scheduler:
             self._tasks.append(_Task(turn, self._traced(turn)))
         return self._make_part(self._tasks[-1])
 
-    def _next(self) -> Turn | None:
+    def _next(self) -> WaitingRequest | None:
         """The request to begin now, if any; the others wait for the task on top."""
         if not self._tasks:
             return self._turns.take()
         top = self._tasks[-1]
         return self._turns.take(SMALL_SHARE * top.turn.seconds) if top.small_s > 0.0 else None
 
-    def _traced(self, turn: Turn) -> Parts[Reply]:
+    def _traced(self, turn: WaitingRequest) -> Parts[Reply]:
         with answer_span(turn):
             return (yield from self._answer(turn.request, turn.level))
 
@@ -165,7 +165,7 @@ class Scheduler:
             shared_span(each)
         return Answered(turns, outcome, time.perf_counter() - task.start_s)
 
-    def _wait_s(self, turn: Turn) -> float:
+    def _wait_s(self, turn: WaitingRequest) -> float:
         """Seconds until its turn, as far as known."""
         larger = [each.turn for each in self._tasks if turn.seconds >= SMALL_SHARE * each.turn.seconds]
         left_s = (max(0.0, self._turns.seconds(each.cost, each.level) - each.spent_s) for each in larger)
@@ -187,7 +187,7 @@ class Scheduler:
         may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
         return COARSEST if self._pace.trains and may_be_coarse else 0
 
-    def _level(self, turn: Turn) -> int:
+    def _level(self, turn: WaitingRequest) -> int:
         """The level of detail at which it is answered now: as fine as time allows.
 
         0, the finest, if no job trains, the format is exact, or nobody else waits and the pace affords it. 1 if the

@@ -48,8 +48,8 @@ from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
 from intrasplat.view.recorded import live_frame, stored_frame
 from intrasplat.view.render import ROUNDING, ViewRequest, frame_in_parts, renderer_of
+from worker.answer_cache import KeptReplies
 from worker.exports import OpenExports
-from worker.kept import KeptReplies
 from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshot, Snapshots
 

@@ -22,7 +22,7 @@ from client.slicer.frames import Matrix, ras_from_ijk, turned, world_from_camera
 from client.slicer.link import Link, first_ended
 from client.slicer.playback import Playback
 from client.slicer.status import Status
-from client.slicer.surface import Surface
+from client.slicer.surface import SurfaceMesh
 from intrasplat.errors import InputError, SceneError
 from intrasplat.pose import parse_pose
 from intrasplat_client import (
@@ -54,7 +54,7 @@ AWAY = (ServiceUnavailable, ServiceFault)
 
 
 @dataclass(frozen=True)
-class Choice:
+class ShownChoice:
     """What the user chose. width: of the picture in pixels; None: the clip's."""
 
     scene: str
@@ -65,7 +65,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class _View:
+class _PeerView:
     """What is asked for: a frame, and a pose as the API has it; None: the endoscope's own."""
 
     frame: int
@@ -76,7 +76,7 @@ class _View:
 class _Shown:
     """What peers have: a view, its picture and camera, and the depth in mm at which it is placed."""
 
-    view: _View
+    view: _PeerView
     image: Image
     camera: PictureCamera
     plane_mm: float
@@ -85,7 +85,7 @@ class _Shown:
 class Bridge:
     """One scene for all peers of `link`."""
 
-    def __init__(self, client: AsyncClient, choice: Choice, playback: Playback, status: Status) -> None:
+    def __init__(self, client: AsyncClient, choice: ShownChoice, playback: Playback, status: Status) -> None:
         self.link = Link(self._hear, self._wake_up)
         self._client, self._choice, self._playback, self._status = client, choice, playback, status
         self._pose: str | None = None
@@ -151,12 +151,12 @@ class Bridge:
                 self._tell()
                 await asyncio.sleep(RETRY_S)
 
-    async def _next_view(self) -> _View:
+    async def _next_view(self) -> _PeerView:
         """The view that is wanted, once a peer is there and it is a new one; or the one that is shown, to check it."""
         since_s = time.monotonic()
         while True:
             self._woken.clear()
-            wanted = _View(self._playback.frame, self._pose)
+            wanted = _PeerView(self._playback.frame, self._pose)
             if self.link.has_peers and (self._shown is None or wanted != self._shown.view):
                 return wanted
             if self._shown is not None and time.monotonic() - since_s > CHECK_S:
@@ -166,7 +166,7 @@ class Bridge:
                 async with asyncio.timeout(LOOK_S if plays else CHECK_S):
                     await self._woken.wait()
 
-    async def _show_view(self, wanted: _View) -> None:
+    async def _show_view(self, wanted: _PeerView) -> None:
         """Render a view and send it with what belongs to it; nothing if it is the one that was sent."""
         before = self._shown
         known = before.image if before is not None and before.view == wanted else None
@@ -186,7 +186,7 @@ class Bridge:
         self._tell()
         self._moment.set()
 
-    async def _plane_mm(self, view: _View, camera: PictureCamera) -> float:
+    async def _plane_mm(self, view: _PeerView, camera: PictureCamera) -> float:
         """Where the picture is placed: the median depth of what is seen. Also measures the confidence."""
         before = self._shown
         is_new = before is None or before.camera.world_from_camera != camera.world_from_camera
@@ -203,7 +203,7 @@ class Bridge:
             raise InputError("t", "nothing of the scene is seen at this moment.", "Choose another with --t.")
         return before.plane_mm
 
-    async def _render(self, view: _View, layer: str, width: int | None, known: Image | None = None) -> Image:
+    async def _render(self, view: _PeerView, layer: str, width: int | None, known: Image | None = None) -> Image:
         size: dict[str, Any] = {} if width is None else {"width": width}
         t = self._playback.t_of(view.frame)
         return await self._client.render(
@@ -238,7 +238,7 @@ class Bridge:
         """Send a frame's surface, or say why there is none."""
         try:
             content = await self._client.export(self._choice.scene, self._playback.t_of(frame), format="mesh-ply")
-            surface = await asyncio.to_thread(Surface.of_ply, content)
+            surface = await asyncio.to_thread(SurfaceMesh.of_ply, content)
         except GONE:
             raise
         except (RequestRefused, SceneError) as error:

@@ -20,7 +20,7 @@ from intrasplat.machine.processes import heeding_signals
 from intrasplat.report import RESEARCH_USE
 
 if TYPE_CHECKING:
-    from client.slicer.bridge import Bridge, Choice
+    from client.slicer.bridge import Bridge, ShownChoice
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 18944
 PATIENCE_S = 2.0
@@ -65,14 +65,14 @@ def add_slicer(commands: Commands) -> None:
 def _slicer(options: argparse.Namespace) -> int:
     if find_spec("pyigtl") is None:
         raise UnavailableError("pyigtl is not installed.", "pip install 'intrasplat-server[slicer]'")
-    from client.slicer.bridge import Choice
+    from client.slicer.bridge import ShownChoice
 
     if not 0 <= options.port < 1 << 16:
         raise InputError("--port", f"{options.port} is no port.", "Choose one below 65536.")
     if not 0 < len(options.pose_device.encode()) <= MAX_DEVICE_CHARACTERS:
         problem = f"{options.pose_device!r} is not 1 to {MAX_DEVICE_CHARACTERS} characters long."
         raise InputError("--pose-device", problem, "Rename the transform in Slicer.")
-    choice = Choice(options.scene, options.width, options.depth, options.surface, options.pose_device)
+    choice = ShownChoice(options.scene, options.width, options.depth, options.surface, options.pose_device)
     with heeding_signals() as end:
         try:
             asyncio.run(_run(options, choice, end))
@@ -81,7 +81,7 @@ def _slicer(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-async def _run(options: argparse.Namespace, choice: Choice, end: threading.Event) -> None:
+async def _run(options: argparse.Namespace, choice: ShownChoice, end: threading.Event) -> None:
     from client.slicer.bridge import Bridge
     from client.slicer.playback import Playback
     from client.slicer.status import Status

@@ -20,7 +20,7 @@ from pyigtl.messages import (
 )
 
 from client.slicer.frames import Matrix, points_in_ras
-from client.slicer.surface import Surface
+from client.slicer.surface import SurfaceMesh
 
 PICTURE, DEPTH, SURFACE = "IntrasplatPicture", "IntrasplatDepth", "IntrasplatSurface"
 CAMERA, STATUS = "IntrasplatCamera", "IntrasplatStatus"
@@ -69,7 +69,7 @@ class Heard:
 class _ColouredPolyData(PolyDataMessage):  # type: ignore[misc]
     """POLYDATA with three scalars of 0 to 1 at each point, which pyigtl does not write."""
 
-    def __init__(self, name: str, surface: Surface) -> None:
+    def __init__(self, name: str, surface: SurfaceMesh) -> None:
         count = np.full((len(surface.faces), 1), 3, np.int32)
         polygons = np.concatenate([count, surface.faces], axis=1).ravel()
         super().__init__(points=points_in_ras(surface.vertices_mm), polygons=polygons, device_name=name)
@@ -98,7 +98,7 @@ def text(name: str, words: str) -> bytes:
     return _packed(StringMessage(words[:MAX_TEXT].encode("ascii", "replace").decode(), device_name=name))
 
 
-def surface(name: str, mesh: Surface) -> bytes:
+def surface(name: str, mesh: SurfaceMesh) -> bytes:
     """POLYDATA of triangles in RAS, with the colours as point scalars RGB."""
     return _packed(_ColouredPolyData(name, mesh))
 

@@ -23,7 +23,7 @@ PLY_PROPERTIES = (
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceMesh:
     """vertices_mm [V, 3] in the world, colours [V, 3] of 0 to 255, faces [F, 3] counter-clockwise from outside."""
 
     vertices_mm: NDArray[np.float32]
@@ -31,7 +31,7 @@ class Surface:
     faces: NDArray[np.int32]
 
     @classmethod
-    def of_ply(cls, content: bytes) -> Surface:
+    def of_ply(cls, content: bytes) -> SurfaceMesh:
         """What an export of the format mesh-ply holds.
 
         Raises:

@@ -99,7 +99,7 @@ class Event:
 
 
 @dataclass(frozen=True, order=True)
-class Place:
+class ListingPosition:
     """A job's place in listings, which are in falling order of these."""
 
     created_at_s: float
@@ -205,7 +205,7 @@ class Queue(Deliveries, Protocol):
         ...
 
     def records(
-        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: ListingPosition | None = None
     ) -> list[JobRecord]:
         """The newest jobs of a tenant, or of all, newest first; those that come after a place, if it is given.
 
@@ -376,9 +376,9 @@ def trainers(workers: list[WorkerAddress]) -> int:
     return sum(not worker.renders_only for worker in workers)
 
 
-def place_of(record: JobRecord) -> Place:
+def place_of(record: JobRecord) -> ListingPosition:
     """The job's place in listings."""
-    return Place(record.created_at_s, record.job_id)
+    return ListingPosition(record.created_at_s, record.job_id)
 
 
 def event_order(number: str) -> tuple[int, int]:

@@ -67,9 +67,9 @@ from contract.queue.interface import (
     Admission,
     Claim,
     Event,
+    ListingPosition,
     Order,
     Pace,
-    Place,
     QueueFigures,
     Waiting,
     check_admission,
@@ -211,7 +211,7 @@ class RedisQueue(RedisDeliveries):
         return estimate_forecast(record, position, pace, ran_s, trainers(self.workers()))
 
     def records(
-        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: ListingPosition | None = None
     ) -> list[JobRecord]:
         index = INDEX if tenant is None else f"{PREFIX}tenant:{tenant}:index"
         while places := self._places(index, limit, before):
@@ -285,7 +285,7 @@ class RedisQueue(RedisDeliveries):
     def close(self) -> None:
         self._client.close()
 
-    def _places(self, index: str, limit: int | None, before: Place | None) -> list[Place]:
+    def _places(self, index: str, limit: int | None, before: ListingPosition | None) -> list[ListingPosition]:
         """At most `limit` places of an index, newest first, that come after a place."""
         if limit == 0:
             return []
@@ -297,7 +297,7 @@ class RedisQueue(RedisDeliveries):
                 at = repr(before.created_at_s)
                 batch.zrevrangebyscore(index, at, at, withscores=True)
                 batch.zrevrangebyscore(index, f"({at}", "-inf", start=0, num=most, withscores=True)
-            found = [Place(score, job_id) for answer in batch.execute() for job_id, score in answer]
+            found = [ListingPosition(score, job_id) for answer in batch.execute() for job_id, score in answer]
         return [place for place in found if before is None or place < before][:limit]
 
     def _settle(self, claim: Claim, target: JobState, error: str = "") -> bool:

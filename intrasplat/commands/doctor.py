@@ -46,7 +46,7 @@ MIN_PYTHON = (3, 11)
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """One line of the doctor's answer. remedy is there exactly when something should be done."""
 
     topic: str
@@ -56,7 +56,7 @@ class Finding:
     """Whether intrasplat cannot work like this."""
 
 
-def examine(device: str = "auto", segmenter: Path | None = None) -> list[Finding]:
+def examine(device: str = "auto", segmenter: Path | None = None) -> list[Diagnosis]:
     """What the library needs, in the order it is printed.
 
     Args:
@@ -72,7 +72,7 @@ def examine(device: str = "auto", segmenter: Path | None = None) -> list[Finding
     ]
 
 
-def format_findings(findings: list[Finding]) -> str:
+def format_findings(findings: list[Diagnosis]) -> str:
     """One line a finding, its remedy below it."""
     lines = []
     for finding in findings:
@@ -83,61 +83,61 @@ def format_findings(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def _python() -> list[Finding]:
+def _python() -> list[Diagnosis]:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores()} cores"
     remedy = None if sys.version_info >= MIN_PYTHON else "install Python 3.11 or newer"
-    return [Finding("python", found, remedy, blocks=remedy is not None)]
+    return [Diagnosis("python", found, remedy, blocks=remedy is not None)]
 
 
-def package_findings(required: Sequence[str], optional: Mapping[str, str]) -> list[Finding]:
+def package_findings(required: Sequence[str], optional: Mapping[str, str]) -> list[Diagnosis]:
     """A finding for each distribution, with its version. optional: what each is needed for."""
     findings = []
     for name in (*required, *optional):
         try:
-            findings.append(Finding(name, version(name)))
+            findings.append(Diagnosis(name, version(name)))
         except PackageNotFoundError:
             if name in optional:
-                findings.append(Finding(name, f"not installed; {optional[name]}"))
+                findings.append(Diagnosis(name, f"not installed; {optional[name]}"))
             else:
-                findings.append(Finding(name, "not installed", INSTALL_REMEDY, blocks=True))
+                findings.append(Diagnosis(name, "not installed", INSTALL_REMEDY, blocks=True))
     return findings
 
 
-def _device(asked: str) -> list[Finding]:
+def _device(asked: str) -> list[Diagnosis]:
     try:
         return [device_finding(asked, find_gpu())]
     except ImportError:
         return []  # said above
 
 
-def device_finding(asked: str, gpu: Gpu) -> Finding:
+def device_finding(asked: str, gpu: Gpu) -> Diagnosis:
     """What would be trained on, where this is the setting and that is there."""
     backend = importlib.import_module("intrasplat.splat.backend")
     try:
         device = backend.choose_device(asked, gpu, cpu_by=backend.CPU_BY_VARIABLE)
     except UnavailableError as error:
-        return Finding("device", error.problem, error.remedy, blocks=True)
+        return Diagnosis("device", error.problem, error.remedy, blocks=True)
     if device.kind == "cuda":
-        return Finding("device", str(device))
+        return Diagnosis("device", str(device))
     found = f"cpu, {cores()} threads"
     if asked == "auto" and gpu.name is not None:
-        return Finding("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", f"{gpu.remedy}.")
-    return Finding("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")
+        return Diagnosis("device", f"{found} (the {gpu.name} is not used: {gpu.missing})", f"{gpu.remedy}.")
+    return Diagnosis("device", f"{found} ({gpu.missing or 'the GPU is not asked for'})")
 
 
-def _video() -> list[Finding]:
+def _video() -> list[Diagnosis]:
     try:
         cv2 = importlib.import_module("cv2")
     except ImportError:
         return []  # said above
     if not re.search(r"FFMPEG:\s+YES", cv2.getBuildInformation()):
-        return [Finding("video decoder", "this OpenCV has no FFmpeg", OPENCV_REQUIREMENT, blocks=True)]
+        return [Diagnosis("video decoder", "this OpenCV has no FFmpeg", OPENCV_REQUIREMENT, blocks=True)]
     found = bundled_ffmpeg(Path(str(cv2.__file__)).parent.parent)
     if found is None:
-        return [Finding("video decoder", "FFmpeg of the system", "make sure it is 8.1.2 or newer (CVE-2026-8461)")]
+        return [Diagnosis("video decoder", "FFmpeg of the system", "make sure it is 8.1.2 or newer (CVE-2026-8461)")]
     shown = "FFmpeg " + ".".join(str(part) for part in found)
     remedy = None if found >= FIXED_FFMPEG else f"open to CVE-2026-8461: {OPENCV_REQUIREMENT}"
-    return [Finding("video decoder", shown, remedy)]
+    return [Diagnosis("video decoder", shown, remedy)]
 
 
 def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
@@ -149,7 +149,7 @@ def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
     return None
 
 
-def _segmenter(path: Path | None) -> list[Finding]:
+def _segmenter(path: Path | None) -> list[Diagnosis]:
     if path is None:
         return []
     from intrasplat.instruments import load_segmenter  # needs packages that _packages may miss
@@ -157,8 +157,8 @@ def _segmenter(path: Path | None) -> list[Finding]:
     try:
         load_segmenter(path)
     except UnavailableError as error:
-        return [Finding("segmenter", error.problem, error.remedy, blocks=True)]
-    return [Finding("segmenter", str(path))]
+        return [Diagnosis("segmenter", error.problem, error.remedy, blocks=True)]
+    return [Diagnosis("segmenter", str(path))]
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,7 +173,7 @@ def run_cli(options: argparse.Namespace) -> int:
     try:
         findings += [] if server is None else server()
     except IntrasplatError as error:
-        findings.append(Finding("settings", str(error), "correct them", blocks=True))
+        findings.append(Diagnosis("settings", str(error), "correct them", blocks=True))
     print(format_findings(findings))
     blocking = sum(finding.blocks for finding in findings)
     print(f"\n{blocking} missing." if blocking else "\nintrasplat can work here.")

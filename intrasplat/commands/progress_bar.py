@@ -10,7 +10,7 @@ BAR_CELLS = 24
 LINE_COLUMNS = 78
 
 
-class Shown(Protocol):
+class ShownProgress(Protocol):
     """Progress of a stage: of this process (intrasplat/machine/hooks.py) or of a job on a service.
 
     fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue.
@@ -26,7 +26,7 @@ class Shown(Protocol):
     def seconds_left(self) -> float | None: ...
 
 
-def format_progress(progress: Shown) -> str:
+def format_progress(progress: ShownProgress) -> str:
     """`train      [######..................]  25 %  31.24 dB  42 s left`, without the parts that are unknown."""
     fraction = min(1.0, max(0.0, progress.fraction)) if math.isfinite(progress.fraction) else 0.0
     filled = round(fraction * BAR_CELLS)
@@ -47,7 +47,7 @@ class ProgressBar:
         self._last_stage: str | None = None
         self._line_open = False
 
-    def show(self, progress: Shown) -> None:
+    def show(self, progress: ShownProgress) -> None:
         """Redraw the line; on anything but a terminal, write one line a stage."""
         if self._on_terminal:
             self._stream.write(f"\r{format_progress(progress):<{LINE_COLUMNS}}")

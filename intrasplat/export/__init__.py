@@ -16,7 +16,7 @@ from intrasplat.export.mesh import mesh_parts
 from intrasplat.export.ply import export_ply, ply_zip_parts
 from intrasplat.export.points import export_points
 from intrasplat.export.splat import export_splat
-from intrasplat.export.target import Target
+from intrasplat.export.target import ExportTarget
 from intrasplat.export.tracks import tracks_parts
 from intrasplat.export.tum import export_tum
 from intrasplat.export.video import video_parts
@@ -24,7 +24,7 @@ from intrasplat.formats import ExportOptions
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 
-Writer: TypeAlias = Callable[[Target], Iterator[bytes]]
+Writer: TypeAlias = Callable[[ExportTarget], Iterator[bytes]]
 
 PART_BYTES = 1 << 20
 
@@ -65,7 +65,7 @@ def export_parts(scene: TrainedScene, name: str, options: ExportOptions, device:
     writer = EXPORTS.get(name)
     if writer is None:
         raise InputError("format", f"{name} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
-    return _cut(writer(Target(scene, options, device)))
+    return _cut(writer(ExportTarget(scene, options, device)))
 
 
 def _cut(pieces: Iterator[bytes]) -> Generator[bytes]:

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from intrasplat.export.npy import npy_head
-from intrasplat.export.target import Target
+from intrasplat.export.target import ExportTarget
 from intrasplat.view.render import render_frame
 
 
-def depth_parts(target: Target) -> Iterator[bytes]:
+def depth_parts(target: ExportTarget) -> Iterator[bytes]:
     """NPY [F, H, W] float32: the camera's z in mm, from the endoscope's own poses; 0 where nothing solid is, and where
     no training frame saw what is shown.
 

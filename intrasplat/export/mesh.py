@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from intrasplat.export.glb import INDICES, Glb, to_gltf
 from intrasplat.export.ply import ply_head, structured
 from intrasplat.export.surface import Mesh, surface
-from intrasplat.export.target import Target, as_bytes
+from intrasplat.export.target import ExportTarget, as_bytes
 
 TRIANGLES = 4
 UNLIT = "KHR_materials_unlit"
 FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
 
 
-def mesh_parts(encode: Callable[[Mesh, float], bytes]) -> Callable[[Target], Iterator[bytes]]:
+def mesh_parts(encode: Callable[[Mesh, float], bytes]) -> Callable[[ExportTarget], Iterator[bytes]]:
     """The writer of a function from a mesh and its model time to a whole file."""
 
-    def parts(target: Target) -> Iterator[bytes]:
+    def parts(target: ExportTarget) -> Iterator[bytes]:
         mesh = yield from surface(target)
         yield encode(mesh, target.t)
 

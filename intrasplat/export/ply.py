@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.export.target import Target, splats_at
+from intrasplat.export.target import ExportTarget, splats_at
 from intrasplat.files.zipped import zip_parts
 from intrasplat.scene.scene import TrainedScene
 
@@ -71,7 +71,7 @@ def structured(columns: Sequence[tuple[str, NDArray[np.generic]]]) -> NDArray[np
     return rows
 
 
-def ply_zip_parts(target: Target) -> Iterator[bytes]:
+def ply_zip_parts(target: ExportTarget) -> Iterator[bytes]:
     """A zip of 000000.ply and so on, a file for each frame, and times.csv with frame, t and seconds.
 
     Raises:

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from intrasplat.camera import Intrinsics, unproject
 from intrasplat.errors import InputError
-from intrasplat.export.target import Target
+from intrasplat.export.target import ExportTarget
 from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.render import render_frame
@@ -53,7 +53,7 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class _View:
+class _SurfaceView:
     """depth_mm [H, W], 0 where it is not used; rgb [H, W, 3] uint8."""
 
     depth_mm: NDArray[np.float32]
@@ -67,7 +67,7 @@ class _View:
         return unproject(pixels, self.depth_mm.ravel()[pixels], self.camera, self.pose)
 
 
-def surface(target: Target) -> Generator[bytes, None, Mesh]:
+def surface(target: ExportTarget) -> Generator[bytes, None, Mesh]:
     """The mesh at the target's moment; yields b"" now and then meanwhile.
 
     Raises:
@@ -99,7 +99,7 @@ def surface(target: Target) -> Generator[bytes, None, Mesh]:
     return Mesh((vertices * volume.voxel_mm + volume.first_mm).astype(np.float32), colour, faces)
 
 
-def _views(target: Target) -> Iterator[_View]:
+def _views(target: ExportTarget) -> Iterator[_SurfaceView]:
     """The endoscope's own view at the target's moment, and four around it."""
     scene, t = target.scene, target.t
     own = endoscope_pose(scene, t)
@@ -113,7 +113,7 @@ def _views(target: Target) -> Iterator[_View]:
             if not depth_mm.any():
                 raise _nothing()
             pivot_mm = float(np.median(depth_mm[depth_mm > 0]))
-        yield _View(depth_mm, frame.rgb, pose, scene.intrinsics)
+        yield _SurfaceView(depth_mm, frame.rgb, pose, scene.intrinsics)
 
 
 def _nothing() -> InputError:
@@ -138,7 +138,7 @@ class _Volume:
     voxel_mm: float
 
 
-def _fused(views: list[_View], points_mm: NDArray[np.float64]) -> Generator[bytes, None, _Volume]:
+def _fused(views: list[_SurfaceView], points_mm: NDArray[np.float64]) -> Generator[bytes, None, _Volume]:
     """All views in one volume around the points."""
     first_mm, last_mm = np.percentile(points_mm, (STRAYS, 100 - STRAYS), axis=0)
     own = views[0]
@@ -161,7 +161,7 @@ def _fused(views: list[_View], points_mm: NDArray[np.float64]) -> Generator[byte
 
 
 def _fuse(
-    view: _View,
+    view: _SurfaceView,
     at_mm: list[NDArray[np.float32]],
     truncation_mm: float,
     distance: NDArray[np.float32],

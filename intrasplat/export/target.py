@@ -23,7 +23,7 @@ MAX_EXPORT_BYTES = 4 << 30
 
 
 @dataclass(frozen=True)
-class Target:
+class ExportTarget:
     """A scene, what of it is wanted, and the device that renders it."""
 
     scene: TrainedScene

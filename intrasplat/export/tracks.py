@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.export.npy import npy_head
-from intrasplat.export.target import Target, as_bytes, splats_at
+from intrasplat.export.target import ExportTarget, as_bytes, splats_at
 from intrasplat.files.zipped import zip_parts
 
 
-def tracks_parts(target: Target) -> Iterator[bytes]:
+def tracks_parts(target: ExportTarget) -> Iterator[bytes]:
     """NPZ of positions_mm [F, N, 3] (the world, OpenCV axes), frame [F], t [F], time_s [F], world_from_camera [F, 4, 4]
     (mm), trust [N] (`seen`), and colour [N, 3] uint8 and opacity [N] of the first of these frames.
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.errors import InputError
-from intrasplat.export.target import Target
+from intrasplat.export.target import ExportTarget
 from intrasplat.machine.opencv import silent_stderr
 from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
@@ -37,10 +37,10 @@ PIECE_BYTES = 1 << 20
 Picture = NDArray[np.uint8]
 
 
-def video_parts(container: str) -> Callable[[Target], Iterator[bytes]]:
+def video_parts(container: str) -> Callable[[ExportTarget], Iterator[bytes]]:
     """The writer of a video in one of CODECS."""
 
-    def parts(target: Target) -> Iterator[bytes]:
+    def parts(target: ExportTarget) -> Iterator[bytes]:
         pictures, rate_hz = _pictures(target)
         with tempfile.TemporaryDirectory(prefix="intrasplat-") as folder:
             path = Path(folder) / f"video.{container}"
@@ -71,7 +71,7 @@ def _encoded(pictures: Iterator[Picture], rate_hz: float, path: Path, codec: str
             writer.release()
 
 
-def _pictures(target: Target) -> tuple[Iterator[Picture], float]:
+def _pictures(target: ExportTarget) -> tuple[Iterator[Picture], float]:
     """The video's pictures, and how many are shown in a second."""
     options, scene = target.options, target.scene
     seconds = float(scene.frame_times_s[-1] - scene.frame_times_s[0])
@@ -86,7 +86,7 @@ def _pictures(target: Target) -> tuple[Iterator[Picture], float]:
     return (_shown(target, target.time_of(frame)) for frame in target.frames), rate_hz
 
 
-def _shown(target: Target, t: float, pose: NDArray[np.float64] | None = None, shift_px: float = 0.0) -> Picture:
+def _shown(target: ExportTarget, t: float, pose: NDArray[np.float64] | None = None, shift_px: float = 0.0) -> Picture:
     """A picture from a pose (None: the endoscope's own), moved so many pixels to the right; the unseen is hatched."""
     camera = target.scene.intrinsics
     camera = dataclasses.replace(camera, cx=camera.cx + shift_px)
@@ -94,7 +94,7 @@ def _shown(target: Target, t: float, pose: NDArray[np.float64] | None = None, sh
     return hatched(frame.rgb, frame.unseen)
 
 
-def _circle(target: Target, rate_hz: float) -> Iterator[Picture]:
+def _circle(target: ExportTarget, rate_hz: float) -> Iterator[Picture]:
     """The camera circles while the clip goes on, or once about the moment that is chosen."""
     scene, fixed_t = target.scene, target.options.t
     pivot_mm = MEDIAN_DEPTH_UNITS / scene.units_per_mm
@@ -106,7 +106,7 @@ def _circle(target: Target, rate_hz: float) -> Iterator[Picture]:
         yield _shown(target, t, endoscope_pose(scene, t) @ np.array(world_from_camera(around, pivot_mm)))
 
 
-def _baseline_mm(target: Target) -> NDArray[np.float64]:
+def _baseline_mm(target: ExportTarget) -> NDArray[np.float64]:
     """[3] where the right eye is, in the left one's axes.
 
     Raises:
@@ -120,7 +120,7 @@ def _baseline_mm(target: Target) -> NDArray[np.float64]:
     return np.array(target.scene.right_eye_mm)
 
 
-def _both_eyes(target: Target, baseline_mm: NDArray[np.float64]) -> Iterator[Picture]:
+def _both_eyes(target: ExportTarget, baseline_mm: NDArray[np.float64]) -> Iterator[Picture]:
     """Left and right side by side, each of full width. Both look the same way, and the right picture is moved so that
     tissue at the median depth lies in the plane of the screen.
     """

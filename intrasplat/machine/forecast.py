@@ -38,7 +38,7 @@ TRUSTED_S = 1.5
 """Of work at the usual pace that is believed in before any has been done: little work says little of the pace."""
 
 
-class Forecast:
+class TimeEstimate:
     """Adds seconds_left to each report of progress.
 
     Args:

@@ -49,7 +49,7 @@ MIN_TRIAL_FRAMES = 8
 
 
 @dataclass(frozen=True)
-class Choice:
+class BasisChoice:
     """A number and why, in words for the report."""
 
     count: int
@@ -57,7 +57,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Trials:
+class BasisTrials:
     """Error of each number of bases in validation frames; empty where too few tracks can be trusted.
 
     tracked  of the tracks
@@ -81,7 +81,7 @@ def try_bases(
     train: Sequence[int],
     basis_values: BasisValues,
     max_bases: int | None = None,
-) -> Trials:
+) -> BasisTrials:
     """The error of each number of bases up to max_bases, in validation frames. tracks: of each keyframe.
 
     Every fourth training frame is a validation frame. The tracks in the others are fitted by three quarters of B bases;
@@ -92,27 +92,27 @@ def try_bases(
     than MIN_GAIN_DB nearer than rest does, with the largest number of bases. The result then has `resting`.
     """
     if len(train) < MIN_TRIAL_FRAMES:
-        return Trials({})
+        return BasisTrials({})
     cells = CELLS // len(tracks)
     trials = [Trial.of(each, clip, train, basis_values, cells) for each in tracks]
     if sum(len(each.places) for each in trials) < MIN_TRIAL_CELLS:
-        return Trials({})
+        return BasisTrials({})
     limit = _bases_limit(len(train), max_bases).count
     numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
     with ThreadPoolExecutor(cores()) as pool:
         tracked = dict(zip(numbers, pool.map(partial(mean_error, trials), numbers), strict=True))
     if len(tracks) > 1:  # the camera moved on: no picture rests
-        return Trials(tracked)
+        return BasisTrials(tracked)
     at_rest = [Trial.of(resting(tracks[0], clip, train), clip, train, basis_values)]
     if len(at_rest[0].places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
-        return Trials(tracked)
+        return BasisTrials(tracked)
     error, error_at_rest = (mean_picture_error(each, numbers[-1]) for each in (trials, at_rest))
     if error_at_rest > error * 10 ** (MIN_GAIN_DB / 10):
-        return Trials(tracked)
-    return Trials(tracked, {bases: mean_error(at_rest, bases) for bases in numbers})
+        return BasisTrials(tracked)
+    return BasisTrials(tracked, {bases: mean_error(at_rest, bases) for bases in numbers})
 
 
-def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | None = None) -> Choice:
+def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int | None = None) -> BasisChoice:
     """The smallest number of bases whose expected error is within MIN_GAIN_DB of the least.
 
     The expected error is that in validation frames plus the floor, which the Gaussians leave whatever moves. `frames`
@@ -127,12 +127,14 @@ def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | Non
         most = max_bases or min(BASES[-1], max(USUAL_BASES, _most_bases(frames)))
         bases = min(frames, most, max(BASES[0], -(-frames // FRAMES_A_BASIS)))
         reason = f"one for {frames / bases:.2g} training frames, for too little could be followed to tell more"
-        return Choice(bases, reason)
+        return BasisChoice(bases, reason)
     smallest, limit = min(errors), _bases_limit(frames, max_bases)
     if len(errors) == 1:
-        return Choice(smallest, limit.reason)
+        return BasisChoice(smallest, limit.reason)
     if min(each.motion for each in errors.values()) > max(floor, MAX_MOTION_LEFT * errors[smallest].motion):
-        return Choice(max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames")
+        return BasisChoice(
+            max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames"
+        )
     total = {bases: each.total for bases, each in trials.decisive.items()}
     best = min(total, key=lambda each: total[each])
     allowed = (total[best] + floor) * 10 ** (MIN_GAIN_DB / 10)
@@ -140,15 +142,15 @@ def choose_bases(trials: Trials, floor: float, frames: int, max_bases: int | Non
     left = ", ".join(f"{each} leave {math.sqrt(total[each] + floor):.2f}" for each in sorted({smallest, bases, best}))
     seen = "no motion shows in the pictures; " if trials.resting else ""
     reason = f"{seen}the fewest within {MIN_GAIN_DB} dB of the best; in validation frames {left} of 255 grey levels"
-    return Choice(bases, reason)
+    return BasisChoice(bases, reason)
 
 
-def _bases_limit(frames: int, max_bases: int | None) -> Choice:
+def _bases_limit(frames: int, max_bases: int | None) -> BasisChoice:
     """The largest number of bases that may be tried, and what limits it."""
     limits = [
-        Choice(BASES[-1], "the most there are to choose from"),
-        Choice(max_bases or BASES[-1], "the most that the preset allows"),
-        Choice(_most_bases(frames), f"the most that {frames} training frames bear"),
+        BasisChoice(BASES[-1], "the most there are to choose from"),
+        BasisChoice(max_bases or BASES[-1], "the most that the preset allows"),
+        BasisChoice(_most_bases(frames), f"the most that {frames} training frames bear"),
     ]
     return min(limits, key=lambda each: each.count)
 
@@ -161,7 +163,7 @@ def _most_bases(frames: int) -> int:
 # points -------------------------------------------------------------------------------------------------------------
 
 
-def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_error: float) -> Choice:
+def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_error: float) -> BasisChoice:
     """Pixels between points: the largest stride whose expected error in these frames is within MIN_GAIN_DB of the
     finest's.
 
@@ -176,7 +178,7 @@ def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_erro
         for each in (stride, stride + 1)
         if each in errors
     )
-    return Choice(stride, f"the most within {MIN_GAIN_DB} dB of {finest}; of 255 grey levels {left}")
+    return BasisChoice(stride, f"the most within {MIN_GAIN_DB} dB of {finest}; of 255 grey levels {left}")
 
 
 def floor_error(clip: DepthClip, index: int, stride: int) -> float:

@@ -42,7 +42,7 @@ def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
     return means
 
 
-class Grid:
+class PointGrid:
     """The coarse grid: the pixels that it samples and their rays. h w cells, step pixels apart."""
 
     def __init__(self, clip: DepthClip, step: int) -> None:
@@ -71,7 +71,7 @@ class CoarseFrame:
     Where no tissue is measured, depth is completed from around; it is 0 in a frame without any.
     """
 
-    def __init__(self, clip: DepthClip, index: int, grid: Grid) -> None:
+    def __init__(self, clip: DepthClip, index: int, grid: PointGrid) -> None:
         self.grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), grid.step)
         self.rgb = np.asarray(cell_means(clip.rgb[index], grid.step) / np.float32(255), np.float32)
         depth_mm = grid.sample(clip.depth_mm[index])

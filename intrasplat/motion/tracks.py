@@ -26,7 +26,16 @@ from intrasplat.machine.cores import cores
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.motion.least_squares import fit_series
-from intrasplat.motion.lifted import COLOUR_SMOOTH_PX, CoarseFrame, Floats, Flows, Grid, averaged, cell_means, lifted
+from intrasplat.motion.lifted import (
+    COLOUR_SMOOTH_PX,
+    CoarseFrame,
+    Floats,
+    Flows,
+    PointGrid,
+    averaged,
+    cell_means,
+    lifted,
+)
 
 Moved = Callable[[int, NDArray[np.intp]], Floats]
 """Displacements [M, 3] mm (world) of what a keyframe's pixels (flat, [M]) show, to a training frame."""
@@ -117,7 +126,7 @@ def track(
             ends the tracking and is raised here.
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // MIN_GRID_SIDE))
-    grid = Grid(clip, step)
+    grid = PointGrid(clip, step)
     start, places = CoarseFrame(clip, train[reference], grid), range(len(train)) if places is None else places
     tracks, own = Tracks.empty(places, start.grey.shape, step, reference), places.index(reference)
     tracks.confidence[own] = start.trust

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from intrasplat.clip import spread
-from intrasplat.poses.links import Frames, Link
+from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, exp, inverse, log
 
 KEY_OVERLAP = 0.6
@@ -39,16 +39,16 @@ class Chain:
 
     frames: Sequence[int]
     world_from_camera: Reals
-    links: list[Link]
+    links: list[FrameLink]
     keys: list[int]
 
 
 def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
     """Follow the training frames, link by link."""
-    poses, links, keys = {train[0]: np.eye(4)}, list[Link](), [train[0]]
+    poses, links, keys = {train[0]: np.eye(4)}, list[FrameLink](), [train[0]]
     flow = None
 
-    def linked(i: int, last: int) -> tuple[Link, float]:
+    def linked(i: int, last: int) -> tuple[FrameLink, float]:
         """The link from the present keyframe, which places frame i, and the share of the keyframe that it explains."""
         key, start = keys[-1], inverse(_ahead(poses, last, i)) @ poses[keys[-1]]
         link = frames.link(key, i, frames.predicted(key, start)[0] if flow is None else flow)
@@ -88,9 +88,9 @@ def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:
     return exp(step * (index - last) / (last - before)) @ poses[last]
 
 
-def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]:
+def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[FrameLink]:
     """Links from a keyframe back to the frames before it."""
-    found, flow = list[Link](), None
+    found, flow = list[FrameLink](), None
     for i in reversed(between):
         link = frames.link(key, i, flow)
         flow = link.flow
@@ -98,7 +98,7 @@ def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Link]
     return found
 
 
-def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[Link]:
+def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[FrameLink]:
     """Links between keyframes that are no neighbours and see the same tissue: those that should see most of it."""
     some = spread(keys, MAX_LOOKS)
     pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]

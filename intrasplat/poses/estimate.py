@@ -19,9 +19,9 @@ from intrasplat.clip import DepthClip, spread
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
 from intrasplat.poses.chain import chained
+from intrasplat.poses.common_motion import RIGID_PER_BENT, Gauged, gauged
 from intrasplat.poses.fitting import Fit, fitted
-from intrasplat.poses.gauge import RIGID_PER_BENT, Gauged, gauged
-from intrasplat.poses.links import Frames, Link
+from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, between, inverse, log
 
 MAX_FITTED = 128
@@ -134,7 +134,7 @@ def _unknown(count: int) -> FoundPath:
     return FoundPath(still, period_frames=None, unsure=tuple(range(count)), **nothing)
 
 
-def _apart(used: Sequence[int], fit: Fit, links: Sequence[Link]) -> list[int]:
+def _apart(used: Sequence[int], fit: Fit, links: Sequence[FrameLink]) -> list[int]:
     """The frames that no chain of links, each of which finds enough tissue where the fit expects it, ties to most."""
     place = {index: k for k, index in enumerate(used)}
     tied = [

@@ -1,7 +1,7 @@
 """A smooth motion of the tissue: u(x, t) = sum_s A_s phi(x) h_s(t), with polynomials phi of the place, courses h_s in
 time.
 
-What of u is a rigid motion of all tissue may as well be the camera's (intrasplat/poses/gauge.py).
+What of u is a rigid motion of all tissue may as well be the camera's (intrasplat/poses/common_motion.py).
 
 Symbols: K frames, M places, F polynomials, S courses. Lengths in mm, in the world.
 """
@@ -24,7 +24,7 @@ SAMPLED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class DeformationField:
     """A motion of the tissue.
 
     degree   of the polynomials in x and y
@@ -42,7 +42,7 @@ class Field:
     period: float | None = None
 
     @classmethod
-    def at_rest(cls, degree: int, middle: Reals, half: Reals, frames: int) -> Field:
+    def at_rest(cls, degree: int, middle: Reals, half: Reals, frames: int) -> DeformationField:
         """No motion in so many frames."""
         return cls(degree, middle, half, np.zeros((0, 3 * powers_of(degree))), np.zeros((frames, 0)))
 

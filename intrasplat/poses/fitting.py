@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intrasplat.poses.chain import Chain
-from intrasplat.poses.field import HARMONICS, Field, waves
+from intrasplat.poses.field import HARMONICS, DeformationField, waves
 from intrasplat.poses.grams import Grams, link_gram
-from intrasplat.poses.links import Link
+from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, exp
 
 ROUGH_PX, FINE_PX = (4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 0.8, 0.8)
@@ -52,7 +52,7 @@ class Fit:
     """
 
     poses: Reals
-    field: Field
+    field: DeformationField
     middle_mm: Reals
     residual_px: Sequence[Reals]
     weight: Sequence[Reals]
@@ -98,7 +98,7 @@ class _Fitting:
         half = (high - low) / 2 + 1e-6
         view = np.median([np.ptp(each[:, :2], axis=0) for each in seen], axis=0) / 2
         degree = WIDE_DEGREE if (half > WIDE * view).any() else DEGREE
-        self.field = Field.at_rest(degree, (low + high) / 2, half, len(self.frames))
+        self.field = DeformationField.at_rest(degree, (low + high) / 2, half, len(self.frames))
         self.rigidity: dict[int, Reals] = {}
         self.residual_px: list[Reals] = []
         self.weight: list[Reals] = []
@@ -157,7 +157,7 @@ class _Fitting:
         twists, bend = grams.solved(field)
         self._move(twists, replace(field, weight=bend))
 
-    def _move(self, twists: Reals, field: Field) -> None:
+    def _move(self, twists: Reals, field: DeformationField) -> None:
         self.field = field
         self.poses = np.stack([exp(each) @ pose for each, pose in zip(twists, self.poses, strict=True)])
 
@@ -180,12 +180,12 @@ class _Fitting:
         self.rigidity = rigidity(self.links, self.weight)
         return Grams(np.stack([each.gram for each in found]), self.incidence, self.frames)
 
-    def _some(self, link: Link, pose: Reals) -> Reals:
+    def _some(self, link: FrameLink, pose: Reals) -> Reals:
         """Every sixteenth match of a link in the world."""
         return self.camera.points_mm(link.before[::16]) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def rigidity(links: Sequence[Link], weight: Sequence[Reals]) -> dict[int, Reals]:
+def rigidity(links: Sequence[FrameLink], weight: Sequence[Reals]) -> dict[int, Reals]:
     """By first frame: of each of its cells the squared mean of the weights in all its links; a half counts beside."""
     cells = 1 + max(int(link.cells.max(initial=0)) for link in links)
     total = {link.a: np.full(cells, 0.5) for link in links}

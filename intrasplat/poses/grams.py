@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from intrasplat.poses.field import Field, waves
-from intrasplat.poses.links import Link
+from intrasplat.poses.field import DeformationField, waves
+from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, inverse, weighted_median
 
 INDEPENDENT, NOISE_PX = 0.05, 0.35
@@ -38,9 +38,9 @@ class LinkGram:
 
 def link_gram(
     camera: StereoCamera,
-    link: Link,
+    link: FrameLink,
     poses: tuple[Reals, Reals],
-    field: Field,
+    field: DeformationField,
     change: Reals,
     scale_px: float,
     rigidity: Reals | None,
@@ -82,7 +82,7 @@ def link_gram(
     return LinkGram(columns.T @ gram @ columns, np.sqrt(squared), weight)
 
 
-def _columns(field: Field) -> Reals:
+def _columns(field: DeformationField) -> Reals:
     """[3 F + 4, G] the columns in terms of the polynomials and z, each along three axes, and the residual."""
     count = field.weight.shape[1]  # 3 F
     columns = np.zeros((count + 4, 7 + count))
@@ -113,7 +113,7 @@ class Grams:
     incidence: Reals
     frames: Reals
 
-    def solved(self, field: Field) -> tuple[Reals, Reals]:
+    def solved(self, field: DeformationField) -> tuple[Reals, Reals]:
         """Steps: twists [K, 6] of the cameras and changes [S, 3 F] of the field's weights, courses as they are."""
         factor, right = cho_factor(self._twists()), self._residuals()
         if not len(field.weight):
@@ -125,7 +125,7 @@ class Grams:
         bend = np.linalg.solve(normal, bent - ridge * field.weight.ravel() - through.T @ right)
         return (cho_solve(factor, right) - through @ bend).reshape(-1, 6), bend.reshape(field.weight.shape)
 
-    def followed(self, field: Field) -> tuple[Reals, Reals]:
+    def followed(self, field: DeformationField) -> tuple[Reals, Reals]:
         """Steps: twists [K, 6] of the cameras and changes [K, S] of the field's courses, weights as they are."""
         kinds, count = len(field.weight), len(self.frames)
         columns = np.zeros((7 + kinds, self.gram.shape[1]))
@@ -142,7 +142,7 @@ class Grams:
         found = np.linalg.solve(normal, right.ravel()).reshape(count, size)
         return found[:, :6], found[:, 6:]
 
-    def covariance(self, field: Field) -> Reals:
+    def covariance(self, field: DeformationField) -> Reals:
         """[6 K, 6 K] of the cameras' twists, whatever the field does but for rigid motions of all tissue.
 
         Those and the cameras are told apart by the gauge, not by links.
@@ -157,7 +157,7 @@ class Grams:
             normal -= mixed @ np.linalg.solve(bent.T @ (bends + ridge) @ bent, mixed.T)
         return np.asarray(np.linalg.inv(normal))
 
-    def bent_mm(self, field: Field, depth_mm: float) -> float:
+    def bent_mm(self, field: DeformationField, depth_mm: float) -> float:
         """Root mean square over the links of the deformation that the field does not explain, mm."""
         squares = []
         for gram in self.gram:
@@ -166,11 +166,11 @@ class Grams:
             squares.append(left.sizes_mm(depth_mm)[0] ** 2)
         return float(np.sqrt(np.mean(squares)))
 
-    def without(self, field: Field) -> Grams:
+    def without(self, field: DeformationField) -> Grams:
         """What the links would say if the field were not there."""
         return self.shifted(-(self.change(field) @ field.weight))
 
-    def with_weights(self, field: Field, added: Reals) -> Grams:
+    def with_weights(self, field: DeformationField, added: Reals) -> Grams:
         """What the links say after the field's weights were changed by [S, 3 F]."""
         return self.shifted(self.change(field) @ added)
 
@@ -180,7 +180,7 @@ class Grams:
         lift[:, -1, 6:-1] = moved
         return replace(self, gram=lift @ self.gram @ lift.transpose(0, 2, 1))
 
-    def change(self, field: Field) -> Reals:
+    def change(self, field: DeformationField) -> Reals:
         """[L, S] change of the field's courses from each link's first frame to its second."""
         return -(self.incidence @ field.courses)
 
@@ -189,7 +189,7 @@ class Grams:
         right = self._residuals()
         return float(self.gram[:, -1, -1].sum() - right @ cho_solve(cho_factor(self._twists()), right))
 
-    def explained(self, field: Field, periods: Sequence[float]) -> list[float]:
+    def explained(self, field: DeformationField, periods: Sequence[float]) -> list[float]:
         """How much of that a field of each period explains; the links are those without any field."""
         factor, right = cho_factor(self._twists()), self._residuals()
         found = []

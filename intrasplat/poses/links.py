@@ -42,7 +42,7 @@ PSEUDO_BASELINE_MM = 4.3
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class TrackedFrame:
     """A frame on the coarse grid.
 
     grey, even  [h, w] grey levels, and those without shades
@@ -57,7 +57,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class FrameLink:
     """Matches from frame a to frame b.
 
     cells  [M]     which of a's cells with depth; a has the same in all links
@@ -94,10 +94,10 @@ class Frames:
         if right is not None:
             baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
-        self._kept: dict[int, Frame] = {}
+        self._kept: dict[int, TrackedFrame] = {}
         self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
-    def frame(self, index: int) -> Frame:
+    def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
         if index not in self._kept:
             clip, step = self._clip, self._step
@@ -110,14 +110,16 @@ class Frames:
             ratio = np.float32(self.camera.fx * self.camera.baseline_mm)
             disparity = np.where(usable, ratio / np.maximum(depth_mm, 1e-3), np.float32(0))
             clip.let_go(index)
-            self._kept[index] = Frame(grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0)))
+            self._kept[index] = TrackedFrame(
+                grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0))
+            )
         return self._kept[index]
 
     def forget(self, index: int) -> None:
         """Free a frame's memory."""
         self._kept.pop(index, None)
 
-    def link(self, a: int, b: int, start: Floats | None = None) -> Link:
+    def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: a guess of the flow [h, w, 2], which is not changed."""
         one, two = self.frame(a), self.frame(b)
         flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
@@ -149,7 +151,7 @@ class Frames:
         before = np.stack([columns, rows, one.disparity[rows, columns]], axis=1)[cells].astype(np.float64)
         after = np.stack([x[:, 0], y[:, 0], disparity_b], axis=1)[cells].astype(np.float64)
         overlap = len(cells) / max(len(found), 1)
-        return Link(a, b, cells, before, after, trust[cells].astype(np.float64), overlap, flow)
+        return FrameLink(a, b, cells, before, after, trust[cells].astype(np.float64), overlap, flow)
 
     def predicted(self, a: int, b_from_a: Reals) -> tuple[Floats, float]:
         """The flow [h, w, 2] of frame a's tissue if it were rigid, and the share of it that stays in view."""
@@ -169,7 +171,7 @@ class Frames:
         flow: Floats = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
         return flow, float((inside & known).sum() / known.sum())
 
-    def _matched(self, frame: Frame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns and rows [M'] of the frame's cells that are matched: those with a depth to rely on."""
         height, width = frame.grey.shape
         rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]

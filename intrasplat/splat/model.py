@@ -39,7 +39,7 @@ def bands_of(width: int, height: int, multiple: int = 1) -> list[slice]:
     return [slice(first, min(first + rows, height)) for first in range(0, height, rows)]
 
 
-class Projected(Protocol):
+class ProjectedPicture(Protocol):
     """The Gaussians at one time on one camera's image, in buffers of its own: its bands are blended one by one, and the
     model may render other pictures in between."""
 
@@ -136,7 +136,7 @@ class Model(Protocol):
         """
         ...
 
-    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
         """The same picture, to be blended in bands of rows, with the same bits. The caller closes it."""
         ...
 

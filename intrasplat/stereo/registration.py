@@ -24,7 +24,7 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import RightEye
 from intrasplat.stereo.alignment import FEATURE_WIDTH, Map, RowShift
 from intrasplat.stereo.matching import SATURATED_LEVEL, Image, MatchPlan, match
-from intrasplat.stereo.turn import AnyImage, Rgb, Turn
+from intrasplat.stereo.turn import AnyImage, EyeRotation, Rgb
 
 USUAL_TURN_RAD = 0.01
 """Deviation of a turn or zoom that is expected before anything is measured: holds back what matches hardly tell."""
@@ -86,7 +86,7 @@ class Registration:
 
     calibrated: Intrinsics
     baseline_mm: float
-    turn: Turn = field(default_factory=Turn)
+    turn: EyeRotation = field(default_factory=EyeRotation)
     colours: Colours = field(default_factory=Colours)
     matches: int = 0
     residual_px: float = 0.0
@@ -98,7 +98,7 @@ class Registration:
         """The coarse turn, from features [M, 4]; none where measure_row_shift found too few."""
         if shift.matches == 0:
             return cls(calibrated, baseline_mm)
-        turn = Turn(shift.shift_px)
+        turn = EyeRotation(shift.shift_px)
         if shift.matches >= MIN_TURN_MATCHES:
             turn = turn_of_matches(matches, shift.shift_px, calibrated)
         return cls(calibrated, baseline_mm, turn, Colours(), shift.matches, _residual_px(matches, turn, calibrated))
@@ -222,16 +222,16 @@ class Registration:
         return tuple(Notice.warning(NoticeCode.EYES_DISAGREE, text) for text in found)
 
 
-def turn_of_matches(matches: NDArray[np.float64], lower_px: float, camera: Intrinsics) -> Turn:
+def turn_of_matches(matches: NDArray[np.float64], lower_px: float, camera: Intrinsics) -> EyeRotation:
     """The turn that puts matches [M, 4] (x_left, y_left, x_right, y_right) on equal rows, from a start for lower_px."""
     numbers = np.array([lower_px, 0.0, 0.0, 0.0, 0.0])
     for within_px in COARSE_WITHIN_PX:
-        x, y = _rectified_places(matches, Turn(*numbers.tolist()), camera).T
+        x, y = _rectified_places(matches, EyeRotation(*numbers.tolist()), camera).T
         dy = y - matches[:, 1]
         kept = np.abs(dy) < within_px
         if kept.any():
             numbers = numbers + _step(_slopes(x, y, camera)[:, kept], dy[kept], numbers)
-    return Turn(*numbers.tolist())
+    return EyeRotation(*numbers.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,9 @@ class MatchedPair:
         return np.asarray(moved, np.float32)
 
 
-def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsics, each: Map = map) -> Turn:
+def turn_of_pictures(
+    pairs: Sequence[MatchedPair], turn: EyeRotation, camera: Intrinsics, each: Map = map
+) -> EyeRotation:
     """A finer turn, from pairs that were rectified by `turn`: after matching along rows only rows are left to fit.
 
     One step of Gauss and Newton is repeated FINE_STEPS times on pictures without their coarse brightness.
@@ -275,9 +277,9 @@ def turn_of_pictures(pairs: Sequence[MatchedPair], turn: Turn, camera: Intrinsic
         if len(missing) < MIN_SAMPLE:
             return turn
         numbers = numbers + _step(slopes, missing, numbers)
-    if Turn(*numbers.tolist()).moved_px(camera) > MAX_FINE_PX * max(camera.width / FEATURE_WIDTH, 1.0):
+    if EyeRotation(*numbers.tolist()).moved_px(camera) > MAX_FINE_PX * max(camera.width / FEATURE_WIDTH, 1.0):
         return turn
-    return Turn(*(np.array(astuple(turn)) + numbers).tolist())
+    return EyeRotation(*(np.array(astuple(turn)) + numbers).tolist())
 
 
 def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
@@ -292,13 +294,13 @@ def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
     return Colours(gain, offset, min(correlation))
 
 
-def _rectified_places(matches: NDArray[np.float64], turn: Turn, camera: Intrinsics) -> NDArray[np.float64]:
+def _rectified_places(matches: NDArray[np.float64], turn: EyeRotation, camera: Intrinsics) -> NDArray[np.float64]:
     """[M, 2] x, y of the right eye's features in the rectified picture."""
     places = cv2.perspectiveTransform(matches[:, None, 2:] - 0.5, np.linalg.inv(turn.from_rectified(camera)))
     return np.asarray(places[:, 0] + 0.5, np.float64)
 
 
-def _residual_px(matches: NDArray[np.float64], turn: Turn, camera: Intrinsics) -> float:
+def _residual_px(matches: NDArray[np.float64], turn: EyeRotation, camera: Intrinsics) -> float:
     """Median |dy| of the matches [M, 4] near their rows."""
     off_px = np.abs(_rectified_places(matches, turn, camera)[:, 1] - matches[:, 1])
     near = off_px[off_px < COARSE_WITHIN_PX[-1]]

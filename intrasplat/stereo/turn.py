@@ -24,7 +24,7 @@ MIN_MOVED_PX = 0.5  # by less, no whole pixel moves
 
 
 @dataclass(frozen=True)
-class Turn:
+class EyeRotation:
     """The right eye's camera against the calibrated one. Its principal point keeps its column, which depth was made of.
 
     lower_px     rows by which its picture lies lower than the left one's
@@ -84,15 +84,15 @@ class Turn:
 
 
 @lru_cache(16)  # the frames of a clip have one turn
-def _from_rectified(turn: Turn, calibrated: Intrinsics) -> NDArray[np.float64]:
+def _from_rectified(turn: EyeRotation, calibrated: Intrinsics) -> NDArray[np.float64]:
     matrix = _matrix(turn.camera(calibrated)) @ turn.rotation.T @ np.linalg.inv(_matrix(calibrated))
     matrix.flags.writeable = False
     return matrix
 
 
 @lru_cache(16)
-def _moved_px(turn: Turn, calibrated: Intrinsics) -> float:
-    if turn == Turn():
+def _moved_px(turn: EyeRotation, calibrated: Intrinsics) -> float:
+    if turn == EyeRotation():
         return 0.0
     x, y = (np.array([0, 0.5, 1]) * side for side in (calibrated.width, calibrated.height))
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
@@ -101,7 +101,7 @@ def _moved_px(turn: Turn, calibrated: Intrinsics) -> float:
 
 
 @lru_cache(1)
-def _depth_factor(turn: Turn, calibrated: Intrinsics) -> NDArray[np.float32]:
+def _depth_factor(turn: EyeRotation, calibrated: Intrinsics) -> NDArray[np.float32]:
     a, b, c = turn.from_rectified(calibrated)[2]
     x, y = np.arange(calibrated.width), np.arange(calibrated.height)[:, None]
     factor = np.asarray(a * x + b * y + c, np.float32)

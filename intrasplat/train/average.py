@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from intrasplat.train.aside import Aside
+from intrasplat.train.tensor_copy import Aside
 
 PREFIX = "average."
 

@@ -14,7 +14,7 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.fusion import FusionSettings, PointCloud, nearest_pixels
 from intrasplat.methods.method import Preset
-from intrasplat.motion.capacity import MAX_POINTS, Trials, choose_bases, choose_stride, mean_floor_error, try_bases
+from intrasplat.motion.capacity import MAX_POINTS, BasisTrials, choose_bases, choose_stride, mean_floor_error, try_bases
 from intrasplat.motion.tracks import GUESSED, Tracks, fit_tracks
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.scene.compact import MAX_WEIGHTS
@@ -55,7 +55,7 @@ def settled(
     """
     notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
-    trials = Trials({})
+    trials = BasisTrials({})
     if tracks and left_open:
         trials = try_bases(tracks, clip, train, basis_values, preset.max_bases)
     fusion = fusion_for(preset, clip.intrinsics)

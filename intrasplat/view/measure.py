@@ -51,7 +51,7 @@ LEAST_KEPT_TRUST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class MeasuredPlace:
     """What one pixel shows.
 
     point_mm        [3] in the world
@@ -83,7 +83,7 @@ def places_at(
     camera: Intrinsics,
     points: Sequence[tuple[float, float]],
     device: Device = CPU,
-) -> list[Place]:
+) -> list[MeasuredPlace]:
     """What the pixels that cover the points (x, y) of a view show at model time t; pose None: the endoscope's.
 
     Raises:
@@ -113,7 +113,7 @@ class _View:
     own_pose: NDArray[np.float64]
     device: Device
 
-    def place(self, x: float, y: float) -> Place:
+    def place(self, x: float, y: float) -> MeasuredPlace:
         """What the pixel shows that covers (x, y)."""
         camera, scene = self.camera, self.scene
         window, i, j = _window(camera, x, y)
@@ -135,7 +135,7 @@ class _View:
             own_depth_mm = depth_mm
         sigma_mm = uncertainty_mm(scene, own_depth_mm, spread_mm, likely)
         unseen = bool(unseen_pixels(missing_pixels(solid, blended), camera.width)[i, j])
-        return Place(point_mm, ray, depth_mm, own_depth_mm, sigma_mm, likely, unseen, gaussians, shares)
+        return MeasuredPlace(point_mm, ray, depth_mm, own_depth_mm, sigma_mm, likely, unseen, gaussians, shares)
 
     def _ray(self, x: float, y: float) -> NDArray[np.float64]:
         """[3] in the world, of length 1 along the camera's z."""
@@ -209,7 +209,9 @@ class Distances:
     paths_mm: NDArray[np.float64]
 
 
-def distances(scene: TrainedScene, t: float, first: Place, second: Place, device: Device = CPU) -> Distances:
+def distances(
+    scene: TrainedScene, t: float, first: MeasuredPlace, second: MeasuredPlace, device: Device = CPU
+) -> Distances:
     """How far two places are apart, chosen at model time t, at that time and at every frame."""
     both = (first, second)
     ways, apart_mm = zip(*(_ways(scene, t, each) for each in both), strict=True)
@@ -238,7 +240,7 @@ def _apart(
     return length_mm, np.sqrt(np.minimum(along + across, every))
 
 
-def _ways(scene: TrainedScene, t: float, place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ways(scene: TrainedScene, t: float, place: MeasuredPlace) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """[T, 3] how far a place has gone at every frame, in mm, and [T] by how much the ways of its Gaussians differ: the
     root of their mean squared distance from that.
     """
@@ -256,7 +258,7 @@ def _ways(scene: TrainedScene, t: float, place: Place) -> tuple[NDArray[np.float
     return way, np.sqrt(np.einsum("m,tmc->t", place.shares, (ways - way[:, None]) ** 2))
 
 
-def _kept_trust(scene: TrainedScene, place: Place, device: Device) -> NDArray[np.float64]:
+def _kept_trust(scene: TrainedScene, place: MeasuredPlace, device: Device) -> NDArray[np.float64]:
     """[T] how much of the trust in a place is left at every frame, of 1 where the endoscope has it in view."""
     renderer, seen = renderer_of(scene, device), scene.seen.numpy()[place.gaussians]
     whole = max(float(place.shares @ seen), 1e-9)

@@ -10,7 +10,7 @@ from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, P
 from intrasplat.notices import Notice
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
-from intrasplat.view.measure import MIN_CONFIDENCE, Distances, Place, distances, places_at
+from intrasplat.view.measure import MIN_CONFIDENCE, Distances, MeasuredPlace, distances, places_at
 from intrasplat.view.render import held_in_clip, renderer_of
 
 OTHER_PLACE = "Choose another place or another moment."
@@ -46,7 +46,7 @@ def measured(
     return Measurement(t=shown, points=told, distance=distance, depth_range_mm=range_mm, warnings=warnings)
 
 
-def _point(number: int, point: Point, place: Place, camera: Intrinsics) -> MeasuredPoint:
+def _point(number: int, point: Point, place: MeasuredPlace, camera: Intrinsics) -> MeasuredPoint:
     refusal = _refusal(f"points[{number}]", place)
     likely = round(place.confidence, DIGITS)
     if refusal is not None:
@@ -62,7 +62,7 @@ def _point(number: int, point: Point, place: Place, camera: Intrinsics) -> Measu
     )
 
 
-def _refusal(field: str, place: Place) -> Refusal | None:
+def _refusal(field: str, place: MeasuredPlace) -> Refusal | None:
     if place.unseen:
         problem = "No frame of the clip saw what is shown here."
         return Refusal(code=RefusalCode.UNSEEN, field=field, problem=problem, remedy=OTHER_PLACE)

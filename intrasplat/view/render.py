@@ -26,7 +26,7 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.layout import COLOUR_ROW
 from intrasplat.splat.metrics import COVERED_ALPHA
-from intrasplat.splat.model import Projected
+from intrasplat.splat.model import ProjectedPicture
 from intrasplat.train.hooks import RenderedFrame
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 from intrasplat.view.camera import endoscope_pose, view_camera
@@ -87,7 +87,7 @@ class SceneRenderer:
         intrinsics: Intrinsics,
         *,
         highlights: bool = True,
-    ) -> Iterator[Projected]:
+    ) -> Iterator[ProjectedPicture]:
         """R G B Z A, and as sixth plane blended_values if they are known, to be sorted and blended in bands.
 
         Other pictures of the scene may be rendered meanwhile.
@@ -190,7 +190,7 @@ class ViewRequest:
         own = self.scene.intrinsics
         return Lenses.of(self.intrinsics or own, own, self.max_pixels, is_coarse=self.is_coarse)
 
-    def projected(self, pose: NDArray[np.float64], lens: Intrinsics) -> AbstractContextManager[Projected]:
+    def projected(self, pose: NDArray[np.float64], lens: Intrinsics) -> AbstractContextManager[ProjectedPicture]:
         """The scene at that time, from a pose through a lens, to be blended (SceneRenderer.projected)."""
         renderer = renderer_of(self.scene, self.device)
         return renderer.projected(self.shown_t, pose, lens, highlights=self.highlights)

@@ -32,7 +32,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
-from intrasplat.view.measure import DISPARITY_PX, MIN_CONFIDENCE, Place, distances, places_at, uncertainty_mm
+from intrasplat.view.measure import DISPARITY_PX, MIN_CONFIDENCE, MeasuredPlace, distances, places_at, uncertainty_mm
 from lab.evaluate.rows import commit, machine, write_rows
 from lab.evaluate.sources import open_source, source_of
 from lab.phantom import Phantom
@@ -79,7 +79,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenPoint:
     """The places of one view that are not refused; which of all points they are, and the truth of these.
 
     depth_mm [P], paths_mm [T, P, 3]
@@ -87,7 +87,7 @@ class Seen:
 
     frame: int
     asked: int
-    places: list[Place]
+    places: list[MeasuredPlace]
     depth_mm: NDArray[np.float64]
     paths_mm: NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def trained(clip: str, scenes: Path) -> tuple[TrainedScene, Phantom]:
     return load_scene(folder), opened.phantom
 
 
-def views(scene: TrainedScene, phantom: Phantom) -> Iterator[Seen]:
+def views(scene: TrainedScene, phantom: Phantom) -> Iterator[SeenPoint]:
     """What is measured: points of a grid in views of several frames and poses."""
     median_mm = MEDIAN_DEPTH_UNITS / scene.units_per_mm
     for frame in SHOWN_FRAMES:
@@ -115,10 +115,10 @@ def views(scene: TrainedScene, phantom: Phantom) -> Iterator[Seen]:
             stands = phantom.world_from_camera(frame) if pose is None else pose
             depth_mm = (truth.points_mm[frame] - stands[:3, 3]) @ stands[:3, 2]
             kept = [n for n, each in enumerate(places) if not each.unseen and each.confidence >= MIN_CONFIDENCE]
-            yield Seen(frame, len(places), [places[n] for n in kept], depth_mm[kept], truth.points_mm[:, kept])
+            yield SeenPoint(frame, len(places), [places[n] for n in kept], depth_mm[kept], truth.points_mm[:, kept])
 
 
-def row_of(clip: str, seen: list[Seen], scene: TrainedScene) -> Row:
+def row_of(clip: str, seen: list[SeenPoint], scene: TrainedScene) -> Row:
     """Of each view, points are joined in pairs by chance."""
     rng, errors, sigmas = np.random.default_rng(0), [], []
     for view in seen:
@@ -150,7 +150,7 @@ def row_of(clip: str, seen: list[Seen], scene: TrainedScene) -> Row:
     )
 
 
-def depths_of(seen: list[Seen]) -> NDArray[np.float64]:
+def depths_of(seen: list[SeenPoint]) -> NDArray[np.float64]:
     return np.array([each.depth_mm for view in seen for each in view.places])
 
 
@@ -178,7 +178,7 @@ def fit(scenes: Path) -> None:
     print("DISPARITY_PX", round(float(found[0]), 3), "factor of the spread", round(float(found[1]), 2))
 
 
-def parts_of(scene: TrainedScene, seen: list[Seen]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def parts_of(scene: TrainedScene, seen: list[SeenPoint]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The uncertainties of all places that a pixel of disparity alone and the spread alone would give."""
     places = [each for view in seen for each in view.places]
     both = np.array([each.uncertainty_mm for each in places])

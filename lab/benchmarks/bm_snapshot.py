@@ -39,7 +39,7 @@ from intrasplat.train.prepare import prepare
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.train.setup import Setup
 from lab.phantom import PhantomSettings, make_phantom
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.reply import NotYetError
 from worker.snapshot import Snapshots
 from worker.views import Views
@@ -68,10 +68,10 @@ def main() -> None:
     clip = make_phantom(CLIP).depth_clip()
     compile_kernels()
     trained(clip, 10, None)  # the first run reads what the others find in caches
-    paces: dict[str, Callable[[], Pace] | None] = {
+    paces: dict[str, Callable[[], RenderPace] | None] = {
         "alone": None,
         "unpaced": _Unpaced,
-        "paced": lambda: Pace(thread_count(), used_s=time.process_time),
+        "paced": lambda: RenderPace(thread_count(), used_s=time.process_time),
     }
     runs: dict[str, list[Figures]] = {name: [] for name in paces}
     for _ in range(arguments.rounds):
@@ -81,7 +81,7 @@ def main() -> None:
         print(line_of(name, figures), flush=True)
 
 
-class _Unpaced(Pace):
+class _Unpaced(RenderPace):
     """Lets every view begin at once."""
 
     def rest_s(self) -> float:
@@ -103,7 +103,7 @@ def line_of(name: str, runs: list[Figures]) -> str:
     return line
 
 
-def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
+def trained(clip: DepthClip, iterations: int, pace: RenderPace | None) -> Figures:
     """One training run, with a viewer if there is a pace for one."""
     split = split_frames(clip)
     options = ReconstructionOptions(iterations=iterations)
@@ -131,7 +131,7 @@ def trained(clip: DepthClip, iterations: int, pace: Pace | None) -> Figures:
     return figures
 
 
-def watch(snapshots: Snapshots, pace: Pace, figures: Figures, began: float, end: threading.Event) -> None:
+def watch(snapshots: Snapshots, pace: RenderPace, figures: Figures, began: float, end: threading.Event) -> None:
     """Ask for one view after the other, and rest in between as a worker does."""
     with tempfile.TemporaryDirectory() as folder:
         views = Views(Store(Path(folder)), snapshots)

@@ -42,7 +42,7 @@ LOOK = (
 
 
 @dataclass(frozen=True)
-class Part:
+class CheckPart:
     """A part: its program, and its seconds, to which those are added that earlier parts did not use."""
 
     name: str
@@ -59,7 +59,7 @@ class Part:
         return [out / f"gpu-{name}.csv" for name in names]
 
 
-PARTS = (Part("correct", 140), Part("speed", 115), Part("train", 160))
+PARTS = (CheckPart("correct", 140), CheckPart("speed", 115), CheckPart("train", 160))
 
 
 def main() -> int:
@@ -138,7 +138,7 @@ def environment(work: Path, interpret: bool) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"} | own
 
 
-def run_parts(parts: list[Part], options: list[str], variables: dict[str, str]) -> list[str]:
+def run_parts(parts: list[CheckPart], options: list[str], variables: dict[str, str]) -> list[str]:
     """Run the parts one after the other while prepare.py runs; returns what failed, in words."""
     failures, doubt, deadline = [], "", time.time()
     prepare = [

@@ -58,7 +58,7 @@ def main() -> None:
     except RuntimeError as error:
         sys.exit(f"  nothing to train on: {error}")
     clip = load_clip(part.work / CLIP, told["camera"])  # type: ignore[arg-type]
-    trials = Trials(part, str(told["name"]), clip)
+    trials = TimedRuns(part, str(told["name"]), clip)
     device = Device("cuda", str(part.origin["gpu"]), part.device)
     if part.interpret:
         trials.run(_tiny("paper"), device, 0, iterations=2)
@@ -87,7 +87,7 @@ def _tiny(name: str) -> Preset:
     return dataclasses.replace(PRESETS[name], tracks=False, bases=2, points_per_image=9, points_by_budget=False)
 
 
-class Trials:
+class TimedRuns:
     """Runs on one clip; what `paper` ended with sets the thresholds, its own and those of the runs after it."""
 
     def __init__(self, part: Part, name: str, clip: DepthClip) -> None:

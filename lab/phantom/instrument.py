@@ -38,7 +38,7 @@ BLACK = np.array([0.020, 0.020, 0.022])
 
 
 @dataclass(frozen=True)
-class Look:
+class InstrumentLook:
     """Albedo [3], linear, of an instrument's parts, and how strongly jaws, wrist and shaft mirror the lamp.
 
     collar  the shaft's end beside the wrist
@@ -53,11 +53,11 @@ class Look:
     glints: tuple[float, float, float]
 
 
-LOOKS: dict[Tool, Look] = {
-    "grasper": Look(STEEL, STEEL, BRASS, 0.7 * STEEL, SHAFT_GREY, (0.9, 0.8, 0.12)),
-    "steel": Look(STEEL, STEEL, 0.8 * STEEL, STEEL, 0.75 * STEEL, (0.9, 0.8, 0.6)),
-    "yellow": Look(0.8 * STEEL, YELLOW, BLACK, YELLOW, BLACK, (0.9, 0.7, 0.35)),
-    "dark": Look(3 * BLACK, 2 * BLACK, BLACK, 2 * BLACK, BLACK, (0.5, 0.5, 0.4)),
+LOOKS: dict[Tool, InstrumentLook] = {
+    "grasper": InstrumentLook(STEEL, STEEL, BRASS, 0.7 * STEEL, SHAFT_GREY, (0.9, 0.8, 0.12)),
+    "steel": InstrumentLook(STEEL, STEEL, 0.8 * STEEL, STEEL, 0.75 * STEEL, (0.9, 0.8, 0.6)),
+    "yellow": InstrumentLook(0.8 * STEEL, YELLOW, BLACK, YELLOW, BLACK, (0.9, 0.7, 0.35)),
+    "dark": InstrumentLook(3 * BLACK, 2 * BLACK, BLACK, 2 * BLACK, BLACK, (0.5, 0.5, 0.4)),
 }
 
 
@@ -83,7 +83,9 @@ def instruments_at(surface: Surface, frame: float, settings: PhantomSettings) ->
     return meshes
 
 
-def _placed(look: Look, tip: NDArray[np.float64], opening: float, port: NDArray[np.float64]) -> InstrumentMesh:
+def _placed(
+    look: InstrumentLook, tip: NDArray[np.float64], opening: float, port: NDArray[np.float64]
+) -> InstrumentMesh:
     """An instrument that goes from its port to its tip [3], world."""
     parts = [*_jaws(opening, look), _wrist(look), _shaft(look)]
     rotation = _rotation_along(port - tip)
@@ -143,7 +145,7 @@ def _visit(surface: Surface, frame: float, settings: PhantomSettings, place: int
     return tip + away_mm * (PORTS_MM[place] - tip) / np.linalg.norm(PORTS_MM[place] - tip), opening
 
 
-def _jaws(opening_rad: float, look: Look) -> list[tuple[Vertices, Vertices, float]]:
+def _jaws(opening_rad: float, look: InstrumentLook) -> list[tuple[Vertices, Vertices, float]]:
     """Two tapered jaws that turn about their root."""
     jaws = []
     along = np.linspace(0, 1, 48)
@@ -161,7 +163,7 @@ def _jaws(opening_rad: float, look: Look) -> list[tuple[Vertices, Vertices, floa
     return jaws
 
 
-def _wrist(look: Look) -> tuple[Vertices, Vertices, float]:
+def _wrist(look: InstrumentLook) -> tuple[Vertices, Vertices, float]:
     z = np.linspace(JAW_MM - 1.5, WRIST_MM, 90)
     along = (z - z[0]) / np.ptp(z)
     clevis = np.where(along < 0.45, 0.72 + 0.2 * np.sin(along / 0.45 * np.pi), 1.0)
@@ -173,7 +175,7 @@ def _wrist(look: Look) -> tuple[Vertices, Vertices, float]:
     return _lathe(z, radius, radius * np.where(along < 0.45, 0.75, 1.0)), colour, look.glints[1]
 
 
-def _shaft(look: Look) -> tuple[Vertices, Vertices, float]:
+def _shaft(look: InstrumentLook) -> tuple[Vertices, Vertices, float]:
     z = np.concatenate([[WRIST_MM - 0.8], np.linspace(WRIST_MM, SHAFT_MM, 120)])
     radius = np.full(z.size, SHAFT_RADIUS_MM)
     radius[0] = WRIST_RADIUS_MM

@@ -55,7 +55,7 @@ from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
 from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.reply import Reply
 from worker.serve import RequestServer
 
@@ -169,7 +169,7 @@ class Painter:
 class Site:
     """A service with its page on a port that stays; queue, store and worker outlive it."""
 
-    def __init__(self, data_dir: Path, endpoint: str, painter: Painter, pace: Pace, **changes: Any) -> None:
+    def __init__(self, data_dir: Path, endpoint: str, painter: Painter, pace: RenderPace, **changes: Any) -> None:
         self.queue, self.store, self.painter, self.pace = MemoryQueue(), Store(data_dir), painter, pace
         self._endpoint = endpoint
         with contextlib.closing(socket.socket()) as probe:
@@ -251,7 +251,7 @@ def site_at(data_dir: Path, answer: Callable[[SceneRequest], Reply] | None = Non
     """A site; answer: of its worker, the painter's if it is left out."""
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
-    pace = Pace()
+    pace = RenderPace()
     with RequestServer(endpoint, at_once(answer or painter.answer, pace, max_wait_s=MAX_WAIT_S)):
         site = Site(data_dir, endpoint, painter, pace, **changes)
         try:

@@ -7,12 +7,12 @@ from pathlib import Path
 from client.doctor import OPTIONAL_PACKAGES, PACKAGES, server_findings
 from contract.runtime.settings import Settings
 from intrasplat.commands.doctor import PACKAGES as PACKAGES_OF_LIBRARY
-from intrasplat.commands.doctor import Finding
+from intrasplat.commands.doctor import Diagnosis
 from tests.contract.queues import RunningServer, valkey_binary
 from tests.test_repository import project, requirement_name
 
 
-def found(settings: Settings) -> dict[str, Finding]:
+def found(settings: Settings) -> dict[str, Diagnosis]:
     return {finding.topic: finding for finding in server_findings(settings)}
 
 

@@ -32,7 +32,7 @@ from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, r
 from worker.channel import Channel, Task
 from worker.device import obey
 from worker.orders import Failed, Finished, RunJob, Scored, ScoreScene
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.snapshot import Snapshots
 
 
@@ -61,7 +61,7 @@ def worked_off(service: ServiceUnderTest) -> list[object]:
     record, claim = service.claimed()
     out, told = service.store.work_folder(record.job_id, record.attempt), Told()
     order = RunJob(record=record, spool=service.store.fetch_clip(record.job_id), out=out, kept=out)
-    obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), Pace(), told)
+    obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), RenderPace(), told)
     for report in told.reports:
         if isinstance(report, Finished):
             service.store.publish_scene(record.job_id, record.attempt)
@@ -298,12 +298,12 @@ def test_a_scene_whose_worker_died_before_it_told_the_scores_has_them(
     store = service.store
     out, told = store.work_folder(record.job_id, record.attempt), Told()
     order = RunJob(record=record, spool=store.fetch_clip(record.job_id), out=out, kept=out)
-    obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), Pace(), told)
+    obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), RenderPace(), told)
     folder = store.publish_scene(record.job_id, record.attempt)
     assert service.queue.finish(claim)
     later = Told()
     score = ScoreScene(record=record, spool=order.spool, scene=folder)
-    obey(Task(score), Settings(data_dir=service.store.data_dir), Snapshots(), Pace(), later)
+    obey(Task(score), Settings(data_dir=service.store.data_dir), Snapshots(), RenderPace(), later)
     assert later.reports == [told.reports[-1]]
     assert Report.model_validate(service.http.get(f"/scenes/{job['id']}").json()).scored
     assert REPORT in {path.name for path in folder.iterdir()}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from contract.queue.interface import MAX_LISTED, Place
+from contract.queue.interface import MAX_LISTED, ListingPosition
 from contract.wire.job import JobRecord
 from contract.wire.rendering import WorkerAddress
 from intrasplat.errors import UnavailableError
@@ -26,7 +26,7 @@ class LeavingQueue(MemoryQueue):
         return super().get(job_id)
 
     def records(
-        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: Place | None = None
+        self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: ListingPosition | None = None
     ) -> list[JobRecord]:
         self._stay()
         return super().records(tenant, limit, before)

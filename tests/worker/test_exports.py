@@ -14,7 +14,7 @@ from contract.store.store import Store
 from contract.wire.rendering import ExportRequest, WorkerReply, WorkerRequest
 from intrasplat.errors import SceneError, UnavailableError
 from intrasplat.export import EXPORTS, export_parts
-from intrasplat.export.target import Target
+from intrasplat.export.target import ExportTarget
 from intrasplat.scene.checkpoint import save_scene
 from tests.answers import at_once
 from tests.intrasplat.scenes import random_scene
@@ -28,7 +28,7 @@ from worker.views import Views
 GAUSSIANS = 11
 
 
-def points_as_text(target: Target) -> Iterator[bytes]:
+def points_as_text(target: ExportTarget) -> Iterator[bytes]:
     """A toy format: one line of x, y and z for each Gaussian."""
     mean = target.scene.deformation.deform(target.scene.gaussians, target.t).mean / target.scene.units_per_mm
     yield "".join("{:.3f} {:.3f} {:.3f}\n".format(*row) for row in mean.tolist()).encode()

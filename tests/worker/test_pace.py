@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from worker.pace import MAX_SAVED_S, MIN_USE, SHARE, Pace
+from worker.pace import MAX_SAVED_S, MIN_USE, SHARE, RenderPace
 
 VIEW_S = 0.05
 ROUNDING_S = 1e-9
@@ -20,7 +20,7 @@ class Clock:
         return self.now_s
 
 
-def views_within(seconds: float, view_s: float, clock: Clock, pace: Pace) -> int:
+def views_within(seconds: float, view_s: float, clock: Clock, pace: RenderPace) -> int:
     """How many are made by somebody who asks without pause."""
     end_s, made = clock.now_s + seconds, 0
     while clock.now_s < end_s:
@@ -36,7 +36,7 @@ def views_within(seconds: float, view_s: float, clock: Clock, pace: Pace) -> int
 @pytest.mark.parametrize("view_s", [0.004, 0.05, 2.0])
 def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(view_s: float) -> None:
     clock = Clock()
-    pace, seconds = Pace(clock=clock), 100.0
+    pace, seconds = RenderPace(clock=clock), 100.0
     with pace.training():
         spent_s = view_s * views_within(seconds, view_s, clock, pace)
     assert spent_s == pytest.approx(SHARE * seconds + MAX_SAVED_S, abs=2 * view_s)
@@ -44,7 +44,7 @@ def test_views_without_pause_take_their_share_of_the_time_and_what_was_saved(vie
 
 def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
     clock = Clock()
-    pace = Pace(clock=clock)
+    pace = RenderPace(clock=clock)
     with pace.training():
         for _ in range(3):
             assert pace.rest_s() == 0.0
@@ -56,7 +56,7 @@ def test_a_lone_view_is_made_at_once_and_the_next_after_a_rest() -> None:
 
 def test_a_debt_with_a_limit_is_paid_within_that_limit_however_long_a_view_took() -> None:
     clock = Clock()
-    pace = Pace(clock=clock, max_debt_s=0.5 * SHARE)
+    pace = RenderPace(clock=clock, max_debt_s=0.5 * SHARE)
     with pace.training():
         clock.now_s += 13.0
         pace.charge(13.0)
@@ -67,14 +67,14 @@ def test_a_debt_with_a_limit_is_paid_within_that_limit_however_long_a_view_took(
 
 def test_with_a_limited_debt_long_views_rest_as_long_as_it_allows() -> None:
     clock = Clock()
-    pace = Pace(clock=clock, max_debt_s=0.5 * SHARE)
+    pace = RenderPace(clock=clock, max_debt_s=0.5 * SHARE)
     with pace.training():
         assert views_within(100.0, 1.0, clock, pace) == pytest.approx(100 / 1.5, abs=2)
 
 
 def test_renders_are_not_rationed_while_nothing_trains() -> None:
     clock = Clock()
-    pace = Pace(clock=clock)
+    pace = RenderPace(clock=clock)
     with pace.training():
         views_within(1.0, VIEW_S, clock, pace)
     assert views_within(1.0, VIEW_S, clock, pace) == pytest.approx(1.0 / VIEW_S, abs=1)
@@ -82,7 +82,7 @@ def test_renders_are_not_rationed_while_nothing_trains() -> None:
 
 def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it() -> None:
     clock = Clock()
-    pace = Pace(clock=clock)
+    pace = RenderPace(clock=clock)
     views_within(5.0, VIEW_S, clock, pace)
     with pace.training():
         assert pace.rest_s() == 0.0
@@ -90,7 +90,7 @@ def test_what_was_rendered_before_a_job_is_not_held_against_those_who_watch_it()
 
 def test_rations_end_with_a_job_that_fails() -> None:
     clock = Clock()
-    pace = Pace(clock=clock)
+    pace = RenderPace(clock=clock)
 
     def fail() -> None:
         with pace.training():
@@ -104,7 +104,7 @@ def test_rations_end_with_a_job_that_fails() -> None:
 
 def test_every_core_gives_its_share_and_waiting_for_one_costs_nothing() -> None:
     clock = Clock()
-    pace = Pace(4, clock)
+    pace = RenderPace(4, clock)
     assert pace.rate == 4
     with pace.training():
         assert pace.rate == pytest.approx(4 * SHARE)
@@ -117,7 +117,7 @@ def test_every_core_gives_its_share_and_waiting_for_one_costs_nothing() -> None:
 
 def test_where_training_gets_less_of_the_cores_renders_do_too_but_never_nothing() -> None:
     clock, used_s = Clock(), [0.0]
-    pace = Pace(2, clock, lambda: used_s[0])
+    pace = RenderPace(2, clock, lambda: used_s[0])
     with pace.training():
         pace.charge(MAX_SAVED_S + 1.0)
         for _ in range(10):
@@ -131,7 +131,7 @@ def test_where_training_gets_less_of_the_cores_renders_do_too_but_never_nothing(
 
 def test_after_a_rest_one_large_view_can_be_made_in_full() -> None:
     clock = Clock()
-    pace = Pace(clock=clock)
+    pace = RenderPace(clock=clock)
     with pace.training():
         assert pace.affords(MAX_SAVED_S)
         assert pace.affords(10 * MAX_SAVED_S)

@@ -11,10 +11,10 @@ import pytest
 from contract.wire.rendering import RenderRequest
 from intrasplat.machine.parts import Parts
 from intrasplat.picture import ImageFormat
-from worker.pace import MAX_SAVED_S, SHARE, Pace
+from worker.pace import MAX_SAVED_S, SHARE, RenderPace
 from worker.reply import Reply
+from worker.request_queue import FIRST_SPEEDS
 from worker.scheduler import MIN_CHARGE_S, Answered, Scheduler
-from worker.turns import FIRST_SPEEDS
 
 SCENE = "0" * 32
 PART_S = 1.0
@@ -38,8 +38,8 @@ class Studio:
     made: t of each part, in the order in which they were made. left: t of each answer that ended, made or abandoned.
     """
 
-    def __init__(self, pace: Pace | None = None, **settings: Any) -> None:
-        self.pace = pace or Pace(clock=Clock())
+    def __init__(self, pace: RenderPace | None = None, **settings: Any) -> None:
+        self.pace = pace or RenderPace(clock=Clock())
         settings |= {
             "cost": lambda request: request.t * FIRST_SPEEDS[0],
             "within": self.within,
@@ -173,7 +173,7 @@ def test_who_asks_the_same_while_it_is_made_shares_the_answer() -> None:
 
 def test_each_part_is_charged_when_it_is_made_and_the_next_waits_until_the_debt_is_paid() -> None:
     clock = Clock()
-    studio = Studio(Pace(clock=clock))
+    studio = Studio(RenderPace(clock=clock))
     with studio.pace.training():
         studio.ask(1.5, image_format=ImageFormat.PNG)
         assert studio.scheduler.advance() is None
@@ -188,7 +188,7 @@ def test_each_part_is_charged_when_it_is_made_and_the_next_waits_until_the_debt_
 
 def test_an_answer_that_costs_nothing_is_charged_the_least_once_for_each_caller() -> None:
     clock = Clock()
-    studio = Studio(Pace(clock=clock))
+    studio = Studio(RenderPace(clock=clock))
     with studio.pace.training():
         studio.ask(0.0, number=1)
         studio.ask(0.0, number=2)
@@ -199,7 +199,7 @@ def test_an_answer_that_costs_nothing_is_charged_the_least_once_for_each_caller(
 
 def test_a_small_answer_that_is_made_between_parts_waits_for_the_pace_too() -> None:
     clock = Clock()
-    studio = Studio(Pace(clock=clock))
+    studio = Studio(RenderPace(clock=clock))
     with studio.pace.training():
         studio.ask(4.0)
         studio.scheduler.advance()

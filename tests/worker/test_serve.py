@@ -21,11 +21,11 @@ from intrasplat.errors import InputError, SceneError, UnavailableError
 from intrasplat.machine.parts import Parts
 from tests.answers import at_once
 from tests.reports import a_warning
-from worker.pace import MAX_SAVED_S, SHARE, Pace
+from worker.pace import MAX_SAVED_S, SHARE, RenderPace
 from worker.reply import NotYetError, Reply
+from worker.request_queue import FIRST_SPEEDS
 from worker.scheduler import Scheduler
 from worker.serve import MAX_REQUEST_BYTES, RequestServer
-from worker.turns import FIRST_SPEEDS
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
@@ -209,7 +209,7 @@ def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
 
 
 def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
-    pace = Pace()
+    pace = RenderPace()
     with RequestServer(endpoint, at_once(answer, pace)), connected(endpoint) as socket, pace.training():
         pace.charge(MAX_SAVED_S + 0.1 * SHARE)
         start_s = time.monotonic()
@@ -221,7 +221,7 @@ class Studio:
     """Renders whose cost is their t, each in parts that are made when they are let go."""
 
     def __init__(self, endpoint: str) -> None:
-        scheduler = Scheduler(self.answer, Pace(), cost=lambda each: each.t * FIRST_SPEEDS[0], max_wait_s=40.0)
+        scheduler = Scheduler(self.answer, RenderPace(), cost=lambda each: each.t * FIRST_SPEEDS[0], max_wait_s=40.0)
         self.server = RequestServer(endpoint, scheduler)
         self.begun: list[float] = []
         self.has_begun = threading.Event()
@@ -316,7 +316,7 @@ def test_a_server_that_ends_abandons_the_answer_that_is_being_made(endpoint: str
         finally:
             ended.set()
 
-    with RequestServer(endpoint, Scheduler(answer_slowly, Pace())), connected(endpoint) as socket:
+    with RequestServer(endpoint, Scheduler(answer_slowly, RenderPace())), connected(endpoint) as socket:
         socket.send_multipart([b"1", request(0.5)])
         time.sleep(0.1)
     assert ended.is_set()

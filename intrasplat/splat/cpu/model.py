@@ -38,7 +38,7 @@ from intrasplat.splat.layout import (
     SIDE,
 )
 from intrasplat.splat.loss import LossSettings
-from intrasplat.splat.model import Projected, bands_of, put_back
+from intrasplat.splat.model import ProjectedPicture, bands_of, put_back
 from intrasplat.splat.optimize import StepRates, adam_step
 from intrasplat.splat.step import StepSums, TrainingFrame, camera_centre, image_size
 
@@ -142,7 +142,7 @@ class CpuModel:
         self.project(camera, t, self.sh_degree)
         return self.rasterizer.render(values)
 
-    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
         """The same picture, to be blended in bands. Until it is closed, others of its size take other buffers."""
         size = image_size(camera)
         rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)

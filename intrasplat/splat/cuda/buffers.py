@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from intrasplat.splat.cuda.captured import Captured
-from intrasplat.splat.cuda.control import Control, Field, adam_fields
+from intrasplat.splat.cuda.control import Control, ControlField, adam_fields
 from intrasplat.splat.cuda.motion import Motion
 from intrasplat.splat.cuda.rasterizer import CudaRasterizer
 from intrasplat.splat.layout import CAMERA, DIM, ROWS, SIDE
@@ -34,11 +34,11 @@ class FrameBuffers:
         self.frames, self._device = frames, device
         self.rasterizer = CudaRasterizer(width, height, device, frames=frames)
         cameras = {
-            "camera": Field((frames, CAMERA), "double"),
-            "centre": Field((frames, 3)),
-            "shine": Field((frames, 2)),
+            "camera": ControlField((frames, CAMERA), "double"),
+            "centre": ControlField((frames, 3)),
+            "shine": ControlField((frames, 2)),
         }
-        training = {"loss": Field((frames, 5)), "frame": Field((frames,), "int")} | adam_fields()
+        training = {"loss": ControlField((frames, 5)), "frame": ControlField((frames,), "int")} | adam_fields()
         self.control = Control(cameras | motion.fields(frames) | training, rows, device)
         self.launches = Captured(device)
         self.images: dict[bool, Tensor] = {}

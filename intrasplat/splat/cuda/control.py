@@ -27,7 +27,7 @@ _TYPES = {"float": torch.float32, "int": torch.int32, "double": torch.float64}
 
 
 @dataclass(frozen=True)
-class Field:
+class ControlField:
     """A part of the block."""
 
     shape: tuple[int, ...]
@@ -45,7 +45,7 @@ class Control:
     rows    likewise, as NumPy views of each row; to be written before the row is sent
     """
 
-    def __init__(self, fields: Mapping[str, Field], rows: int, device: torch.device) -> None:
+    def __init__(self, fields: Mapping[str, ControlField], rows: int, device: torch.device) -> None:
         starts, size = {}, 0
         for name, field in fields.items():
             starts[name] = size
@@ -65,15 +65,15 @@ class Control:
         self._block.copy_(self._ring[row], non_blocking=True)
 
 
-def adam_fields() -> dict[str, Field]:
+def adam_fields() -> dict[str, ControlField]:
     """What Adam needs of a step, of everything but the motion: the step's place in the report; sizes of the state's
     rows and the opacity, and of the other harmonics; the floor they share; the decays of the moments."""
     return {
-        "slot": Field((1,), "int"),
-        "size": Field((VALUES,)),
-        "rest_size": Field((1,)),
-        "floor": Field((1,)),
-        "betas": Field((2,)),
+        "slot": ControlField((1,), "int"),
+        "size": ControlField((VALUES,)),
+        "rest_size": ControlField((1,)),
+        "floor": ControlField((1,)),
+        "betas": ControlField((2,)),
     }
 
 

@@ -29,7 +29,7 @@ from intrasplat.splat.cuda import harmonics
 from intrasplat.splat.cuda.buffers import FrameBuffers
 from intrasplat.splat.cuda.control import write_adam
 from intrasplat.splat.cuda.frames import FrameStore
-from intrasplat.splat.cuda.motion import Motion, Trained, kept_where_old, motion_of
+from intrasplat.splat.cuda.motion import Motion, TrainedValues, kept_where_old, motion_of
 from intrasplat.splat.cuda.rasterizer import Gradients
 from intrasplat.splat.cuda.update import MADE, SEEN, SUMS, padded
 from intrasplat.splat.deformation import Deformation
@@ -49,7 +49,7 @@ from intrasplat.splat.layout import (
     VALUES,
 )
 from intrasplat.splat.loss import LossSettings
-from intrasplat.splat.model import Blended, Projected, put_back
+from intrasplat.splat.model import Blended, ProjectedPicture, put_back
 from intrasplat.splat.optimize import StepRates
 from intrasplat.splat.step import StepSums, TrainingFrame, image_size
 
@@ -166,7 +166,7 @@ class CudaModel:
             harmonics.update(
                 self._sh_rest, self._rest_moments, *seen, gradients.colour, rasterizer.ok, control, sh_degree
             )
-        trained = Trained(
+        trained = TrainedValues(
             self._values, self._moments, gradients.state, gradients.opacity_logit, gradients.colour, view.colour,
             control["shine"], rasterizer.count, rasterizer.statistics, rasterizer.ok, self._report,
         )  # fmt: skip
@@ -290,7 +290,7 @@ class CudaModel:
         image: Floats = self.render_times(camera, [t], values)[0].cpu().numpy()
         return image
 
-    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
         """The same picture, which a GPU blends in one part."""
         return Blended(self.render_times(camera, [t], values)[0].to("cpu", copy=True).numpy())
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from intrasplat.splat.cpu.motion import NEGLIGIBLE
 from intrasplat.splat.cuda import motion_kernels as kernels
-from intrasplat.splat.cuda.control import ADAM, Field
+from intrasplat.splat.cuda.control import ADAM, ControlField
 from intrasplat.splat.cuda.update import COLUMNS
 from intrasplat.splat.deformation import Deformation, FlexibleDeformation, LinearDeformation
 from intrasplat.splat.layout import COLOUR, GLOSS, LOG_SCALE, MEAN, QUATERNION, ROWS
@@ -25,7 +25,7 @@ from intrasplat.splat.optimize import StepRates, adam_step
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedValues:
     """What a step's last kernel changes apart from the motion, and the gradients it reads; update.py has the shapes."""
 
     values: Tensor
@@ -63,7 +63,7 @@ class Trained:
 class Motion(Protocol):
     """A deformation the step can evaluate and train; `control` is the block's fields on the device (control.py)."""
 
-    def fields(self, frames: int) -> dict[str, Field]:
+    def fields(self, frames: int) -> dict[str, ControlField]:
         """What it needs in the control block."""
 
     def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
@@ -75,7 +75,7 @@ class Motion(Protocol):
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         """state [F, ROWS, N] = values [VALUES, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""
 
-    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+    def update(self, trained: TrainedValues, control: Mapping[str, Tensor]) -> None:
         """One Adam step of the values and of the weights that reach the times, and its report."""
 
     def take(self, columns: Tensor, fresh: Tensor) -> None:
@@ -159,15 +159,15 @@ class LinearMotion:
             self._found[t] = values, first, last
         return self._found[t]
 
-    def fields(self, frames: int) -> dict[str, Field]:
+    def fields(self, frames: int) -> dict[str, ControlField]:
         bases = self._bases
         return {
-            "basis": Field((frames, bases)),
-            "span": Field((frames, 2), "int"),
-            "alive": Field((1 + bases,), "int"),
-            "basis_size": Field((bases,)),
-            "basis_floor": Field((bases,)),
-            "channel_rate": Field((ROWS,)),
+            "basis": ControlField((frames, bases)),
+            "span": ControlField((frames, 2), "int"),
+            "alive": ControlField((1 + bases,), "int"),
+            "basis_size": ControlField((bases,)),
+            "basis_floor": ControlField((bases,)),
+            "channel_rate": ControlField((ROWS,)),
         }
 
     def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
@@ -194,7 +194,7 @@ class LinearMotion:
             self._bases, CHANNELS=self._channels,
         )  # fmt: skip
 
-    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+    def update(self, trained: TrainedValues, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
         kernels.update_linear[_grid(trained.columns)](
             *tensors[:2], self.weight, *self._moments.both, *tensors[2:], *(control[name] for name in ADAM),
@@ -228,8 +228,8 @@ class FdmMotion:
         )
         self._moments = Moments((3, *self.weight.shape), device)
 
-    def fields(self, frames: int) -> dict[str, Field]:
-        return {"time": Field((frames,)), "motion_size": Field((1,))}
+    def fields(self, frames: int) -> dict[str, ControlField]:
+        return {"time": ControlField((frames,)), "motion_size": ControlField((1,))}
 
     def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
         row["time"][:] = times
@@ -244,7 +244,7 @@ class FdmMotion:
             columns, self.weight.shape[1], QUARTIC=self._form.quartic,
         )  # fmt: skip
 
-    def update(self, trained: Trained, control: Mapping[str, Tensor]) -> None:
+    def update(self, trained: TrainedValues, control: Mapping[str, Tensor]) -> None:
         tensors = trained.tensors()
         kernels.update_fdm[_grid(trained.columns)](
             *tensors[:2], self.weight, self.centre, self.width, *self._moments.both, *tensors[2:],

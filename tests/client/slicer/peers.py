@@ -30,7 +30,7 @@ from tests.client.page import Painter, Site
 from tests.intrasplat.export.sheet import tissue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.test_repository import REPOSITORY
-from worker.pace import Pace
+from worker.pace import RenderPace
 from worker.scheduler import Scheduler
 from worker.serve import RequestServer
 from worker.views import Views
@@ -199,7 +199,7 @@ def rendering_site(data_dir: Path) -> Iterator[Site]:
     render_frame(tissue(), 0.0)
     store = Store(data_dir)
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
-    pace = Pace()
+    pace = RenderPace()
     with RequestServer(endpoint, Scheduler(Views(store).answer_in_parts, pace)):
         site, ended = Site(data_dir, endpoint, Painter(), pace), threading.Event()
         heart = threading.Thread(target=_beat, args=(site, ended))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import DepthClip, Eye
-from intrasplat.clip.kept import MANIFEST, load_clip, save_clip
+from intrasplat.clip.stored import MANIFEST, load_clip, save_clip
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import RightEye
 from tests.intrasplat.phantoms import phantom_clip

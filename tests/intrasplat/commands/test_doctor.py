@@ -12,7 +12,7 @@ from intrasplat.commands.doctor import (
     FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
     PACKAGES,
-    Finding,
+    Diagnosis,
     bundled_ffmpeg,
     device_finding,
     examine,
@@ -24,7 +24,7 @@ from tests.test_repository import project, requirement_name
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.9.0")
 
 
-def found(device: str = "auto", segmenter: Path | None = None) -> dict[str, Finding]:
+def found(device: str = "auto", segmenter: Path | None = None) -> dict[str, Diagnosis]:
     return {finding.topic: finding for finding in examine(device, segmenter)}
 
 
@@ -52,7 +52,7 @@ def test_a_device_that_cannot_be_trained_on_blocks_and_has_a_remedy() -> None:
 
 
 def test_the_gpu_that_would_be_trained_on_is_named() -> None:
-    assert device_finding("auto", H200) == Finding("device", "cuda (NVIDIA H200)")
+    assert device_finding("auto", H200) == Diagnosis("device", "cuda (NVIDIA H200)")
     assert device_finding("cpu", H200).found.endswith("(the GPU is not asked for)")
 
 
@@ -83,12 +83,12 @@ def test_the_version_of_a_bundled_ffmpeg_is_read_from_its_library(tmp_path: Path
 @pytest.mark.parametrize(
     ("finding", "mark"),
     [
-        (Finding("a", "fine"), "ok"),
-        (Finding("a", "old", "update it"), "look"),
-        (Finding("a", "gone", "install it", blocks=True), "missing"),
+        (Diagnosis("a", "fine"), "ok"),
+        (Diagnosis("a", "old", "update it"), "look"),
+        (Diagnosis("a", "gone", "install it", blocks=True), "missing"),
     ],
 )
-def test_each_line_begins_with_how_it_stands_and_the_remedy_follows(finding: Finding, mark: str) -> None:
+def test_each_line_begins_with_how_it_stands_and_the_remedy_follows(finding: Diagnosis, mark: str) -> None:
     lines = format_findings([finding]).splitlines()
     assert lines[0].split()[0] == mark
     assert len(lines) == (1 if finding.remedy is None else 2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import DepthClip
-from intrasplat.clip.kept import load_clip, save_clip
+from intrasplat.clip.stored import load_clip, save_clip
 from intrasplat.instruments import Finder, FoundMask, Looked, TissueLook, find_instruments, with_instruments_found
 from intrasplat.instruments.depth_clip import nearness_of
 from intrasplat.instruments.finder import MAX_MISSED, MAX_UNSURE

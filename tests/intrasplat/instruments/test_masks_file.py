@@ -12,9 +12,9 @@ import pytest
 
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip
 from intrasplat.clip.calibration.rectify import rectify
-from intrasplat.clip.kept import load_clip, save_clip
 from intrasplat.clip.masks import open_masks, tissue_from_masks
 from intrasplat.clip.recorded_masks import as_recorded
+from intrasplat.clip.stored import load_clip, save_clip
 from intrasplat.instruments import zipped_masks
 from intrasplat.intake.calibration.types import RawCalibration, RawEye
 from intrasplat.report import Masks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from intrasplat.machine.forecast import IN_BUDGET, USUAL_S, Forecast
+from intrasplat.machine.forecast import IN_BUDGET, USUAL_S, TimeEstimate
 from intrasplat.machine.hooks import Progress
 
 FRAMES, MEGAPIXELS = 100, 30.0
@@ -14,7 +14,7 @@ STAGES = [stage for stage in USUAL_S if stage != "publish"]
 def run_through(pace: float, budget_s: float | None = None, iterations: int | None = None) -> list[tuple[float, float]]:
     """Seconds left as told, and as they turn out, at ten moments of each stage of a machine of this pace."""
     now_s = 0.0
-    forecast = Forecast(iterations, budget_s, clock=lambda: now_s)
+    forecast = TimeEstimate(iterations, budget_s, clock=lambda: now_s)
     took_s = {stage: pace * (fixed + each * MEGAPIXELS) for stage, (fixed, each) in USUAL_S.items()}
     if budget_s is None:
         assert iterations is not None
@@ -47,11 +47,11 @@ def test_from_the_first_tenth_on_it_is_right_within_a_quarter_of_the_whole(
 
 def test_a_stage_that_it_does_not_know_is_told_as_it_is() -> None:
     progress = Progress("score", 0.5)
-    assert Forecast(None, 60.0).completed(progress) is progress
+    assert TimeEstimate(None, 60.0).completed(progress) is progress
 
 
 def test_compilation_changes_nothing_wherever_it_comes() -> None:
-    forecast = Forecast(None, 60.0, clock=lambda: 0.0)
+    forecast = TimeEstimate(None, 60.0, clock=lambda: 0.0)
     for stage in ("decode", "stereo", "start"):
         before_s = forecast.completed(Progress(stage, 1.0)).seconds_left
         assert forecast.completed(Progress("compile", 0.3)).seconds_left == before_s

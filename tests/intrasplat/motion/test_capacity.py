@@ -17,7 +17,7 @@ from intrasplat.motion.capacity import (
     MIN_GAIN_DB,
     MIN_TRIAL_FRAMES,
     REST,
-    Trials,
+    BasisTrials,
     choose_bases,
     floor_error,
     try_bases,
@@ -46,12 +46,12 @@ def bases_for(motion: Motion) -> int:
     return bases
 
 
-def motion_left(errors: dict[int, float]) -> Trials:
+def motion_left(errors: dict[int, float]) -> BasisTrials:
     """The same errors, all of motion."""
-    return Trials({bases: FitError(motion=error, light=0.0) for bases, error in errors.items()})
+    return BasisTrials({bases: FitError(motion=error, light=0.0) for bases, error in errors.items()})
 
 
-def tried_bases(tracks: list[Tracks], clip: DepthClip, train: list[int], most: int | None = None) -> Trials:
+def tried_bases(tracks: list[Tracks], clip: DepthClip, train: list[int], most: int | None = None) -> BasisTrials:
     return try_bases(tracks, clip, train, basis_values, most)
 
 
@@ -218,7 +218,7 @@ def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: 
 
 @pytest.mark.parametrize(("frames", "bases"), [(1, 1), (2, 2), (12, 4), (105, 33), (875, 193)])
 def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most(frames: int, bases: int) -> None:
-    assert choose_bases(Trials({}), 10.0, frames).count == bases
+    assert choose_bases(BasisTrials({}), 10.0, frames).count == bases
 
 
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
@@ -234,7 +234,7 @@ def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> N
 
 @pytest.mark.parametrize("most", [1, 2, 17])
 def test_where_nothing_could_be_followed_a_preset_gets_no_more_bases_than_it_allows(most: int) -> None:
-    assert choose_bases(Trials({}), 10.0, 1000, most).count == most
+    assert choose_bases(BasisTrials({}), 10.0, 1000, most).count == most
 
 
 @pytest.mark.parametrize("bases", [3, 9, 33])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from intrasplat.poses.certainty import aligned_sigma
+from intrasplat.poses.common_motion import gauged
 from intrasplat.poses.field import waves
-from intrasplat.poses.gauge import gauged
 from intrasplat.poses.rigid import Reals, exp, inverse
 from intrasplat.poses.trajectory import trajectory_error
 

@@ -19,8 +19,8 @@ from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.cpu.motion import NEGLIGIBLE
 from intrasplat.splat.cpu.motion import motion_of as cpu_motion_of
 from intrasplat.splat.cuda import harmonics
-from intrasplat.splat.cuda.control import Control, Field, adam_fields, write_adam
-from intrasplat.splat.cuda.motion import LinearMotion, Motion, Trained, motion_of
+from intrasplat.splat.cuda.control import Control, ControlField, adam_fields, write_adam
+from intrasplat.splat.cuda.motion import LinearMotion, Motion, TrainedValues, motion_of
 from intrasplat.splat.cuda.update import MADE, SEEN, SUMS, padded
 from intrasplat.splat.deformation import GaussianFdm, SharedBasis, restore
 from intrasplat.splat.gaussians import Gaussians
@@ -49,7 +49,7 @@ class MotionBench:
     deformation: Fused
     motion: Motion
     control: Control
-    trained: Trained
+    trained: TrainedValues
     state: Tensor
     times: tuple[float, ...]
 
@@ -90,14 +90,16 @@ def bench(kind: str, device: str, times: tuple[float, ...] = TIMES) -> MotionBen
     gaussians, deformation = some_gaussians(kind, 0)
     columns, frames = padded(COUNT), len(times)
     motion = motion_of(deformation, columns, torch.device(device))
-    control = Control(adam_fields() | {"shine": Field((frames, 2))} | motion.fields(frames), 1, torch.device(device))
+    control = Control(
+        adam_fields() | {"shine": ControlField((frames, 2))} | motion.fields(frames), 1, torch.device(device)
+    )
     values = torch.zeros(VALUES, columns, device=device)
     values[:, :COUNT] = torch.cat([canonical_rows(gaussians), gaussians.opacity_logit[None]]).to(device)
 
     def poisoned(*shape: int) -> Tensor:
         return torch.full(shape, float("nan"), device=device)
 
-    trained = Trained(
+    trained = TrainedValues(
         values, torch.zeros(2, *values.shape, device=device),
         poisoned(frames, 10, columns), poisoned(frames, columns), poisoned(frames, 3, columns),
         poisoned(frames, 3, columns), control.values["shine"],

@@ -17,7 +17,7 @@ from intrasplat.clip.calibration import RectifiedClip, rectify
 from intrasplat.notices import NoticeCode
 from intrasplat.stereo import estimate_depth
 from intrasplat.stereo.registration import Colours, MatchedPair, Registration, colours_of
-from intrasplat.stereo.turn import Turn
+from intrasplat.stereo.turn import EyeRotation
 from lab.phantom import PhantomSettings, make_phantom
 from tests.intrasplat.stereo.test_stereo import clip_of, draw_pair, slanted
 
@@ -38,7 +38,7 @@ def with_right(change: Callable[[Picture, int], Picture]) -> RectifiedClip:
     return dataclasses.replace(drawn(), pairs=partial(iter, pairs))
 
 
-def turned(turn: Turn) -> RectifiedClip:
+def turned(turn: EyeRotation) -> RectifiedClip:
     matrix, size = turn.from_rectified(drawn().intrinsics), (drawn().intrinsics.width, drawn().intrinsics.height)
 
     def redraw(right: Picture, _: int) -> Picture:
@@ -70,15 +70,15 @@ def test_an_exact_calibration_stays_as_it_is_and_no_doubt_is_told() -> None:
 @pytest.mark.parametrize(
     "turn",
     [
-        Turn(roll_rad=np.deg2rad(0.1)),
-        Turn(roll_rad=np.deg2rad(-1.0)),
-        Turn(lower_px=0.5, pitch_rad=np.deg2rad(0.1)),
-        Turn(yaw_rad=np.deg2rad(0.15)),
-        Turn(lower_px=-2.0, zoom=0.004),
+        EyeRotation(roll_rad=np.deg2rad(0.1)),
+        EyeRotation(roll_rad=np.deg2rad(-1.0)),
+        EyeRotation(lower_px=0.5, pitch_rad=np.deg2rad(0.1)),
+        EyeRotation(yaw_rad=np.deg2rad(0.15)),
+        EyeRotation(lower_px=-2.0, zoom=0.004),
     ],
     ids=["0.1 degrees of roll", "a degree of roll", "pitch", "yaw", "zoom"],
 )
-def test_a_turned_right_eye_is_measured_and_costs_no_depth(turn: Turn) -> None:
+def test_a_turned_right_eye_is_measured_and_costs_no_depth(turn: EyeRotation) -> None:
     clip = estimate_depth(turned(turn))
     found, right = clip.registration, clip.right
     assert found is not None
@@ -99,7 +99,7 @@ def test_a_turned_right_eye_is_measured_and_costs_no_depth(turn: Turn) -> None:
 
 
 def test_the_turned_eyes_depth_and_instruments_lie_at_its_own_pixels() -> None:
-    turn = Turn(lower_px=5.0, roll_rad=np.deg2rad(1.0))
+    turn = EyeRotation(lower_px=5.0, roll_rad=np.deg2rad(1.0))
     clip, k = estimate_depth(turned(turn)), drawn().intrinsics
     assert clip.right is not None
     assert sound().right is not None
@@ -112,7 +112,7 @@ def test_the_turned_eyes_depth_and_instruments_lie_at_its_own_pixels() -> None:
 
 
 def test_a_turn_projects_a_point_to_where_its_picture_shows_it() -> None:
-    turn, k = Turn(3.0, 0.01, -0.02, 0.03, 0.01), drawn().intrinsics
+    turn, k = EyeRotation(3.0, 0.01, -0.02, 0.03, 0.01), drawn().intrinsics
     calibrated, pose = np.eye(4), np.eye(4)
     pose[:3, :3] = turn.rotation
     x, y = np.array([20.0, 160.0, 300.0]), np.array([30.0, 128.0, 200.0])

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from intrasplat.methods.registry import PRESETS
-from intrasplat.train import aside
 from intrasplat.train.average import PREFIX, RunningMean
 from tests.intrasplat.phantoms import phantom_clip, prepared
 

@@ -18,7 +18,6 @@ from intrasplat.pipeline import make
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.train import keep
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
@@ -105,7 +104,7 @@ def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
     monkeypatch.setattr("intrasplat.methods.method.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
     monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
-    monkeypatch.setattr("intrasplat.train.aside.LARGE_BYTES", 1 << 12)
+    monkeypatch.setattr("intrasplat.train.tensor_copy.LARGE_BYTES", 1 << 12)
     monkeypatch.setattr("intrasplat.scene.resume_file._AT_MOST_BYTES", 1 << 12)
 
     def stop(progress: Progress) -> None:

@@ -20,7 +20,7 @@ LEARNING = 0.2
 
 
 @dataclass(eq=False)
-class Turn:
+class WaitingRequest:
     """A request that waits or is being answered.
 
     cost       pixels x Gaussians
@@ -52,7 +52,7 @@ class Turns:
     """All that wait, and how fast they are answered; for one thread."""
 
     def __init__(self) -> None:
-        self._waiting: list[Turn] = []
+        self._waiting: list[WaitingRequest] = []
         self._speeds = list(FIRST_SPEEDS)
 
     def __len__(self) -> int:
@@ -62,12 +62,12 @@ class Turns:
         """CPU seconds that a request of this cost takes at a level of detail."""
         return cost / self._speeds[level]
 
-    def learn(self, turn: Turn) -> None:
+    def learn(self, turn: WaitingRequest) -> None:
         """Remember how long the answer took."""
         if turn.cost > 0 and turn.spent_s > 0:
             self._speeds[turn.level] += LEARNING * (turn.cost / turn.spent_s - self._speeds[turn.level])
 
-    def add(self, turn: Turn) -> None:
+    def add(self, turn: WaitingRequest) -> None:
         """Let it wait."""
         self._waiting.append(turn)
 
@@ -75,7 +75,7 @@ class Turns:
         """Forget a request that nobody waits for any more."""
         self._waiting = [each for each in self._waiting if (each.caller, each.request_id) != (caller, request_id)]
 
-    def take(self, below_s: float = math.inf) -> Turn | None:
+    def take(self, below_s: float = math.inf) -> WaitingRequest | None:
         """The next one to answer, of those that take less than below_s."""
         turn = min(
             (each for each in self._waiting if each.seconds < below_s), key=lambda each: each.due_s, default=None
@@ -84,7 +84,7 @@ class Turns:
             self._waiting.remove(turn)
         return turn
 
-    def take_same(self, request: SceneRequest) -> list[Turn]:
+    def take_same(self, request: SceneRequest) -> list[WaitingRequest]:
         """All who wait for the same answer."""
         same = [each for each in self._waiting if each.request == request]
         self._waiting = [each for each in self._waiting if each.request != request]
@@ -94,7 +94,7 @@ class Turns:
         """How many other answers somebody waits for."""
         return len({each.request for each in self._waiting} - {request})
 
-    def seconds_before(self, turn: Turn) -> float:
+    def seconds_before(self, turn: WaitingRequest) -> float:
         """CPU seconds, at least, of all that are answered before this one; 0 if one of them has the same answer."""
         before = [each for each in self._waiting if each.due_s <= turn.due_s]
         return 0.0 if any(each.request == turn.request for each in before) else sum(each.least_s for each in before)

@@ -20,8 +20,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from intrasplat.clip import DepthClip
-from intrasplat.clip.kept import load_clip, save_clip
 from intrasplat.clip.layouts import registered_files
+from intrasplat.clip.stored import load_clip, save_clip
 from intrasplat.errors import Cancelled
 from intrasplat.names import KEPT, PREPARED
 from intrasplat.scene.resume_file import RESUME_FILE

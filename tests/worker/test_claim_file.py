@@ -12,7 +12,7 @@ from contract.wire.job import JobState
 from intrasplat.errors import UnavailableError
 from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import Jobs
-from worker.held import HeldClaim
+from worker.claim_file import HeldClaim
 
 OWNER = "worker-1.a"
 

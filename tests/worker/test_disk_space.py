@@ -11,7 +11,7 @@ from contract.store.store import Store
 from contract.wire.job import JobState
 from intrasplat.errors import ErrorCode
 from tests.worker.test_consume import JobLoop
-from worker.room import MAX_SHORTAGES, MIN_ROOM_BYTES, Room
+from worker.disk_space import MAX_SHORTAGES, MIN_ROOM_BYTES, Room
 
 MIN_FREE_BYTES = 400 * 2**20
 
@@ -26,7 +26,7 @@ def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.fixture
 def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.room.PAUSE_S", 0.0)
+    monkeypatch.setattr("worker.disk_space.PAUSE_S", 0.0)
 
 
 def test_after_a_shortage_jobs_pause_until_more_is_free(
@@ -39,7 +39,7 @@ def test_after_a_shortage_jobs_pause_until_more_is_free(
     assert room.is_short()
     free_bytes[0] += MIN_ROOM_BYTES + 1
     assert not room.is_short()
-    monkeypatch.setattr("worker.room.PAUSE_S", 0.0)
+    monkeypatch.setattr("worker.disk_space.PAUSE_S", 0.0)
     room.begins()
     assert room.ran_out("a")
     assert not room.is_short()

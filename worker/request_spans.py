@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from contract.runtime import traces
-from worker.turns import Turn
+from worker.request_queue import WaitingRequest
 
 
 @contextmanager
-def answer_span(turn: Turn) -> Iterator[None]:
+def answer_span(turn: WaitingRequest) -> Iterator[None]:
     """The span of an answer that is being made; parts of it that begin in the context are within it."""
     came_s = _came_s(turn)
     with traces.span(turn.request.kind, turn.trace or traces.NEW, since_s=came_s, job_id=turn.request.scene_id):
@@ -19,11 +19,11 @@ def answer_span(turn: Turn) -> Iterator[None]:
         yield
 
 
-def shared_span(turn: Turn) -> None:
+def shared_span(turn: WaitingRequest) -> None:
     """The span of a request that got the answer of another that asked the same."""
     told = traces.Attributes(job_id=turn.request.scene_id, shared=True)
     traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **told).end()
 
 
-def _came_s(turn: Turn) -> float:
+def _came_s(turn: WaitingRequest) -> float:
     return time.time() - (time.monotonic() - turn.arrived_s)
