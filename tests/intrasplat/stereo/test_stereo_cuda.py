@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA backend on this platform")
 
+from intrasplat.clip import DepthClip
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.stereo import cuda, estimate_depth, matching
 from intrasplat.stereo.cuda import matching as on_device
@@ -27,6 +28,9 @@ from tests.intrasplat.probes import kernels_compiled_by
 from tests.intrasplat.stereo.test_stereo import clip_of, draw_pair, errors_px, slanted
 
 WIDTH, HEIGHT = 88, 48
+SMALL_WIDTH, SMALL_HEIGHT = 40, 40
+"""Where matching is compared with itself; of fewer rows no frame counts as a repeated one."""
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 @pytest.fixture
@@ -192,12 +196,23 @@ def test_depth_is_as_true_as_on_the_cpu() -> None:
     assert ours.measurements["min_disparity_px"] < 7 < 14 < ours.measurements["max_disparity_px"] < 26
 
 
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    """Four frames, of which the second and the last show nothing new."""
+    return [draw_pair(slanted(10.0, 7.0, SMALL_WIDTH, SMALL_HEIGHT), seed=seed) for seed in (0, 0, 1, 1)]
+
+
+@pytest.fixture(scope="module")
+def whole(pairs: list[Pair]) -> DepthClip:
+    """Their depth, none left out and all but the first at once."""
+    return estimate_depth(clip_of(pairs), device="cuda", measured_frames=[1, 2])
+
+
 def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_depth(
-    monkeypatch: pytest.MonkeyPatch,
+    pairs: list[Pair], whole: DepthClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("intrasplat.clip.sampling.KEPT_FRAMES", 2)
-    pairs = [draw_pair(slanted(10.0, 7.0, WIDTH, HEIGHT), seed=seed) for seed in (0, 0, 1, 1)]
-    whole, sampled = (estimate_depth(clip_of(pairs), leave_out=each, device="cuda") for each in (False, True))
+    sampled = estimate_depth(clip_of(pairs), leave_out=True, device="cuda")
     assert (whole.left_out, sampled.left_out) == ((), (1, 3))
     assert np.array_equal(sampled.depth_mm[::2], whole.depth_mm[::2])
     assert np.array_equal(sampled.depth_confidence[::2], whole.depth_confidence[::2])
@@ -205,10 +220,8 @@ def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_d
 
 
 def test_the_first_frame_is_shown_before_the_others_are_matched_and_batches_change_nothing(
-    monkeypatch: pytest.MonkeyPatch,
+    pairs: list[Pair], whole: DepthClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pairs = [draw_pair(slanted(10.0, 7.0, WIDTH, HEIGHT), seed=seed) for seed in range(4)]
-    together = estimate_depth(clip_of(pairs), device="cuda", measured_frames=[1, 2])
     matched: list[int] = []
     at_first: list[tuple[list[int], NDArray[np.float32]]] = []
     depth_of = cuda.depth_of
@@ -222,11 +235,11 @@ def test_the_first_frame_is_shown_before_the_others_are_matched_and_batches_chan
     hooks = Hooks(on_first_moment=lambda moment: at_first.append((list(matched), moment.depth_mm.copy())))
     batched = estimate_depth(clip_of(pairs), hooks, device="cuda", measured_frames=[1, 2])
     assert matched == [1, 2, 1]
-    assert np.array_equal(batched.depth_mm, together.depth_mm)
-    assert np.array_equal(batched.depth_confidence, together.depth_confidence)
+    assert np.array_equal(batched.depth_mm, whole.depth_mm)
+    assert np.array_equal(batched.depth_confidence, whole.depth_confidence)
     [(before, first_mm)] = at_first
     assert before == [1]
-    assert np.array_equal(first_mm[0], together.depth_mm[1])
+    assert np.array_equal(first_mm[0], whole.depth_mm[1])
 
 
 def test_kernels_compile_for_sm_90_within_its_registers_once_for_clips_of_every_size(triton_cache: Path) -> None:

@@ -19,6 +19,12 @@ def scene(*tools: Tool) -> Phantom:
     return make_phantom(PhantomSettings(160, 128, FRAMES, tools=tools, noise=False, period_frames=12.0))
 
 
+@cache
+def frame_of(index: int, *tools: Tool) -> PhantomFrame:
+    """Callers share the arrays."""
+    return scene(*tools).frame(index)
+
+
 def shown(frame: PhantomFrame) -> NDArray[np.bool_]:
     """Pixels well inside the instruments."""
     return ~frame.tissue & (frame.hidden_depth_mm - frame.depth_mm > 1)
@@ -26,7 +32,7 @@ def shown(frame: PhantomFrame) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("tool", TOOLS)
 def test_an_instrument_moves_enters_from_the_border_and_glints(tool: Tool) -> None:
-    frames = [scene(tool).frame(index) for index in (0, 8, 16)]
+    frames = [frame_of(index, tool) for index in (0, 8, 16)]
     for frame in frames:
         mask = ~frame.tissue
         assert 0.005 < mask.mean() < 0.4
@@ -40,7 +46,7 @@ def test_an_instrument_moves_enters_from_the_border_and_glints(tool: Tool) -> No
 def test_kinds_tell_apart_by_their_colours() -> None:
     looks = {}
     for tool in TOOLS:
-        frames = [scene(tool).frame(index) for index in range(0, FRAMES, 4)]
+        frames = [frame_of(index, tool) for index in range(0, FRAMES, 4)]
         looks[tool] = np.concatenate([frame.left[shown(frame)] for frame in frames]).astype(float)
     brightness = {tool: np.median(pixels) for tool, pixels in looks.items()}
     assert brightness["dark"] < brightness["grasper"] < brightness["steel"]
@@ -52,10 +58,9 @@ def test_kinds_tell_apart_by_their_colours() -> None:
 
 
 def test_a_second_instrument_comes_and_goes_and_leaves_the_first_as_it_was() -> None:
-    two, one = scene("grasper", "yellow"), scene("grasper")
     more = []
     for index in range(0, FRAMES, 2):
-        both, alone = two.frame(index), one.frame(index)
+        both, alone = frame_of(index, "grasper", "yellow"), frame_of(index, "grasper")
         np.testing.assert_array_equal(both.hidden_rgb, alone.hidden_rgb)
         assert not (both.tissue & ~alone.tissue).any()
         assert (both.depth_mm <= alone.depth_mm).all()
@@ -65,8 +70,8 @@ def test_a_second_instrument_comes_and_goes_and_leaves_the_first_as_it_was() -> 
 
 
 def test_three_instruments_come_from_three_sides() -> None:
-    scenes = [scene("grasper"), scene("grasper", "steel"), scene("grasper", "steel", "dark")]
-    tissue = [np.stack([each.frame(index).tissue for index in range(0, FRAMES, 2)]) for each in scenes]
+    chosen: list[tuple[Tool, ...]] = [("grasper",), ("grasper", "steel"), ("grasper", "steel", "dark")]
+    tissue = [np.stack([frame_of(index, *tools).tissue for index in range(0, FRAMES, 4)]) for tools in chosen]
     second, third = (now_less & ~now for now_less, now in pairwise(tissue))
     assert second[:, :, 0].any() | second[:, -1, :80].any(), "from below left"
     assert third[:, 0].any(), "from above"
