@@ -1,8 +1,8 @@
 """Given poses that jump to and fro, and the same path without the jumps.
 
 The pictures place each frame among its neighbours to a tenth of a millimetre, but leave open where the whole path goes
-(intrasplat/poses/common_motion.py); given poses err the other way. So the path that was found is laid on the given one by a
-motion that changes slowly.
+(intrasplat/poses/common_motion.py); given poses err the other way. So the path that was found is laid on the given one
+by a motion that changes slowly.
 
 Symbols: T frames.
 """

@@ -85,7 +85,7 @@ def _kept_steps(kept: Path) -> list[int]:
 
 
 def _keep(kept: Path, made: list[int]) -> None:
-    """As intrasplat/train/persistence.py: aside, then in place. One whose folder a later attempt has taken over goes on."""
+    """As intrasplat/train/persistence.py: aside, then in place. It goes on where a later attempt has the folder."""
     aside = kept / f".{RESUME}.new"
     with suppress(FileNotFoundError):
         aside.write_text(json.dumps(made))

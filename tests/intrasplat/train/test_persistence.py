@@ -18,6 +18,7 @@ from intrasplat.pipeline import make
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.train import persistence
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
@@ -67,8 +68,8 @@ class Stages:
 def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
     preset: str, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keep, "PERIOD_S", 0.0)
-    monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
+    monkeypatch.setattr(persistence, "PERIOD_S", 0.0)
+    monkeypatch.setattr(persistence, "MAX_SHARE", 1e9)
     monkeypatch.setattr("intrasplat.train.loop.REPORT_EVERY_S", 0.0)
     found: dict[int, Path] = {}
 
@@ -102,8 +103,8 @@ def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("intrasplat.methods.method.USUAL_BASES", 1)  # what a long clip has more of
-    monkeypatch.setattr(keep, "PERIOD_S", 0.0)
-    monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
+    monkeypatch.setattr(persistence, "PERIOD_S", 0.0)
+    monkeypatch.setattr(persistence, "MAX_SHARE", 1e9)
     monkeypatch.setattr("intrasplat.train.tensor_copy.LARGE_BYTES", 1 << 12)
     monkeypatch.setattr("intrasplat.scene.resume_file._AT_MOST_BYTES", 1 << 12)
 
@@ -157,7 +158,7 @@ def test_a_file_that_has_changed_is_decoded_anew(clip: Path, tmp_path: Path) -> 
 def test_a_full_disk_costs_what_would_have_been_kept_and_not_the_run(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keep, "SPARE_BYTES", 1 << 62)
+    monkeypatch.setattr(persistence, "SPARE_BYTES", 1 << 62)
     make(request_of(clip), tmp_path / "scene", TrainingHooks(), tmp_path / "kept")
     assert list((tmp_path / "kept").iterdir()) == []
     assert bits(tmp_path / "scene")
