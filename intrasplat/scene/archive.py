@@ -106,7 +106,7 @@ class ManifestHead(BaseModel):
 
 @dataclass(frozen=True)
 class Archived:
-    """An archive that has passed the checks. sha256: one hash of all files, in the order of their names."""
+    """An archive that has passed the checks."""
 
     head: ArchiveHead
     manifest: ManifestHead
