@@ -1,4 +1,6 @@
-"""A trained run and its held-out frames in, the quality report out: scores, checks, what the clip saw of each Gaussian.
+"""Judge a trained scene.
 
+In: a trained model, its clip and the held-out frames. Out: the quality report, with scores and warnings, and how far to
+trust each Gaussian.
 Verbs: trust.trust, quality.first_report, judge.judged, baselines.copy_baselines.
 """
