@@ -93,7 +93,7 @@ def run_cli(options: argparse.Namespace) -> int:
 
 
 def _of_frames(clip: DepthClip, times_s: Reals, poses: Reals) -> Reals:
-    """The known poses [T, 4, 4] of the clip's frames: one line per frame, or interpolated at times since the first line.
+    """The known poses [T, 4, 4] of the clip's frames: one line per frame, or interpolated at its time.
 
     Raises:
         InputError: the path does not belong to this clip.
