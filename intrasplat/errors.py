@@ -78,7 +78,7 @@ class ResumeMismatch(InputError):
 
 
 class TrainingDiverged(IntrasplatError):
-    """Training reached a NaN or lost its Gaussians, or a render holds a NaN."""
+    """Training reached a NaN or lost its Gaussians, or a render contains a NaN."""
 
     code = ErrorCode.TRAINING_DIVERGED
 

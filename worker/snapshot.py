@@ -100,7 +100,8 @@ class Snapshots:
                 self._newest = snapshot
                 if not snapshot.of_one_moment:
                     self._copy_s = snapshot.taken_s - self._wanted_s
-                self._asked, self._answers = False, not snapshot.of_one_moment  # no copy comes soon after it
+                # Do not wait for a copy after a first picture: training is still far from its first copy.
+                self._asked, self._answers = False, not snapshot.of_one_moment
                 self._changed.notify_all()
 
     def newest(self, job_id: str) -> Snapshot | None:

@@ -31,7 +31,7 @@ def add_options(
 ) -> None:
     """Add one command-line option for each named field of `model` (default: all): flag, type, choices and help.
 
-    The namespace holds None for an option that was not given. The parser refuses more than one of `model.exclusive`. In
+    The namespace has None for an option that was not given. The parser refuses more than one of `model.exclusive`. In
     the help, the last word of an option's name stands for its value (--budget-s S), unless it lists choices.
     `overrides` go to every add_argument, such as nargs="+".
     """

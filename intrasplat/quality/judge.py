@@ -31,7 +31,7 @@ def judged(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRen
         render: renders the model; several threads may call it.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
         Cancelled: hooks.should_stop said so.
     """
     started_s, sampled = time.perf_counter(), sample_frames(train)

@@ -104,7 +104,7 @@ def measure(
     compared: compute the scores that compare one scene with another, too; else all but psnr_tissue_db are NaN.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
     """
 
     def score(index: int) -> tuple[tuple[float, float, float, float, float], Errors, Errors]:

@@ -45,7 +45,7 @@ def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer,
     `mapping` may use several threads.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
     """
     right = clip.right
     if right is None:

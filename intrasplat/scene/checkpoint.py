@@ -5,7 +5,7 @@
     ├── ...                 files that rendering does not need, such as recorded.zip
     └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
 
-The manifest is written last, so a folder without one holds no scene. docs/scene-file.md describes both files.
+The manifest is written last, so a folder without one contains no scene. docs/scene-file.md describes both files.
 """
 
 from __future__ import annotations

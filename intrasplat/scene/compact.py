@@ -4,7 +4,7 @@ Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R
 K columns.
 
 A decoder undoes four steps (intrasplat/scene/quantize.py does them): motion is coefficients of patterns, numbers are
-multiples of a step, columns may hold differences between neighbours, and the table is range coded. docs/scene-file.md
+multiples of a step, columns may be differences between neighbours, and the table is range coded. docs/scene-file.md
 describes the file for other readers.
 """
 

@@ -123,7 +123,7 @@ def check(scene: TrainedScene) -> None:
 
 
 def check_finite(tensors: dict[str, Tensor]) -> None:
-    """Raise SceneError where a tensor holds NaN or infinity."""
+    """Raise SceneError where a tensor contains NaN or infinity."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not is_finite(tensor):
             broken = int((~torch.isfinite(tensor)).sum())
