@@ -23,8 +23,7 @@ MAX_HOLDOUT_CHARACTERS = 8000
 """Room for a thousand frame numbers of six digits with commas; a job's record must fit into a pipe's buffer."""
 
 MIN_DEPTH_MM, MAX_DEPTH_MM = 10.0, 300.0
-"""Depths that an endoscope sees: nearer it is out of focus, and farther away its eyes' pictures differ by only a pixel
-or two."""
+"""Depths that an endoscope sees: nearer it is out of focus, and farther its eyes' pictures differ by 1 or 2 pixels."""
 
 FIELD_PREFIX = "options"
 """InputError.field of an option is `options.NAME`."""

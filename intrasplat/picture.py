@@ -7,8 +7,7 @@ from enum import StrEnum
 from pydantic import BaseModel, ConfigDict, Field
 
 MAX_JUDGED_PIXELS = 1 << 21
-"""A picture smaller than the recording is drawn in the recording's pixels, but in at most so many: enough for 1920 x
-1080."""
+"""A picture smaller than the recording is drawn in the recording's pixels, but at most so many (1920 x 1080)."""
 
 
 class Layer(StrEnum):

@@ -6,8 +6,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 GROUP = "intrasplat.server"
-"""Group of entry points: `commands` runs the server's commands, `doctor` examines it, `dashboard` names the page's
-folder."""
+"""Entry points: `commands` runs the server's commands, `doctor` examines it, `dashboard` names the page's folder."""
 
 
 def server_part(name: str) -> Any | None:

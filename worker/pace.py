@@ -18,15 +18,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SHARE = 0.12
-"""Share of the CPU time for renders while a job trains. Copies of the model, the service and its viewers take some
-more."""
+"""Renders' share of the CPU time while a job trains. Model copies, the service and its viewers take some more."""
 
 MIN_USE = 0.25
 """The bucket gains as if the process used at least this share of the cores: it uses few while it decodes a clip."""
 
 MAX_SAVED_S = 0.1
-"""Most CPU seconds in the bucket: enough for a few renders when a viewer opens. More would disturb the 0.3 s in which
-training times its steps."""
+"""Enough for a few renders when a viewer opens. More would disturb the 0.3 s in which training times its steps."""
 
 
 class RenderPace:

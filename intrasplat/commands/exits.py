@@ -41,8 +41,7 @@ def exit_code_of(error: IntrasplatError) -> ExitCode:
 
 
 LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
-"""Environment variable with the path of the file for last words: the UnavailableError that ends a process. Supervised
-sets it."""
+"""Environment variable set by Supervised: the file for last words, the UnavailableError that ends a process."""
 
 
 def end_by(error: IntrasplatError) -> ExitCode:

@@ -1,4 +1,4 @@
-"""The Gaussians at one moment as binary glTF with the extension KHR_gaussian_splatting (ratified).
+"""Export the Gaussians at one moment as binary glTF with the extension KHR_gaussian_splatting (ratified).
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """

@@ -1,8 +1,7 @@
 """The tissue's surface at one moment as a coloured mesh, fused from the depth of several views.
 
 The depths of the endoscope's view and of four around it are fused into a truncated signed distance (Curless and Levoy,
-A volumetric method for building complex models from range images, SIGGRAPH 1996). scikit-image extracts its zero level
-as a mesh.
+A volumetric method for building complex models from range images, SIGGRAPH 1996). scikit-image meshes its zero level.
 
 Symbols: X Y Z voxels, H W pixels, V vertices, F faces.
 """

@@ -1,6 +1,5 @@
 """Judge a trained scene.
 
-In: a trained model, its clip and the held-out frames. Out: the quality report, with scores and warnings, and how far to
-trust each Gaussian.
+In: a trained model, its clip, the held-out frames. Out: the quality report, and the trust in each Gaussian.
 Verbs: trust.trust, quality.first_report, judge.judged, baselines.copy_baselines.
 """

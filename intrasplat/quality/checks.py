@@ -1,8 +1,7 @@
 """Check the pictures, masks and depth of a clip, and warn about what may harm its scene.
 
-Symbols: T frames, H W pixels. Each check compares one number with one bound. The bounds lie between the numbers of
-clean clips, real and synthetic, and those that harm a scene (docs/decisions/evaluation.md). No check reads held-out
-frames.
+Symbols: T frames, H W pixels. No check reads held-out frames. Each compares a number with a bound that lies between
+the numbers of clean clips, real and synthetic, and those that harm a scene (docs/decisions/evaluation.md).
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ MAX_BRIGHTNESS_DRIFT = 0.25
 ANALYSED_WIDTH = 640
 """Larger pictures are shrunk to this width first: those of 4K endoscopes are soft at the pixel scale even in focus."""
 DARK_PERCENTILE, MAX_DARK_LEVEL = 5.0, 85.0
-"""Percentile and limit of each pixel's weakest colour: at most 68 of 255 in clean clips, 90 behind a veil that takes a
-quarter."""
+"""Of each pixel's weakest colour (of 255): at most 68 in clean clips, and 90 behind a veil that takes a quarter."""
 FOCUS_SIGMAS_PX = (1.0, 2.0)
 MIN_FINE_DETAIL = 0.62
 """Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
@@ -56,8 +54,8 @@ MIN_INSTRUMENT = 0.02
 SURE = 128
 """Smallest depth_confidence (of 255) that is checked; another check warns about less confident depth."""
 DEPTH_JUMP, MAX_JUMPING_SHARE = 0.1, 0.03
-"""Relative jump of depth from frame to frame, and the share of tissue on which it may occur: at most 0.012 in clean
-clips, 0.05 where 0.05 of the tissue has gross errors."""
+"""Relative jump of depth between frames, and the tissue's share that may jump: 0.012 in clean clips, 0.05 with gross
+errors on 0.05."""
 MAX_PAIRS = 8
 
 

@@ -38,8 +38,7 @@ MIN_TRAIN_DB = 25.0
 MIN_HELD_OUT_DB = 24.0
 """An error of 6 % of white: clean clips reach 25 within a hundred iterations, clips with cuts or jumps stay below."""
 MAX_GAP_DB = 3.0
-"""Gap between training and held-out frames: a larger one means that the model memorised frames, or does not interpolate
-between them."""
+"""Gap between training and held-out frames; beyond it the model memorised frames, or cannot interpolate them."""
 MAX_RIGHT_GAP_DB = 4.0
 """Gap between the left eye and the right eye, which views the tissue from some degrees beside it."""
 OUTLIER_DB = 6.0

@@ -24,8 +24,7 @@ SAMPLED_PICTURES = 24
 MIN_TISSUE_PX = 0.5
 """A frame sees a Gaussian if its weights on tissue add up to so many pixels; hidden Gaussians reach less."""
 MIN_TISSUE_SHARE = 0.2
-"""And if they are this share of all its weights in the frame. Behind an instrument's edge, the visible part of a
-Gaussian determines the rest."""
+"""And if they are this share of all its weights there. At an instrument's edge, the visible part fixes the rest."""
 
 RIGHT_COLOUR, RIGHT_DEPTH = 0.03, 0.02
 """Largest errors that count as right: mean error of R G B, with white as 1, and relative error of depth."""

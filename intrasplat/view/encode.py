@@ -8,8 +8,7 @@ confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high
 False colours are those of intrasplat/colours.py.
 
 If unseen pixels are marked, their depth and confidence are 0, and rgb shows a hatch. Then png and webp of rgb have an
-alpha channel: UNSEEN_ALPHA (practically transparent) at unseen pixels, 255 elsewhere. A program without alpha shows the
-hatch.
+alpha channel, UNSEEN_ALPHA (practically transparent) there and 255 elsewhere. Programs without alpha show the hatch.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ SMOOTHED_SHARE = 1 / 128
 STRIPE_SHARE = 1 / 96
 """Width of a stripe of the hatch along a row, as a share of the image's width: 3 mm where the picture is 30 cm wide."""
 DARK_GREY, LIGHT_GREY = 40, 74
-"""Grey levels of the stripes, of 255; a luminance of 2 and 7 %. They can be told apart from 3 m away, and nothing in a
-body is neutral and striped."""
+"""Greys of the stripes, of 255 (luminance 2 and 7 %): distinct from 3 m away; nothing in a body is grey and striped."""
 HATCHES_KEPT = 8
 
 
