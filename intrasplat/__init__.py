@@ -1,4 +1,4 @@
-"""Differentiable splatting and dynamic 3D Gaussians of deforming tissue from a stereo endoscope clip, without CUDA.
+"""Differentiable splatting, and dynamic 3D Gaussians of deforming tissue from a stereo endoscope clip, without CUDA.
 
     import intrasplat as isp
 
@@ -102,7 +102,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'intrasplat' has no attribute {name!r}")
     value = getattr(import_module(f"intrasplat.{_MODULES[name]}"), name)
-    globals()[name] = value  # the next access does not come here
+    globals()[name] = value  # the next access does not call __getattr__
     return value
 
 

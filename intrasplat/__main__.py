@@ -1,7 +1,7 @@
 """The `intrasplat` command.
 
-reconstruct, render, export, measure, evaluate, poses and doctor work on this machine without a service. The other
-commands come with the server (the distribution intrasplat-server), which registers them (intrasplat/server_parts.py).
+reconstruct, render, export, measure, evaluate, poses and doctor work on this machine without a service. The server (the
+distribution intrasplat-server) registers the other commands (intrasplat/server_parts.py).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return commands(arguments)
     if arguments and not arguments[0].startswith("-"):
         return end_by(NO_SERVER)
-    _parser(None).parse_args(arguments)  # prints the help, or what is wrong, and exits
+    _parser(None).parse_args(arguments)  # prints the help or the mistake, and exits
     return ExitCode.USAGE
 
 
@@ -55,8 +55,8 @@ def run_local(arguments: Sequence[str]) -> int:
 
 
 def _parser(chosen: str | None) -> argparse.ArgumentParser:
-    """The parser of the library's commands. Only the chosen one has its options: the others are not imported, so that
-    --help and doctor answer at once, and doctor even without torch."""
+    """The parser of the library's commands. Only the chosen command has its options. The others are not imported, so
+    that --help and doctor answer at once, and doctor works without torch."""
     parser = argparse.ArgumentParser(
         prog="intrasplat",
         description="Dynamic 3D Gaussians of tissue from a stereo endoscope clip. Research use only.",
@@ -73,8 +73,8 @@ def _parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _leave(code: int) -> NoReturn:
-    """End this process. Python's own end would free every object of torch and Numba first, which takes most of a
-    second."""
+    """End this process at once. Python's own exit would first free every object of torch and Numba, which takes most of
+    a second."""
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -82,8 +82,8 @@ def _leave(code: int) -> NoReturn:
 
 
 def command_line() -> NoReturn:
-    """What the script `intrasplat` and `python -m intrasplat` run: one command, then the end of the process."""
-    keep_libraries_to_one_thread()  # before they are imported
+    """Run one command, then end the process: the entry point of `intrasplat` and `python -m intrasplat`."""
+    keep_libraries_to_one_thread()  # must come before their import
     is_local = len(sys.argv) > 1 and sys.argv[1] in LOCAL_COMMANDS
     status = main()
     if is_local:

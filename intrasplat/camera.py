@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 class Intrinsics:
     """Pinhole intrinsics in pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5) (docs/conventions.md).
 
-    A plain dataclass, so that training needs no pydantic.
+    This is a plain dataclass, so that training needs no pydantic.
 
     Raises:
-        ValueError: a size or focal length is not above 0, a size is not a whole number, or something is not finite.
+        ValueError: a size or focal length is not above 0, a size is not an integer, or a number is not finite.
     """
 
     width: int
@@ -38,12 +38,12 @@ class Intrinsics:
                 raise ValueError(f"{name} of a camera is {value!r} pixels, which is not a whole number")
             if name not in ("cx", "cy") and value <= 0:
                 raise ValueError(f"{name} of a camera is {value!r}, not above 0")
-            kind = int if name in ("width", "height") else float  # NumPy's numbers are not written as JSON
+            kind = int if name in ("width", "height") else float  # JSON cannot represent NumPy's numbers
             object.__setattr__(self, name, kind(value))
 
     @classmethod
     def parsed(cls, value: object) -> Intrinsics:
-        """The camera whose numbers() were stored as JSON.
+        """The camera from numbers() that were stored as JSON.
 
         Raises:
             ValueError: the value is not a camera.
@@ -60,14 +60,14 @@ class Intrinsics:
         return asdict(self)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera with another pixel grid over the same field of view."""
+        """The camera with the same field of view and another size in pixels."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(
             width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
     def cut(self, left: int, top: int, width: int, height: int) -> Intrinsics:
-        """The camera of a part of the picture, whose first pixel is (top, left)."""
+        """The camera of a part of the picture that starts at row `top` and column `left`."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
 
@@ -77,7 +77,7 @@ def unproject(
     intrinsics: Intrinsics,
     world_from_camera: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """World points [M, 3] in mm of flat pixel indices [M] with their depths [M], through the pixels' centres."""
+    """World points [M, 3] in mm of flat pixel indices [M] at depths [M], through the pixels' centres."""
     rows, columns = np.divmod(pixels, intrinsics.width)
     return unproject_at(columns + 0.5, rows + 0.5, depth_mm, intrinsics, world_from_camera)
 
@@ -89,7 +89,7 @@ def unproject_at(
     intrinsics: Intrinsics,
     world_from_camera: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """World points [M, 3] in mm of image positions [M] with their depths [M]; positions may lie beyond the borders."""
+    """World points [M, 3] in mm of image positions [M] at depths [M]; positions may lie outside the image."""
     x = (column - intrinsics.cx) / intrinsics.fx
     y = (row - intrinsics.cy) / intrinsics.fy
     camera_mm = np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[:, None].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Codes that another version may have written."""
+"""Read codes that another version may have written."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import BeforeValidator
 
 
 def known_code(codes: type[StrEnum]) -> BeforeValidator:
-    """For a field with one of the codes: a text that is none of them, as a later version writes, is `unclassified`."""
+    """A validator for a field with one of the codes: an unknown code, as of a later version, becomes `unclassified`."""
     known = {code.value for code in codes}
 
     def read(code: object) -> object:

@@ -1,7 +1,7 @@
-"""The false colours of depth and confidence, the same in pictures of the worker and on the page.
+"""The false colours of depth and confidence, the same in rendered pictures and on the page.
 
-cividis (Nunez, Anderson and Renslow 2018): its lightness rises evenly, and who sees no red or no green sees the same
-order. Depth is bright where it is near, confidence where it is high.
+The colour map is cividis (Nunez, Anderson and Renslow 2018): its lightness rises evenly, and colour-blind people see
+the same order. Near depth is bright, and high confidence is bright.
 """
 
 from __future__ import annotations
@@ -24,5 +24,5 @@ COLOUR_TABLE = bytes.fromhex(
     "dec958dfca57e0cb56e1cc55e2cd54e4ce53e5cf52e6d051e7d150e8d24fe9d34eead34cebd44bedd54aeed649efd748"
     "f0d846f1d945f2da44f3db42f5dc41f6dd3ff7de3ef8df3cf9e03afbe138fce236fde334fee434fee535fee636fee838"
 )
-"""256 colours, R G B of 8 bit each, from 0 (dark) to 1 (bright); tests/intrasplat/test_colours.py compares them with
+"""256 colours, R G B of 8 bit each, from 0 (dark) to 1 (bright). tests/intrasplat/test_colours.py compares them with
 matplotlib's."""

@@ -1,13 +1,13 @@
-"""Every error intrasplat raises on purpose.
+"""Every error that intrasplat raises on purpose.
 
     IntrasplatError
-    ├── InputError            what the user gave cannot be used: names the field and the remedy
-    │   ├── LimitError        it is larger than this machine accepts
+    ├── InputError            the user's input cannot be used: names the field and the remedy
+    │   ├── LimitError        the input is larger than this machine accepts
     │   └── ResumeMismatch    the folder holds a stopped run that this request does not continue
     ├── TrainingDiverged      the optimiser left the finite numbers, or the model collapsed
     ├── SceneError            a stored scene is missing, damaged or of another version
     ├── Cancelled             the caller asked to stop
-    └── UnavailableError      a queue, device or binary that is needed is not there
+    └── UnavailableError      a required queue, device or binary is missing
 
 Each has a code for programs (docs/codes.md) and one sentence for people. InputError and UnavailableError also say what
 to do.
@@ -51,7 +51,7 @@ class InputError(IntrasplatError):
     """The input cannot be used as it is.
 
     Attributes:
-        field: the input that is at fault, in the caller's words ("clip", "calibration", "masks", "options.holdout").
+        field: the input that is wrong, as the caller names it ("clip", "calibration", "masks", "options.holdout").
         problem: what is wrong with it, with the offending value.
         remedy: what to do about it, one sentence.
     """
@@ -78,7 +78,7 @@ class ResumeMismatch(InputError):
 
 
 class TrainingDiverged(IntrasplatError):
-    """Training reached a NaN or lost its Gaussians, or a render holds a NaN."""
+    """Training reached a NaN or lost its Gaussians, or a render contains a NaN."""
 
     code = ErrorCode.TRAINING_DIVERGED
 
@@ -99,8 +99,8 @@ class UnavailableError(IntrasplatError):
     """Something this command needs is not on this machine.
 
     Attributes:
-        remedy: one line that mends it.
-        may_return: it may be there again without anything done here, like a queue on another machine that starts later.
+        remedy: one line that says how to fix it.
+        may_return: it may return by itself, like a queue on another machine that starts later.
     """
 
     code = ErrorCode.UNAVAILABLE

@@ -1,4 +1,4 @@
-"""What a stored scene can be exported as: names, files, which options fit which format, and how they are checked.
+"""The export formats of a stored scene: their names, file names and options, and the check of the options.
 
 intrasplat/export writes the formats; docs/export.md lists their units, axes and readers.
 """
@@ -49,20 +49,20 @@ class ExportOptions(BaseModel):
     )
 
     def given(self) -> dict[str, object]:
-        """The options that were chosen, by name."""
+        """The options that the caller chose, by name."""
         return self.model_dump(exclude_none=True)
 
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format: what comes after the scene's name in a file's name, the media type, and the options that fit."""
+    """An export format: the suffix of its file name, its media type, and the options that fit."""
 
     suffix: str
     media_type: str
     options: tuple[str, ...]
     about: str
     is_stored: bool = False
-    """Made of the stored files, by the service itself; for keys that may download them."""
+    """Whether the service itself writes it from the stored files, for keys that may download them."""
 
 
 _VIDEO = ("view", "every", "t", "baseline_mm")
@@ -98,11 +98,11 @@ EXPORT_FORMATS = {
 """The formats by name."""
 
 _OF_VIEW = {"t": "orbit", "baseline_mm": "stereo"}
-"""Options of a video that fit one view alone."""
+"""Options of a video that fit only one `view`."""
 
 
 def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
-    """The options of an export, checked against its format; those that are None count as not given.
+    """The options of an export, checked against its format; None means not given.
 
     Raises:
         InputError: there is no such format, an option does not fit it, or a value is out of its range.

@@ -1,6 +1,6 @@
-"""Places in mm under pixels of a view, and the distance of two of them over time; how far each may be off.
+"""The result of a measurement: points in mm under pixels of a view, the distance of two over time, and uncertainties.
 
-Symbols: T frames. Uncertainties are expanded uncertainties of factor 2: about 95 % of the true values lie within them
+Symbols: T frames. Uncertainties are expanded, with coverage factor 2: about 95 % of the true values lie within them
 (docs/conventions.md, "Measuring").
 """
 
@@ -93,10 +93,10 @@ class Measurement(BaseModel):
 
 
 def parse_points(text: str) -> tuple[Point, ...]:
-    """Points as the API and the command line spell them, x,y;x,y.
+    """Read points as the API and the command line write them: x,y;x,y.
 
     Raises:
-        InputError: they are not 1 to MAX_POINTS pairs of finite numbers.
+        InputError: the text is not 1 to MAX_POINTS pairs of finite numbers.
     """
     points = []
     for pair in text.split(";"):

@@ -1,6 +1,6 @@
-"""What a report or a picture says about itself: warnings, assumptions and doubts, each with a code.
+"""Notices of a report or a picture: warnings, assumptions and remarks, each with a code.
 
-Programs decide by code and severity; the text is for people, and its words may change. docs/codes.md explains every
+Programs decide by code and severity. The text is for people, and its words may change. docs/codes.md explains every
 code.
 """
 
@@ -24,7 +24,7 @@ class Severity(StrEnum):
 class NoticeCode(StrEnum):
     """The kind of a notice. Two notices of one code differ in their numbers and names only."""
 
-    # what was assumed about the input
+    # assumptions about the input
     BASELINE = "baseline"
     CALIBRATION = "calibration"
     DECODING = "decoding"
@@ -38,12 +38,12 @@ class NoticeCode(StrEnum):
     POSES = "poses"
     RECTIFICATION = "rectification"
     SYNTHETIC = "synthetic"
-    # what the training chose
+    # choices of the training
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
-    # what in the clip makes the result doubtful
+    # warnings about the clip
     ALIGNMENT_UNKNOWN = "alignment_unknown"
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"
@@ -80,7 +80,7 @@ class NoticeCode(StrEnum):
     ROWS_MISALIGNED = "rows_misaligned"
     STEREO_UNSURE = "stereo_unsure"
     VEILED = "veiled"
-    # what the training and its scores say
+    # warnings about the training and its scores
     SCORES_FAILED = "scores_failed"
     SCORES_PENDING = "scores_pending"
     COPYING_SCORES_MORE = "copying_scores_more"
@@ -97,7 +97,7 @@ class NoticeCode(StrEnum):
     OUTLIER_FRAMES = "outlier_frames"
     TIME_TOO_SHORT = "time_too_short"
     TRAINING_SCORE_LOW = "training_score_low"
-    # what to know of one render
+    # notices about one render
     COARSE = "coarse"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"

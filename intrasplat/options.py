@@ -1,7 +1,7 @@
-"""The one definition of what a caller may choose about a reconstruction: names, choices, bounds, meaning.
+"""The single definition of a reconstruction's options: names, choices, bounds, meaning.
 
-Derived from it: the fields of POST /reconstruct, the options of `intrasplat reconstruct`, `submit` and `evaluate`
-(intrasplat/commands/arguments.py), what the decoding process and the training are told, and the form of the page.
+These derive from it: the fields of POST /reconstruct, the options of `intrasplat reconstruct`, `submit` and `evaluate`
+(intrasplat/commands/arguments.py), the parameters of the decoding process and the training, and the form of the page.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from intrasplat.errors import InputError
 from intrasplat.names import Eyes, Keep, Layout, MaskPolarity, MaskSource, PoseConvention, Poses, PresetName, UsedFrames
 
 Priority = Literal["standard", "high"]
-"""high: before all standard jobs, and in place of one that is running, which goes on later from where it was."""
+"""high: runs before all standard jobs, and interrupts one that is running, which resumes later."""
 
 MAX_HOLDOUT_CHARACTERS = 8000
-"""A thousand frame numbers of up to six digits with commas: a job's record must fit into a pipe's buffer."""
+"""Room for a thousand frame numbers of six digits with commas; a job's record must fit into a pipe's buffer."""
 
 MIN_DEPTH_MM, MAX_DEPTH_MM = 10.0, 300.0
-"""What an endoscope sees: sharp from here, and farther on its eyes' pictures differ by a pixel or two."""
+"""Depths that an endoscope sees: nearer it is out of focus, and farther its eyes' pictures differ by 1 or 2 pixels."""
 
 FIELD_PREFIX = "options"
 """InputError.field of an option is `options.NAME`."""
@@ -92,7 +92,7 @@ class ReconstructionOptions(ClipOptions):
     @field_validator("holdout", mode="before")
     @classmethod
     def _frames_as_text(cls, value: object) -> object:
-        """A JSON list of frame numbers means the same as their comma-separated text."""
+        """Accept a JSON list of frame numbers in place of their comma-separated text."""
         return ",".join(str(frame) for frame in value) if isinstance(value, list) else value
 
     @field_validator("max_depth_mm")
@@ -128,7 +128,7 @@ def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Op
     """Options from JSON text or from values by name.
 
     Raises:
-        InputError: names the option at fault, as options.NAME.
+        InputError: an option is wrong; its field is options.NAME.
     """
     try:
         return model.model_validate_json(given) if isinstance(given, str) else model.model_validate(given)

@@ -1,4 +1,4 @@
-"""What a picture of a scene can be: its layer, its file format, its camera, and how it shows what was not seen."""
+"""The choices for a picture of a scene: its layer, its file format, its camera, and how it shows unseen pixels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 from pydantic import BaseModel, ConfigDict, Field
 
 MAX_JUDGED_PIXELS = 1 << 21
-"""A picture smaller than the recording is drawn in the recording's pixels, in at most so many: those of 1920 x 1080."""
+"""A picture smaller than the recording is drawn in the recording's pixels, but at most so many (1920 x 1080)."""
 
 
 class Layer(StrEnum):
@@ -41,7 +41,7 @@ class Highlights(StrEnum):
     OFF = "off"
 
     def shown_in(self, layer: Layer) -> bool:
-        """Whether the render behind a layer has them; only colours can do without."""
+        """Whether the render of a layer includes them; only colours can be rendered without."""
         return self is Highlights.ON or layer is not Layer.RGB
 
 
@@ -69,7 +69,7 @@ class IntrinsicsOverride(BaseModel):
     cy: float | None = Field(default=None, ge=-1e5, le=1e5)
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height in pixels of the image of a clip of width x height."""
+        """Width and height in pixels of the picture, for a clip of width x height."""
         if self.width is not None and self.height is not None:
             return self.width, self.height
         if self.width is not None:

@@ -1,6 +1,6 @@
-"""Where a caller may stand: a rigid transform, or an orbit about a point, such as what the endoscope looked at.
+"""The pose of a caller's camera: a rigid transform, or an orbit about a point, such as what the endoscope looked at.
 
-Symbols: R rotation, C camera centre (mm), P point looked at (mm), D median depth, at which frame 0 looks (mm).
+Symbols: R rotation, C camera centre (mm), P point looked at (mm), D median depth of the clip (mm).
 Axes are OpenCV's (x right, y down, z forward); the world is the endoscope's camera at frame 0.
 """
 
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from intrasplat.errors import InputError
 
 RIGID_TOLERANCE = 1e-3
-"""Largest |R R^T - 1| entry accepted: poses are often typed with four digits."""
+"""Largest entry of |R R^T - 1| that is accepted: poses are often typed with four digits."""
 
 MAX_TRANSLATION_MM = 10_000.0
 POSE_REMEDY = (
@@ -45,7 +45,7 @@ class OrbitPose(BaseModel):
     pitch_deg: float = Field(ge=-90, le=90)
     zoom: float = Field(ge=0.1, le=10)
     about_mm: tuple[float, float, float] | None = None
-    """The point looked at, in the world; None: the one at the median depth on frame 0's axis."""
+    """The point looked at, in the world; None: the point at the median depth on frame 0's axis."""
 
 
 Pose = MatrixPose | OrbitPose
@@ -60,7 +60,7 @@ def orbit(
         yaw_deg: degrees to the right, -180 to 180.
         pitch_deg: degrees up, -90 to 90.
         zoom: times nearer, 0.1 to 10.
-        about_mm: the point in the world, mm; None: the one at the median depth on the first frame's axis.
+        about_mm: the point in the world, mm; None: the point at the median depth on frame 0's axis.
 
     Raises:
         InputError: a number is out of its range.
@@ -73,10 +73,10 @@ def orbit(
 
 
 def parse_pose(text: str) -> Pose:
-    """Read a pose as the API and the command line spell it; numbers may be parted by commas or blanks.
+    """Read a pose as the API and the command line write it; commas or blanks separate the numbers.
 
     Raises:
-        InputError: not one of the two forms, not finite, not rigid, or out of range.
+        InputError: the text has neither form, or the pose is not finite, not rigid, or out of range.
     """
     if text.startswith("orbit:"):
         return _parse_orbit(_numbers(text.removeprefix("orbit:")))
@@ -90,9 +90,9 @@ def parse_pose(text: str) -> Pose:
 
 
 def world_from_camera(pose: Pose, median_depth_mm: float) -> Matrix:
-    """The 4 x 4 transform a pose means, translation in mm; the median depth matters to orbits only.
+    """The 4 x 4 transform of a pose, translation in mm; only orbits use the median depth.
 
-    An orbit is C = P - R z D / zoom with R = Ry(-yaw) Rx(-pitch): it always looks at P, by default (0, 0, D).
+    An orbit is C = P - R z D / zoom with R = Ry(-yaw) Rx(-pitch). It always looks at P, by default (0, 0, D).
     """
     if isinstance(pose, MatrixPose):
         a = pose.rows

@@ -1,4 +1,4 @@
-"""The quality report of a finished scene (report.json): what was measured, what was assumed, what to distrust."""
+"""The quality report of a finished scene (report.json): measurements, assumptions and warnings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from intrasplat.names import JOB_ID_PATTERN, Eye, Eyes
 from intrasplat.notices import Notice, NoticeCode, Severity
 
 REPORT_VERSION = 2
-"""Raised when a field changes its meaning; new fields do not raise it."""
+"""It rises when a field changes its meaning, not when a field is added."""
 VersionText = Annotated[str, Field(pattern=r"^[0-9A-Za-z.+-]{1,40}$")]
 """A version of intrasplat."""
 RESEARCH_USE = "Research use only. Not a medical device; it must not guide treatment."
@@ -239,7 +239,7 @@ class Report(BaseModel):
     @field_validator("warnings", "assumptions", mode="before")
     @classmethod
     def _of_plain_text(cls, notices: object, info: ValidationInfo) -> object:
-        """Reports of version 1 hold texts without codes."""
+        """Convert the notices of a report of version 1, which are texts without codes."""
         if not isinstance(notices, Iterable) or isinstance(notices, str):
             return notices
         severity = Severity.WARNING if info.field_name == "warnings" else Severity.INFO

@@ -1,4 +1,4 @@
-"""What an installed server (the distribution intrasplat-server) adds to the commands of the library."""
+"""Find what an installed server (the distribution intrasplat-server) adds to the commands of the library."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ GROUP = "intrasplat.server"
 
 
 def server_part(name: str) -> Any | None:
-    """What the server registers under this name in GROUP; None: no server is installed."""
+    """The object that the server registers under this name in GROUP; None: no server is installed."""
     for each in entry_points(group=GROUP, name=name):
         return each.load()
     return None

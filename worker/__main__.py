@@ -19,7 +19,7 @@ SUMMARY = "claim jobs from the queue of REDIS_URL and serve renders, until a sig
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one of the two and return its exit code."""
+    """Run one of the two commands and return its exit code."""
     try:
         options = _parser().parse_args(argv)
         command: Callable[[argparse.Namespace], int] = options.command

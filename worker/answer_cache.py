@@ -1,4 +1,4 @@
-"""Answers that were given, for those who ask the same again."""
+"""A cache of replies to render requests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_KEPT_BYTES = 32 * 2**20
 
 
 class KeptReplies:
-    """Renders by request, those asked for last, of at most MAX_KEPT_BYTES in all."""
+    """The most recently used replies by request, of at most max_bytes in all."""
 
     def __init__(self, max_bytes: int = MAX_KEPT_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -24,14 +24,14 @@ class KeptReplies:
         return request in self._replies
 
     def get(self, request: RenderRequest) -> Reply | None:
-        """The answer that was given, if it is kept."""
+        """The cached reply; None if there is none."""
         reply = self._replies.get(request)
         if reply is not None:
             self._replies.move_to_end(request)
         return reply
 
     def keep(self, request: RenderRequest, reply: Reply) -> None:
-        """Keep an answer, in place of those asked for longest ago."""
+        """Store a reply; drop the least recently used ones to make space."""
         self.drop(lambda each: each == request)
         if len(reply.body) <= self._max_bytes // 4:
             self._replies[request] = dataclasses.replace(reply, is_kept=True)
@@ -40,6 +40,6 @@ class KeptReplies:
             self._bytes -= len(self._replies.popitem(last=False)[1].body)
 
     def drop(self, is_out: Callable[[RenderRequest], bool]) -> None:
-        """Forget the answers to these requests."""
+        """Drop the replies to these requests."""
         for request in [request for request in self._replies if is_out(request)]:
             self._bytes -= len(self._replies.pop(request).body)

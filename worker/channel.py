@@ -1,6 +1,6 @@
-"""The device process's end of the messages of worker/orders.py: it sends reports and reads orders.
+"""The device process's side of the messages of worker/orders.py: it sends reports and reads orders.
 
-Imports no torch.
+This module imports no torch.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from contract.runtime import traces
 from worker.orders import DeviceReport, RunJob, ScoreScene, line_of, read_order
 
 TRACES_PATIENCE_S = 1.0
-"""How long the end of the process waits for a collector: less than a supervisor waits for the process."""
+"""How long the process waits at its end for a trace collector: less than a supervisor waits for the process."""
 
 logger = logging.getLogger("intrasplat.worker")
 
 
 class Channel:
-    """Sends reports; for any thread."""
+    """Sends reports; any thread may use it."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -35,20 +35,20 @@ class Channel:
 
     @classmethod
     def instead_of_stdout(cls) -> Channel:
-        """Take stdout for reports; anything else that is printed from now on goes to stderr."""
+        """Use stdout for reports; anything else that is printed from now on goes to stderr."""
         sys.stdout.flush()
         own = os.dup(sys.stdout.fileno())  # child processes do not inherit it
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         return cls(os.fdopen(own, "wb"))
 
     def send(self, message: DeviceReport) -> None:
-        """Write one report; if the supervisor is gone, do nothing."""
+        """Write one report; do nothing if the supervisor has ended."""
         with self._lock, contextlib.suppress(BrokenPipeError):
             self._stream.write(line_of(message))
             self._stream.flush()
 
     def send_if_new(self, message: DeviceReport) -> None:
-        """Write a report unless it equals the last of its type; for one thread."""
+        """Write a report unless it equals the last of its type; only one thread may call this."""
         if self._last.get(type(message)) != message:
             self._last[type(message)] = message
             self.send(message)
@@ -56,14 +56,14 @@ class Channel:
 
 @dataclass(frozen=True)
 class Task:
-    """What was ordered; `stop` is set once it shall stop."""
+    """An order; `stop` is set when the work on it must stop."""
 
     order: RunJob | ScoreScene
     stop: threading.Event = field(default_factory=threading.Event)
 
 
 class Orders:
-    """Reads orders in a thread, which ends the whole process when the orders end."""
+    """Reads orders in a thread, which ends the whole process when the stream ends."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -72,11 +72,11 @@ class Orders:
 
     @classmethod
     def from_stdin(cls) -> Orders:
-        """Orders from stdin, read through a copy: at exit Python must not wait for this thread's lock on sys.stdin."""
+        """Orders from stdin, read through a duplicate: at exit Python must not wait for this thread's lock."""
         return cls(os.fdopen(os.dup(sys.stdin.fileno()), "rb"))
 
     def next(self, timeout_s: float) -> Task | None:
-        """The next task; None after timeout_s."""
+        """The next task; None if none comes within timeout_s."""
         try:
             return self._tasks.get(timeout=timeout_s)
         except queue.Empty:
@@ -87,7 +87,7 @@ class Orders:
         for line in self._stream:
             try:
                 order = read_order(line)
-            except ValidationError:  # of another version: a process that hears no orders would only seem to work
+            except ValidationError:  # of another version: a process that understands no orders would only seem to work
                 logger.error("an order cannot be read; restart the worker after updating the program")
                 os._exit(1)
             if isinstance(order, RunJob | ScoreScene):
@@ -96,4 +96,4 @@ class Orders:
             elif task is not None:
                 task.stop.set()
         traces.flush(TRACES_PATIENCE_S)
-        os._exit(0)  # all that must be kept is on disk already
+        os._exit(0)  # everything that must be stored is on disk already

@@ -1,6 +1,6 @@
-"""The device process as its supervisor sees it: started, given orders, watched, and killed if need be.
+"""Run the device process from the supervisor: start it, give it orders, watch it, and kill it if necessary.
 
-A kernel may crash, hang or eat all memory. Whatever becomes of the device process, the supervisor survives and sees it.
+A kernel may crash, hang or use all memory. The supervisor survives every end of the device process and notices it.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
 from worker.orders import Advanced, DeviceOrder, Failed, Finished, Holding, Ready, Scored, Stopped, line_of, read_report
 
 MAX_START_S = 240.0
-"""To import torch and compile all kernels, on a slow machine whose cache is empty."""
+"""Time to import torch and compile all kernels on a slow machine with an empty cache."""
 
 LOOK_PERIOD_S = 0.1
-"""How soon a supervisor that waits for its child sees what has become of it, or acts on a new order of the queue."""
+"""How soon a supervisor that waits for its child notices its end, or acts on a new order of the queue."""
 
 MAX_STOP_S = 5.0
-"""How long a child that is told to stop may take to save the job's state before it is killed."""
+"""How long a child may take, after an order to stop, to save the job's state before it is killed."""
 
 LAST_REPORTS_S = 0.5
-"""How long to wait for the last reports of a dead child, in case a process of its own holds its pipe open."""
+"""How long to wait for the last reports of a dead child: a process that it started may keep its pipe open."""
 
 MAX_END_S = 2.0
-"""A child without a job ends at once when its orders end."""
+"""How long a child without a job may take to end after its orders end."""
 
 logger = logging.getLogger("intrasplat.worker")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """The child is gone; cause is for the log."""
+    """The child has ended; cause is for the log."""
 
     cause: str
 
@@ -47,7 +47,7 @@ JobReport: TypeAlias = Advanced | Finished | Scored | Stopped | Failed
 
 
 class DeviceChild:
-    """One running device process: send() gives orders, next_report() hears of the job. `kill` must end the process."""
+    """One running device process: send() gives orders, next_report() returns reports. `kill` must end the process."""
 
     def __init__(self, process: subprocess.Popen[bytes], kill: Callable[[], None]) -> None:
         self.process = process
@@ -60,19 +60,19 @@ class DeviceChild:
 
     @property
     def ended(self) -> Ended | None:
-        """How the process ended; None while it runs. For any thread."""
+        """How the process ended; None while it runs. Any thread may ask."""
         status = self.process.poll()
         return None if status is None else Ended(cause_of(status))
 
     def send(self, order: DeviceOrder) -> None:
-        """Give an order. A dead child hears none, which next_report() tells."""
+        """Give an order. If the child is dead, nothing happens; next_report() returns its end."""
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError, ValueError):
             self.process.stdin.write(line_of(order))
             self.process.stdin.flush()
 
     def next_report(self, timeout_s: float) -> JobReport | Ended | None:
-        """The next report on the job, then the child's end; None after timeout_s."""
+        """The next report on the job; after the last one, the child's end. None if nothing comes within timeout_s."""
         with contextlib.suppress(queue.Empty):
             return self._reports.get(timeout=timeout_s)
         ended = self.ended
@@ -99,7 +99,7 @@ class DeviceChild:
 
 
 class ChildKeeper:
-    """Keeps one device process running. Use it from one thread, which must live as long as the process."""
+    """Keeps one device process running. Use it from a single thread, which must live as long as the process."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str] | None = None, last_words: Path | None = None
@@ -110,22 +110,22 @@ class ChildKeeper:
             environment,
             last_words=last_words,
             pipes=True,
-            dies_with_parent=False,  # it sees to that itself
+            dies_with_parent=False,  # the child arranges that itself
             grace_s=MAX_END_S,
         )
         self._child: DeviceChild | None = None
 
     @property
     def live(self) -> DeviceChild | None:
-        """The child, if it is ready and has not ended; for any thread."""
+        """The child, if it is ready and has not ended; any thread may ask."""
         child = self._child
         return child if child is not None and child.ready is not None and child.ended is None else None
 
     def child(self, end: threading.Event) -> DeviceChild | None:
-        """The child as soon as it is ready; None if `end` was set first.
+        """Wait until the child is ready and return it; None if `end` is set first.
 
         Raises:
-            UnavailableError: the child cannot work here; carries its last words.
+            UnavailableError: the child cannot work here; the error is the one that it left as last words.
         """
         while not end.is_set():
             ended = self._supervised.watch()
@@ -142,7 +142,7 @@ class ChildKeeper:
         return None
 
     def stop(self) -> None:
-        """Let a child without a job end, for good."""
+        """End a child without a job, and start no other."""
         self._supervised.stop()
 
     def _running(self) -> DeviceChild | None:

@@ -1,6 +1,6 @@
-"""The claim that a worker holds, in a file: if it is killed, the next worker of its name gives the job back at once.
+"""Store a worker's claim in a file: if the worker is killed, the next one of its name gives the job back at once.
 
-Without the file the job would wait until the lease has run out. Only one worker of a name runs on a data directory.
+Without the file the job would wait until the lease expires. Only one worker of a name runs on a data directory.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class HeldClaim:
-    """The file of one worker. It is never needed: whatever fails here, the lease decides."""
+    """The claim file of one worker. It only saves time: if it cannot be used, the lease expires instead."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def note(self, claim: Claim) -> None:
-        """The worker holds this claim from now on."""
+        """Store the claim that the worker holds from now on."""
         try:
             self._path.write_text(json.dumps(asdict(claim)))
         except OSError as error:
             logger.warning("the claim was not noted: %s", error.strerror)
 
     def forget(self) -> None:
-        """The worker holds no claim."""
+        """Remove the file: the worker holds no claim."""
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:
             logger.warning("the noted claim was not removed: %s", error.strerror)
 
     def give_back(self, queue: Queue) -> bool:
-        """Release the claim of an earlier process that was killed, as a death of its job; False if there was none."""
+        """Release the claim of an earlier, killed process, and count a death of its job; False if there was none."""
         try:
             claim = Claim(**json.loads(self._path.read_text()))
         except (OSError, ValueError, TypeError):

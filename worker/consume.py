@@ -1,11 +1,13 @@
-"""The job loop: claim a job, let the device process reconstruct it, settle. No torch here, so nothing can hang.
+"""The job loop: claim a job, let the device process reconstruct it, tell the queue how it ended.
+
+Nothing here uses torch, so nothing can hang.
 
 A job ends in exactly one of done, failed and cancelled. If the child dies, the job is handed back and the death counts
-against it. If this process is told to end, or the job to make way, the job is handed back and a later attempt resumes
-it. If this process dies, its child dies too, the claim runs out, and any worker takes the job.
+against it. If this process must end, or the job must yield to another, the job is handed back and a later attempt
+resumes it. If this process dies, its child dies too, the claim expires, and any worker takes the job.
 
-A job is done before its scene is scored. The scores follow within seconds. If scoring is cut off, the worker scores the
-scene when no job waits.
+A job is done before its scene is scored. The scores follow within seconds. If scoring is interrupted, the worker scores
+the scene when no job waits.
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ CLAIM_TIMEOUT_S = 1.0
 UNREACHABLE_PAUSE_S = 1.0
 
 MAX_STORE_S = 60.0
-"""The job fails when the store fails for so long. For room on the disk it waits as long as it takes."""
+"""The job fails when the store fails for so long. For space on the disk the worker waits without limit."""
 
 PUBLISHING = "publish"
-"""The last stage a caller sees: the scene is published."""
+"""The last stage that a caller sees: the scene is published."""
 
 DONE = "done"
 UNSETTLED = "the queue cannot be reached; the lease will run out"
@@ -55,14 +57,14 @@ logger = logging.getLogger("intrasplat.worker")
 
 @dataclass(frozen=True)
 class Died:
-    """The child is gone. excused: not because of the job, as it had been told to stop or had died before."""
+    """The child has died. excused: not because of the job: it had been ordered to stop, or had died before."""
 
     cause: str
     excused: bool
 
 
 class Consumer:
-    """Takes one job after the other. job_id names the running one and may be read from any thread."""
+    """Runs one job after the other. job_id names the running one; any thread may read it."""
 
     def __init__(
         self,
@@ -115,7 +117,7 @@ class Consumer:
                 self.held.forget()
                 self.job_id = None
                 if scores is not None:
-                    # also while a job waits: made up for later they take several times as long
+                    # Also while a job waits: scoring the scene later takes several times as long.
                     scores.take(child, stop=self._end.is_set)
             else:
                 self._left.make_up(child)
@@ -124,9 +126,9 @@ class Consumer:
 def run_job(
     queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
 ) -> AwaitedScores | None:
-    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's.
+    """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's name.
 
-    Returns the scores that the child measures now, if the job is done.
+    Returns the wait for the scores that the child now measures, if the job is done.
     """
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
@@ -137,7 +139,7 @@ def run_job(
         job = _Job(queue, store, claim, heart, name, end, room)
         try:
             outcome = job.settle(job.work(child, record))
-        except IntrasplatError as error:  # the store failed, and the job is not with the child, or no more
+        except IntrasplatError as error:  # the store failed before the child got the job, or after it finished
             outcome = job.settle(job.without_store(error))
         except Exception as error:
             child.kill()
@@ -149,15 +151,15 @@ def run_job(
     scores = AwaitedScores(store, name, record)
     if outcome == DONE:
         return scores
-    if outcome != UNSETTLED:  # if unsettled, the queue may have accepted the end
-        with contextlib.suppress(UnavailableError):  # else LeftScores forgets it
+    if outcome != UNSETTLED:  # if unsettled, the queue may still have accepted the end
+        with contextlib.suppress(UnavailableError):  # if this fails, LeftScores removes it
             store.expect_no_scores(name, claim.job_id, claim.attempt)
     scores.take(child, stop=lambda: True)
     return None
 
 
 def _log_of(claim: Claim) -> logging.LoggerAdapter[logging.Logger]:
-    """A logger whose lines carry the job's id."""
+    """A logger whose lines contain the job's id."""
     return logging.LoggerAdapter(logger, {"job_id": claim.job_id, "attempt": claim.attempt})
 
 
@@ -186,7 +188,7 @@ class _Job:
         self.is_scoring = False
 
     def work(self, child: DeviceChild, record: JobRecord) -> Finished | Stopped | Failed | Died:
-        """Let the child reconstruct; stop it when the queue or `end` says so, kill it when it hangs."""
+        """Let the child reconstruct; stop it when the queue orders it or `end` is set; kill it when it hangs."""
         job_id, attempt = self._claim.job_id, self._claim.attempt
         self._report(JobProgress(stage=FETCHING, fraction=0.0))
         spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
@@ -224,16 +226,15 @@ class _Job:
         return self._heart.order is not Order.GO_ON or self._end.is_set()
 
     def without_store(self, error: IntrasplatError) -> Failed | Died:
-        """The end of an attempt when the store fails: handed back if it was to stop anyway, else failed."""
+        """The end of an attempt when the store fails: handed back if it had to stop anyway, else failed."""
         if self._is_to_stop():
             return Died("waited for the store", excused=True)
         return Failed(error=describe(error), fault=type(error).__name__)
 
     def settle(self, result: Finished | Stopped | Failed | Died) -> str:
-        """Tell the queue how the attempt ended, and tidy up; returns the outcome for the log.
+        """Tell the queue how the attempt ended, and tidy up; return the outcome for the log.
 
-        Retry until the queue answers or `end` is set. After that touch nothing: whether the claim still stands is
-        unknown.
+        Retry until the queue answers or `end` is set. If `end` comes first, touch nothing: the claim may have expired.
         """
         if isinstance(result, Failed | Died):
             self._stages.end(result.fault if isinstance(result, Failed) else "died")
@@ -255,7 +256,7 @@ class _Job:
         return outcome
 
     def _excuse(self, result: Finished | Stopped | Failed | Died) -> Finished | Stopped | Failed | Died:
-        """The same, but a job that a full disk ended is to be handed back, no death counted."""
+        """The same result, except that a job that a full disk ended is handed back without a counted death."""
         is_full = isinstance(result, Failed) and result.error.code is ErrorCode.STORE_FULL
         died = isinstance(result, Died) and not result.excused
         if is_full or (died and self._room.is_short()):
@@ -268,7 +269,7 @@ class _Job:
         return result
 
     def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
-        """Whether the queue accepts the end (None: it cannot be reached), and the end in words for the log."""
+        """Whether the queue accepts the end (None: it cannot be reached), and a description of the end for the log."""
         if isinstance(result, Finished):
             return self._publish(), DONE
         if isinstance(result, Failed):
@@ -282,7 +283,7 @@ class _Job:
         return accepted, "handed back, its worker's death held against it" if died else "handed back"
 
     def _publish(self) -> bool | None:
-        """Publish the scene, then finish the record, so that whoever sees the job done finds its scene."""
+        """Publish the scene, then finish the record: a caller who sees that the job is done must find its scene."""
         self._report(JobProgress(stage=PUBLISHING, fraction=1.0, seconds_left=0.0))
         order = self._retry_queue(self._heart.beat)
         if order is None or order in (Order.CANCEL, Order.LOST):
@@ -292,7 +293,7 @@ class _Job:
         return self._retry_queue(lambda: self._queue.finish(self._claim))
 
     def _withdraw(self) -> str:
-        """Remove the whole job if it is cancelled, this attempt's files if another worker has taken it over."""
+        """Remove the whole job if it is cancelled, or this attempt's files if another worker has taken it over."""
         order = self._heart.order
         if order not in (Order.CANCEL, Order.LOST):
             order = self._retry_queue(self._heart.beat) or order
@@ -329,7 +330,7 @@ class _Job:
                     return None
 
     def _retry_store(self, work: Callable[[], _Result]) -> _Result:
-        """Retry while the store cannot be reached, for up to MAX_STORE_S; the beats go on."""
+        """Retry while the store cannot be reached, for up to MAX_STORE_S; the heartbeat continues."""
         deadline_s = time.monotonic() + MAX_STORE_S
         while True:
             try:
@@ -342,7 +343,7 @@ class _Job:
                 self._end.wait(UNREACHABLE_PAUSE_S)
 
     def _remove(self, work: Callable[[], object]) -> None:
-        """Remove files; what cannot be removed now the service's sweep removes later."""
+        """Remove files. If that fails now, the service's sweep removes them later."""
         try:
             work()
         except UnavailableError as error:

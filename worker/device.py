@@ -59,16 +59,17 @@ from worker.snapshot import Snapshots
 from worker.views import Views
 
 REPORT_PERIOD_S = 0.1
-"""Minimum time between two reports of one stage."""
+"""Minimum time between two reports within a stage."""
 
 MAX_WAIT_SHARE = 0.4
-"""Of the time after which the service gives up a render: who would wait longer is told when to come back."""
+"""Share of the time after which the service gives up a render. A request that would wait longer is refused, with the
+time at which to ask again."""
 
 MAX_GPU_REST_S = 0.5
-"""After a render beside training on a GPU (worker/pace.py)."""
+"""Longest rest after a render beside training on a GPU (worker/pace.py)."""
 
 LAST_SNAPSHOT_S = 10.0
-"""How long the last snapshot of a finished job is still shown: until the service knows of the scene."""
+"""How long the last snapshot of a finished job is still rendered: until the service knows the scene."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -76,11 +77,11 @@ logger = logging.getLogger("intrasplat.worker")
 def run_device(settings: Settings) -> None:
     """Obey the orders on stdin. It never returns, because the end of the orders ends the process.
 
-    What keeps it from starting (a device, data directory or endpoint that cannot be used) is left to the supervisor
-    as last words (intrasplat/commands/exits.py), and the supervisor tells the user.
+    If it cannot start (the device, data directory or endpoint cannot be used), it leaves the error as last words
+    (intrasplat/commands/exits.py), which the supervisor shows to the user.
 
     Raises:
-        SystemExit: something that it needs is not there.
+        SystemExit: something that it needs is missing.
     """
     die_with_parent()
     channel = Channel.instead_of_stdout()
@@ -97,7 +98,7 @@ def run_device(settings: Settings) -> None:
 def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     device = choose_device(settings.device, cpu_by=CPU_BY_VARIABLE)
     if settings.segmenter is not None:
-        load_segmenter(settings.segmenter)  # says now what every job without masks would fail by
+        load_segmenter(settings.segmenter)  # fails now, not at each job without masks
     store, snapshots = open_store(settings), Snapshots()
     pace = (
         RenderPace(thread_count(), used_s=time.process_time)
@@ -110,7 +111,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     if device == CPU:
         compile_kernels()
     else:
-        examine(device)  # what a job's model needs beside it is compiled for the job
+        examine(device)  # kernels that only a job's model needs are compiled at the job
     compile_coder()
     logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
@@ -124,8 +125,8 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         views.answer_in_parts,
         pace,
         cost=views.cost,
-        within=lambda: alone(is_alone=pace.trains),  # shares in the pool would make those of a training step wait
-        spent_s=cpu_time_s,  # with what this thread waits for a GPU: it asks again and again
+        within=lambda: alone(is_alone=pace.trains),  # a render in the thread pool would delay the training step
+        spent_s=cpu_time_s,  # includes waiting for a GPU: this thread polls it
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
     )
     server = RequestServer(endpoint, scheduler, between=report_held_scenes, render_secret=settings.render_secret)
@@ -145,7 +146,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 
 
 def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace, channel: Channel) -> None:
-    """Do what was ordered, and report it."""
+    """Carry out an order, and report its end."""
     order, limits = task.order, settings.clip_limits
     if order.record.imported is not None:
         take_in(order, order.record.imported, limits, settings.max_upload_bytes, channel)
@@ -174,7 +175,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace,
 def take_in(
     order: RunJob | ScoreScene, imported: Imported, limits: ClipLimits, max_bytes: int, channel: Channel
 ) -> None:
-    """Take in a scene that another installation made; it has its scores."""
+    """Import a scene of another installation, which has its scores already."""
     if isinstance(order, ScoreScene):
         report = order.scene / REPORT
         channel.send(scored(lambda: Report.model_validate_json(report.read_bytes()), report))
@@ -200,7 +201,7 @@ def work_on(
     hooks: TrainingHooks,
     segmenter: Path | None = None,
 ) -> Made | Stopped | Failed:
-    """Run one job until its scene is finished. An error ends the job; only a lost GPU ends this process too."""
+    """Run one job until its scene is finished. An error ends only the job; a lost GPU ends this process, too."""
     job_id = order.record.job_id
     snapshots.begin(job_id)
     try:
@@ -218,10 +219,10 @@ def work_on(
 
 
 def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
-    """What judging comes to. An error leaves the scene without scores, and its report says so.
+    """The result of scoring a scene. After an error the scene has no scores, and its report says so.
 
-    Stopped: the scene may be scored later, because it was told to stop, something is not available now, or its report
-    cannot be read. A lost GPU ends this process.
+    Stopped: the scene may be scored later, because of an order to stop, because something is not available now, or
+    because its report cannot be read. A lost GPU ends this process.
 
     first: the report without scores, or its file.
     """
@@ -245,7 +246,7 @@ def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stoppe
 
 
 class _Reporter:
-    """Sends progress, not too often; for any thread."""
+    """Sends progress at a limited rate; any thread may use it."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -253,7 +254,7 @@ class _Reporter:
         self._next_s = 0.0
 
     def report(self, progress: Progress) -> None:
-        """Send the progress if it begins a stage or REPORT_PERIOD_S has passed."""
+        """Send the progress if a new stage starts or REPORT_PERIOD_S has passed."""
         now_s = time.monotonic()
         if progress.stage == self._stage and now_s < self._next_s:
             return
@@ -264,7 +265,7 @@ class _Reporter:
 def request_of(
     record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None, segmenter: Path | None = None
 ) -> ReconstructionRequest:
-    """The request of a job, with its files in the folder where the store keeps them."""
+    """The reconstruction request of a job, with its files in the folder `spool`."""
     files = record.files
     return ReconstructionRequest(
         clip=spool / files.clip,
@@ -280,7 +281,7 @@ def request_of(
 
 
 def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, hooks: TrainingHooks) -> Made:
-    """Make the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
+    """Train the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
     try:
         return make(request, out, hooks, kept)
     except ResumeMismatch as error:
@@ -290,7 +291,7 @@ def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, ho
 
 
 def _socket_endpoint(store: Store, name: str) -> str:
-    """A unix socket in the data directory; one that an earlier process of this name left is removed."""
+    """The endpoint of a unix socket in the data directory; the socket of an earlier process of this name is removed."""
     path = short_socket_path(store.run_dir, f"{name}.sock")
     path.unlink(missing_ok=True)
     return f"ipc://{path}"

@@ -1,4 +1,4 @@
-"""Exports under way: each is made part by part, as its caller asks for the parts."""
+"""Exports in progress: each is computed part by part, as its caller asks for the parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from intrasplat.errors import SceneError, UnavailableError
 
 MAX_OPEN = 8
 IDLE_S = 120.0
-"""So long after its last part an export is forgotten."""
+"""An export ends this long after its last part if its caller asks for no other."""
 
 
 @dataclass(eq=False)
@@ -23,18 +23,18 @@ class _Open:
 
 
 class OpenExports:
-    """The exports that have begun and not ended, by their ids; for one thread."""
+    """The exports in progress, by their ids; for use in one thread."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._open: dict[str, _Open] = {}
 
     def part(self, request: ExportRequest, begin: Callable[[], Generator[bytes]]) -> tuple[bytes, bool]:
-        """The part that is asked for, and whether more follow. The first is made of begin().
+        """The requested part, and whether more follow. The first part starts the export: begin() yields its parts.
 
         Raises:
-            UnavailableError: too many are under way.
-            SceneError: this export is not under way here.
+            UnavailableError: too many exports are in progress.
+            SceneError: this export is not in progress here.
         """
         if request.part == 0:
             self.forget()
@@ -59,7 +59,7 @@ class OpenExports:
         return content, True
 
     def forget(self, is_gone: Callable[[str, int], bool] = lambda scene_id, attempt: False) -> None:
-        """End the exports of scenes that are gone, and of callers who are."""
+        """End the exports of scenes that were removed, and those that their callers abandoned."""
         now_s = self._clock()
         for export_id, each in list(self._open.items()):
             if now_s - each.used_s > IDLE_S or is_gone(*each.key):
@@ -68,4 +68,4 @@ class OpenExports:
     def _end(self, export_id: str) -> None:
         export = self._open.pop(export_id, None)
         if export is not None:
-            export.parts.close()  # its files go
+            export.parts.close()  # removes its temporary files

@@ -10,27 +10,27 @@ from contract.wire.job import JobProgress
 
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
-        "decode": 20.0,  # a frame has 10 s, which the decoding process enforces first
+        "decode": 20.0,  # a frame may take 10 s, which the decoding process enforces first
         "stereo": 30.0,  # a pair of 4096 x 2160 takes 3 s on a slow core; three are aligned without a report
         "compile": 120.0,  # one set of kernels takes seconds, on a crowded machine minutes
-        "masks": 60.0,  # a frame takes some 10 ms, of a hospital's own segmenter seconds
+        "masks": 60.0,  # a frame takes some 10 ms; with a hospital's own segmenter, seconds
         "poses": 60.0,  # a step of the fit takes up to some seconds
         "fusion": 60.0,  # all frames at once, about 10 ms each
         "motion": 10.0,  # a frame takes some 10 ms
-        "start": 120.0,  # least squares for every Gaussian, and the targets of all frames, without a report between
+        "start": 120.0,  # least squares for every Gaussian, then the targets of all frames, with no report between
         "calibrate": 150.0,  # UNTIMED_STEPS and TIMED_STEPS are 15 iterations of training
         "train": 10.0,  # an iteration takes 10 to 500 ms
-        "finish": 150.0,  # the motion of a long clip becomes patterns in some 10 s
-        "score": 60.0,  # a frame takes some 100 ms; afterwards flow copies of every held-out frame, and the files
+        "finish": 150.0,  # finding the motion patterns of a long clip takes some 10 s
+        "score": 60.0,  # a frame takes some 100 ms; then come the copy baselines and the files
     }
 )
-"""Limits for the stages of intrasplat/pipeline.py: at least ten times what a step took on slow machines."""
+"""Limits for the stages of intrasplat/pipeline.py: at least ten times as long as a step took on slow machines."""
 
 OTHER_LIMIT_S = 60.0
 """The limit of any other stage, and of the time before the first report."""
 
 MAX_LOOK_S = 1.0
-"""How much of the time between two calls of is_hung() counts: a supervisor that was stopped heard nothing."""
+"""Most time between two calls of is_hung() that counts: a suspended supervisor reads no reports."""
 
 
 class HangDetector:
@@ -48,7 +48,7 @@ class HangDetector:
         return self._place[0]
 
     def observe(self, progress: JobProgress) -> None:
-        """Take a report. It is an advance unless it repeats stage, fraction and iteration of the last."""
+        """Take a report. It counts as an advance unless it repeats the last one's stage, fraction and iteration."""
         place = (progress.stage, progress.fraction, progress.iteration)
         if place != self._place:
             self._place, self._silence_s = place, 0.0

@@ -1,4 +1,4 @@
-"""Renew one claim in a thread of its own, which neither work nor a slow disk delays."""
+"""Renew one claim in a separate thread, which neither work nor a slow disk delays."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class Heartbeat:
-    """A context manager that beats for a claim every BEAT_PERIOD_S, and at once when a new stage begins.
+    """A context manager that beats for a claim every BEAT_PERIOD_S, and at once when a new stage starts.
 
-    Each beat carries the newest progress and brings back the queue's order. CANCEL, YIELD and LOST are kept once heard.
-    While the queue cannot be reached the work goes on; the claim stands if the queue answers again within the lease.
+    Each beat sends the newest progress and returns the queue's order. CANCEL, YIELD and LOST stay in force.
+    While the queue cannot be reached, the work continues; the claim is valid if the queue answers within the lease.
     """
 
     def __init__(self, queue: Queue, claim: Claim) -> None:
@@ -56,14 +56,14 @@ class Heartbeat:
         """Send this progress with the next beat that is due."""
         with self._changed:
             before = self._progress
-            if before is not None:  # keep showing what training reached
+            if before is not None:  # keep the scores and iterations of training
                 progress = progress.model_copy(update=_reached(before, progress))
             self._urgent = self._urgent or before is None or before.stage != progress.stage
             self._progress, self._unsent = progress, True
             self._changed.notify()
 
     def beat(self) -> Order:
-        """Beat now; returns the queue's order.
+        """Beat now; return the queue's order.
 
         Raises:
             UnavailableError: the queue cannot be reached.
@@ -78,7 +78,7 @@ class Heartbeat:
                 with self._changed:
                     self._unsent = self._unsent or progress is not None
                 raise
-            # YIELD may be followed by CANCEL or LOST, which are final.
+            # CANCEL and LOST are final; they may follow YIELD.
             if order is not Order.GO_ON and self._order in (Order.GO_ON, Order.YIELD):
                 self._order = order
             return self._order
@@ -90,7 +90,7 @@ class Heartbeat:
             began_s = time.monotonic()
             try:
                 self.beat()
-            except Exception as error:  # go on after any error: without beats the claim is lost
+            except Exception as error:  # continue after any error: without beats the claim is lost
                 if not away:
                     reason = error.problem if isinstance(error, UnavailableError) else type(error).__name__
                     logger.warning("the queue cannot be reached: %s", reason, extra={"job_id": self._claim.job_id})
@@ -116,7 +116,7 @@ class Heartbeat:
 
 
 def _reached(before: JobProgress, now: JobProgress) -> dict[str, object]:
-    """What a stage that does not train leaves out: the scores and the iterations."""
+    """The earlier scores and iterations, which the progress of a stage without training does not have."""
     scores = {"psnr_db": before.psnr_db, "psnr_right_db": before.psnr_right_db}
     iterations = {"iteration": before.iteration, "iterations": before.iterations}
     return {**(scores if now.psnr_db is None else {}), **(iterations if now.iterations == 0 else {})}

@@ -1,6 +1,6 @@
 """Describe an error to the caller of a job.
 
-The text of an unforeseen error may hold the names of a caller's files, so neither the caller nor the log gets it.
+The text of an unforeseen error may contain names of a caller's files, so neither the caller nor the log gets it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 def describe(error: Exception) -> JobError:
-    """Problem and remedy of an error. An unforeseen one is told by its type alone, as its text may hold anything."""
+    """Problem and remedy of an error; for an unforeseen error only its type."""
     if isinstance(error, InputError):
         return JobError(code=error.code, problem=error.problem, field=error.field, remedy=error.remedy)
     if isinstance(error, UnavailableError):
@@ -27,7 +27,7 @@ def describe(error: Exception) -> JobError:
     if isinstance(error, OSError) and error.errno in NO_ROOM:
         remedy = "Free space on its disk, and retry the job."
         return JobError(code=ErrorCode.STORE_FULL, problem="The worker's disk is full.", remedy=remedy)
-    # torch.OutOfMemoryError is known by its name, because the supervisor does not load torch
+    # Recognise torch.OutOfMemoryError by its name, because the supervisor does not load torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         remedy = "Send a shorter or smaller clip."
         return JobError(code=ErrorCode.OUT_OF_MEMORY, problem="The worker ran out of memory.", remedy=remedy)

@@ -1,4 +1,4 @@
-"""The spans of a job in a worker: its wait, each attempt, and its stages (contract/runtime/traces.py)."""
+"""Trace spans of a job in a worker: its wait, each attempt, and its stages (contract/runtime/traces.py)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from contract.wire.job import JobRecord
 def attempt_span(record: JobRecord, worker: str) -> Iterator[Span]:
     """The span of one attempt at a job, in the trace of the request that submitted it.
 
-    Before the first attempt there is one of the time that the job waited.
+    The first attempt also gets a span of the time that the job waited.
     """
     parent = record.trace or traces.NEW
     if record.attempt == 1:
@@ -26,20 +26,20 @@ def attempt_span(record: JobRecord, worker: str) -> Iterator[Span]:
 
 
 class StageSpans:
-    """A span for each stage: it lasts until the next stage is reached, or the end."""
+    """A span for each stage, until the next stage or the end."""
 
     def __init__(self) -> None:
         self._stage = ""
         self._span: Span = INVALID_SPAN
 
     def reached(self, stage: str) -> None:
-        """Say at which stage the job is."""
+        """Note the stage that the job has reached."""
         if stage != self._stage:
             self.end()
             self._stage, self._span = stage, traces.begin(stage)
 
     def end(self, failed: str | None = None) -> None:
-        """No stage follows. failed: the type of the error that ended the last one."""
+        """End the last span. failed: the type of the error that ended the last stage."""
         if failed is not None:
             traces.fail(self._span, failed)
         self._span.end()

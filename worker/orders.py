@@ -1,11 +1,11 @@
 """The messages between the supervisor and its device process, one JSON document per line.
 
     supervisor -> child   on the child's stdin    RunJob, ScoreScene, StopJob; when stdin closes, the child ends at once
-    child -> supervisor   on the child's stdout   Ready once; Holding at any time; for an order any number of Advanced
-                                                  and what ends it
+    child -> supervisor   on the child's stdout   Ready once; Holding at any time; for each order any number of
+                                                  Advanced, then its end
 
-RunJob ends with Stopped or Failed, or with Finished and after it Scored or Stopped. ScoreScene ends with Scored or
-Stopped. The child's death ends either. Only then may another begin.
+RunJob ends with Stopped or Failed, or with Finished followed by Scored or Stopped. ScoreScene ends with Scored or
+Stopped. The child's death ends either. The next order may follow only then.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from intrasplat.machine.hooks import Progress
 from intrasplat.report import Report
 
 FETCHING = "fetch"
-"""The first stage a caller sees: what was sent is fetched, and a scene that was sent whole is read."""
+"""The first stage that a caller sees: the job's files are fetched, and an imported scene is read."""
 
 
 class _Message(BaseModel):
@@ -29,7 +29,7 @@ class _Message(BaseModel):
 
 
 class RunJob(_Message):
-    """Reconstruct the record's clip in the folder `spool` into the empty `out`; go on from what `kept` holds."""
+    """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `kept`."""
 
     kind: Literal["run"] = "run"
     record: JobRecord
@@ -39,7 +39,7 @@ class RunJob(_Message):
 
 
 class ScoreScene(_Message):
-    """Score the finished scene in the folder `scene`, whose clip is in `spool`: its worker ended before it did."""
+    """Score the finished scene in the folder `scene`, whose clip is in `spool`: its worker ended before scoring it."""
 
     kind: Literal["score"] = "score"
     record: JobRecord
@@ -48,13 +48,13 @@ class ScoreScene(_Message):
 
 
 class StopJob(_Message):
-    """Stop what runs; a job that is not finished keeps its state in `kept`. Ignored while nothing runs."""
+    """Stop what runs; an unfinished job stores its state in `kept`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
 
 class Ready(_Message):
-    """The kernels are compiled, and renders are answered at `endpoint`."""
+    """The kernels are compiled, and `endpoint` accepts render requests."""
 
     kind: Literal["ready"] = "ready"
     endpoint: str
@@ -76,7 +76,7 @@ class Advanced(_Message):
 
 
 class Finished(_Message):
-    """The scene is complete in `out`, but for its scores."""
+    """The scene in `out` is complete except for its scores."""
 
     kind: Literal["finished"] = "finished"
 
@@ -89,7 +89,7 @@ class Scored(_Message):
 
 
 class Stopped(_Message):
-    """What ran stopped as ordered. checkpointed: training had begun, and its state is in `kept`."""
+    """The work stopped as ordered. checkpointed: training had started, and its state is in `kept`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
@@ -101,7 +101,7 @@ class Failed(_Message):
     kind: Literal["failed"] = "failed"
     error: JobError
     fault: str
-    """The error's type, for the log. Its text may hold the names of a caller's files."""
+    """The error's type, for the log. The error's text may contain names of a caller's files."""
 
 
 DeviceOrder: TypeAlias = RunJob | ScoreScene | StopJob

@@ -1,12 +1,12 @@
 """Limit the CPU time that renders take while a job trains: both need all cores, and training has a time budget.
 
-A token bucket of CPU seconds. While a job trains, the bucket gains SHARE of the CPU time that this process uses, up to
-MAX_SAVED_S: where other programs take the cores, training gets less, and so do renders. A render takes the CPU time
-that it used out of the bucket, into debt if need be; the next one begins when the debt is paid. Time in which a render
-only waits for a core costs nothing.
+The limit is a token bucket of CPU seconds. While a job trains, the bucket gains SHARE of the CPU time that this process
+uses, up to MAX_SAVED_S. If other programs use the cores, training gets less time, and so do renders. A render takes the
+CPU time that it used out of the bucket, which may become negative (a debt); the next render starts when the debt is
+paid. Time in which a render only waits for a core costs nothing.
 
-A GPU makes a render in milliseconds, but the first of a scene may compile kernels for seconds. So the debt may have a
-limit, whatever caused it: renders that take longer than that limit allows for get more than SHARE.
+A GPU renders in milliseconds, but the first render of a scene may compile kernels for seconds. So max_debt_s may limit
+the debt; renders that exceed it get more than SHARE.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SHARE = 0.12
-"""Of the CPU time while a job trains. Copies of the model, the service and its viewers take some more."""
+"""Renders' share of the CPU time while a job trains. Model copies, the service and its viewers take some more."""
 
 MIN_USE = 0.25
-"""The bucket gains as if the process used at least this share of the cores: while a clip is decoded it uses few."""
+"""The bucket gains as if the process used at least this share of the cores: it uses few while it decodes a clip."""
 
 MAX_SAVED_S = 0.1
 """Enough for a few renders when a viewer opens. More would disturb the 0.3 s in which training times its steps."""
 
 
 class RenderPace:
-    """Rations renders; for one thread that trains and one that renders.
+    """Limits the CPU time of renders; for one thread that trains and one that renders.
 
     Args:
-        cores: what a second can give, in CPU seconds.
+        cores: number of cores: CPU seconds available in a second.
         clock: monotonic seconds.
-        used_s: CPU seconds that this process has used; None: all that the cores give.
+        used_s: CPU seconds that this process has used; None: count all cores as used.
         max_debt_s: CPU seconds; a render never leaves more debt than that.
     """
 
@@ -57,7 +57,7 @@ class RenderPace:
 
     @contextmanager
     def training(self) -> Iterator[None]:
-        """Ration renders while the context lasts."""
+        """Limit renders inside the context."""
         with self._lock:
             self._fill()
             self._trains, self._left_s, self._use = True, MAX_SAVED_S, 1.0
@@ -68,27 +68,27 @@ class RenderPace:
                 self._trains = False
 
     def charge(self, cpu_s: float) -> None:
-        """Count so many CPU seconds of a render."""
+        """Take the CPU seconds of a render out of the bucket."""
         with self._lock:
             self._left_s -= cpu_s
             self._fill()
             self._left_s = max(self._left_s, -self._max_debt_s)
 
     def rest_s(self) -> float:
-        """Seconds until the next render may begin; 0 while no job trains."""
+        """Seconds until the next render may start; 0 while no job trains."""
         with self._lock:
             self._fill()
             return max(0.0, -self._left_s / self._rate) if self._trains else 0.0
 
     def affords(self, cpu_s: float) -> bool:
-        """Whether a render of so many CPU seconds may be made: without going into debt, or after a rest."""
+        """Whether the bucket contains enough for a render of so many CPU seconds, or is full."""
         with self._lock:
             self._fill()
             return not self._trains or min(cpu_s, MAX_SAVED_S) <= self._left_s
 
     @property
     def trains(self) -> bool:
-        """Whether a job trains, so that renders are rationed."""
+        """Whether a job trains, so that renders are limited."""
         return self._trains
 
     @property
@@ -106,6 +106,6 @@ class RenderPace:
         passed_s = now_s - self._at_s
         gained_s = min(max(used_s - self._used_before_s, MIN_USE * self._cores * passed_s), self._cores * passed_s)
         if passed_s > 0:
-            self._use += (gained_s / (self._cores * passed_s) - self._use) * min(1.0, passed_s)  # of about a second
+            self._use += (gained_s / (self._cores * passed_s) - self._use) * min(1.0, passed_s)  # mean of about 1 s
         self._left_s = min(MAX_SAVED_S, self._left_s + SHARE * gained_s)
         self._at_s, self._used_before_s = now_s, used_s

@@ -1,4 +1,4 @@
-"""What a request comes to before it is sent: bytes with what there is to say of them, or an error."""
+"""The reply to a request before it is sent: bytes with their description, or an error."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ from intrasplat.notices import Notice
 
 
 class NotYetError(IntrasplatError):
-    """The job has nothing to show yet."""
+    """The job has no snapshot to show yet."""
 
     code = ErrorCode.NOT_YET
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request: encoded bytes, the model time that they show (clamped), and warnings.
+    """The answer to a request: encoded bytes, the model time that they show (clamped to the clip), and warnings.
 
-    iteration: of the snapshot that is shown; None: the scene is finished.
+    iteration: iteration of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
-    gaussians, clip_size, camera: as in WorkerReply.
-    level: of detail at which it was drawn (intrasplat/view/coarse.py); 0 shows all.
-    is_kept: it was made for an earlier request, or its time tells nothing of that of renders.
+    gaussians, clip_size, camera, depth_range_mm: as in WorkerReply.
+    level: level of detail at which it was rendered (intrasplat/view/coarse.py); 0 is full detail.
+    is_kept: the reply comes from the cache or is no render; its time is not used to predict that of renders.
     more: further parts of the export follow.
-    depth_range_mm: of depth in false colours, as in WorkerReply.
     """
 
     body: bytes

@@ -1,4 +1,4 @@
-"""The requests that wait at a worker, and whose turn it is: small ones come first, and none waits for ever."""
+"""The queue of requests at a worker: small ones come first, and none waits for ever."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from contract.wire.rendering import SceneRequest
 
 PATIENCE = 4.0
-"""A request may wait so many times the seconds that it takes, before those that came later are answered first."""
+"""A request may wait PATIENCE times the seconds that it takes; then it comes before later requests."""
 
 FIRST_SPEEDS = (3e11, 1e12, 2e12)
-"""Pixels x Gaussians of the whole picture, rendered in a CPU second at each level of detail
-(intrasplat/view/coarse.py), until the first render has been timed (bm_service, on two cores)."""
+"""First guesses of the speed at each level of detail (intrasplat/view/coarse.py), in pixels x Gaussians of the whole
+picture per CPU second, until a render has been timed (bm_service, on two cores)."""
 COARSEST = len(FIRST_SPEEDS) - 1
-"""Level of detail."""
+"""The coarsest level of detail."""
 LEARNING = 0.2
-"""Share of the newest render in what is known of the speed."""
+"""Weight of the newest render in the moving average of the speed."""
 
 
 @dataclass(eq=False)
@@ -24,11 +24,12 @@ class WaitingRequest:
     """A request that waits or is being answered.
 
     cost       pixels x Gaussians
-    seconds    CPU seconds that all of it will take, as far as known; spent_s: that it has taken
-    least_s    the same at the coarsest level of detail that the caller accepts
-    level      of detail at which it is answered
-    trace      traceparent of the asker; None: it has none
-    arrived_s  monotonic
+    seconds    predicted CPU seconds of the whole answer
+    spent_s    CPU seconds that it has taken so far
+    least_s    predicted CPU seconds at the coarsest level of detail that the caller accepts
+    level      level of detail at which it is answered
+    trace      traceparent of the caller; None: it has none
+    arrived_s  arrival on the monotonic clock
     """
 
     caller: bytes
@@ -44,12 +45,12 @@ class WaitingRequest:
 
     @property
     def due_s(self) -> float:
-        """The order of the answers."""
+        """The key by which requests are ordered."""
         return self.arrived_s + PATIENCE * self.seconds
 
 
 class Turns:
-    """All that wait, and how fast they are answered; for one thread."""
+    """All waiting requests, and how fast they are answered; for use in one thread."""
 
     def __init__(self) -> None:
         self._waiting: list[WaitingRequest] = []
@@ -59,24 +60,24 @@ class Turns:
         return len(self._waiting)
 
     def seconds(self, cost: float, level: int = 0) -> float:
-        """CPU seconds that a request of this cost takes at a level of detail."""
+        """Predicted CPU seconds of a request of this cost at a level of detail."""
         return cost / self._speeds[level]
 
     def learn(self, turn: WaitingRequest) -> None:
-        """Remember how long the answer took."""
+        """Update the speed with the time that the answer took."""
         if turn.cost > 0 and turn.spent_s > 0:
             self._speeds[turn.level] += LEARNING * (turn.cost / turn.spent_s - self._speeds[turn.level])
 
     def add(self, turn: WaitingRequest) -> None:
-        """Let it wait."""
+        """Add a request."""
         self._waiting.append(turn)
 
     def give_up(self, caller: bytes, request_id: bytes) -> None:
-        """Forget a request that nobody waits for any more."""
+        """Remove a request that its caller gave up."""
         self._waiting = [each for each in self._waiting if (each.caller, each.request_id) != (caller, request_id)]
 
     def take(self, below_s: float = math.inf) -> WaitingRequest | None:
-        """The next one to answer, of those that take less than below_s."""
+        """Remove and return the next request to answer, of those that take less than below_s."""
         turn = min(
             (each for each in self._waiting if each.seconds < below_s), key=lambda each: each.due_s, default=None
         )
@@ -85,16 +86,16 @@ class Turns:
         return turn
 
     def take_same(self, request: SceneRequest) -> list[WaitingRequest]:
-        """All who wait for the same answer."""
+        """Remove and return all requests that wait for the same answer."""
         same = [each for each in self._waiting if each.request == request]
         self._waiting = [each for each in self._waiting if each.request != request]
         return same
 
     def others(self, request: SceneRequest) -> int:
-        """How many other answers somebody waits for."""
+        """The number of other answers that are waited for."""
         return len({each.request for each in self._waiting} - {request})
 
     def seconds_before(self, turn: WaitingRequest) -> float:
-        """CPU seconds, at least, of all that are answered before this one; 0 if one of them has the same answer."""
+        """Least CPU seconds of all requests answered before this one; 0 if one of them has the same answer."""
         before = [each for each in self._waiting if each.due_s <= turn.due_s]
         return 0.0 if any(each.request == turn.request for each in before) else sum(each.least_s for each in before)

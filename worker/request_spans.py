@@ -1,4 +1,4 @@
-"""The spans of a request that a worker answers: all of it since it came, and its wait (contract/runtime/traces.py)."""
+"""Trace spans of a request at a worker: all of it since its arrival, and its wait (contract/runtime/traces.py)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from worker.request_queue import WaitingRequest
 
 @contextmanager
 def answer_span(turn: WaitingRequest) -> Iterator[None]:
-    """The span of an answer that is being made; parts of it that begin in the context are within it."""
+    """The span of an answer in progress; spans that start in the context become its children."""
     came_s = _came_s(turn)
     with traces.span(turn.request.kind, turn.trace or traces.NEW, since_s=came_s, job_id=turn.request.scene_id):
         traces.begin("wait for turn", since_s=came_s).end()
@@ -20,7 +20,7 @@ def answer_span(turn: WaitingRequest) -> Iterator[None]:
 
 
 def shared_span(turn: WaitingRequest) -> None:
-    """The span of a request that got the answer of another that asked the same."""
+    """The span of a request that shares the answer to another, equal request."""
     told = traces.Attributes(job_id=turn.request.scene_id, shared=True)
     traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **told).end()
 

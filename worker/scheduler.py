@@ -1,4 +1,4 @@
-"""Decides which answer is computed next, part by part: small ones first, and no more than the pace allows.
+"""Decide which answer is computed next, part by part: small ones first, and no more than the pace allows.
 
 An answer is computed in parts (intrasplat/machine/parts.py). Between two parts the scheduler may start a request that
 takes less than SMALL_SHARE of the time: the large answer waits until the small one is done. Small answers get as much
@@ -23,23 +23,23 @@ from worker.request_queue import COARSEST, Turns, WaitingRequest
 from worker.request_spans import answer_span, shared_span
 
 SMALL_SHARE = 0.25
-"""An answer that takes less than this share of a larger one's time is made between the parts of that one."""
+"""An answer that takes less than this share of a larger one's time is computed between the parts of that one."""
 
 ALL_WITHIN_S = 1.0
-"""Each viewer's picture is at most so old, where a coarser one can make it so."""
+"""Time within which all waiting viewers should get a picture: if necessary, a coarser one."""
 
 MIN_CHARGE_S = 0.01
-"""Counted for each answer while a job trains: service and viewer have work with it, too."""
+"""Least CPU seconds charged for an answer while a job trains: the service and the viewer have work with it, too."""
 
 Answer = Callable[[SceneRequest, int], Parts[Reply]]
-"""What makes the reply to a request at a level of detail (intrasplat/view/coarse.py)."""
+"""Computes the reply to a request at a level of detail (intrasplat/view/coarse.py), in parts."""
 
 
 @dataclass(frozen=True)
 class Answered:
-    """Requests that asked the same, and their answer.
+    """Equal requests, and their answer.
 
-    seconds: wall time from the first part to the last, with all that was done in between
+    seconds: wall time from the first part to the last, including other work in between
     """
 
     turns: tuple[WaitingRequest, ...]
@@ -62,12 +62,12 @@ class Scheduler:
     """The requests of one worker, from their arrival until they are answered.
 
     Args:
-        answer: makes a reply in parts.
-        pace: how much of the time answers may take.
-        cost: what an answer takes, in pixels x Gaussians.
-        within: a context for each part.
+        answer: computes a reply in parts.
+        pace: limits the CPU time of answers.
+        cost: cost of an answer in pixels x Gaussians.
+        within: context in which each part runs.
         spent_s: CPU seconds that this thread has used.
-        max_wait_s: requests whose turn is farther off are refused.
+        max_wait_s: requests that would wait longer are refused.
     """
 
     def __init__(
@@ -87,14 +87,14 @@ class Scheduler:
         self._spent_s = spent_s
         self._max_wait_s = max_wait_s
         self._turns = Turns()
-        self._tasks: list[_Task] = []  # a stack: each is much smaller than the one before it, which waits for it
+        self._tasks: list[_Task] = []  # a stack: each task waits for the next one, which is much smaller
 
     def take_in(
         self, caller: bytes, request_id: bytes, request: SceneRequest, trace: str | None = None
     ) -> float | None:
-        """Answer a request when its turn comes: None. Or refuse it: the seconds until its turn, as far as known.
+        """Queue a request and return None; or refuse it and return the predicted seconds that it would have to wait.
 
-        trace: of its asker (Turn). Raises whatever cost raises.
+        trace: traceparent of the caller (WaitingRequest). Raises whatever `cost` raises.
         """
         cost = self._cost(request)
         seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
@@ -105,7 +105,7 @@ class Scheduler:
         return None
 
     def give_up(self, caller: bytes, request_id: bytes) -> None:
-        """Nobody waits for this request any more: forget it, or abandon its answer."""
+        """Remove a request that its caller gave up, or abandon its answer."""
         self._turns.give_up(caller, request_id)
         for task in [each for each in self._tasks if (each.turn.caller, each.turn.request_id) == (caller, request_id)]:
             self._abandon(task)
@@ -116,11 +116,11 @@ class Scheduler:
             self._abandon(task)
 
     def rest_s(self) -> float:
-        """Seconds until the next part may be made; infinity if nobody waits for one."""
+        """Seconds until the next part may be computed; infinity if no request waits."""
         return self._pace.rest_s() if self._tasks or len(self._turns) else math.inf
 
     def advance(self) -> Answered | None:
-        """Make the next part, if one may be made now. Returns those whose answer it completes."""
+        """Compute the next part, if the pace allows one now. Return the requests whose answer it completes."""
         if self.rest_s() > 0.0:
             return None
         if (turn := self._next()) is not None:
@@ -129,7 +129,7 @@ class Scheduler:
         return self._make_part(self._tasks[-1])
 
     def _next(self) -> WaitingRequest | None:
-        """The request to begin now, if any; the others wait for the task on top."""
+        """The request to start now, if any; the others wait for the task on top of the stack."""
         if not self._tasks:
             return self._turns.take()
         top = self._tasks[-1]
@@ -147,7 +147,7 @@ class Scheduler:
                 task.context.run(next, task.parts)
         except StopIteration as end:
             outcome = end.value
-        except Exception as error:  # what one caller asks must not end the thread for all
+        except Exception as error:  # one caller's request must not end the thread for all
             outcome = error
         task.small_s = self._spent_s() - start_s
         task.turn.spent_s += task.small_s
@@ -166,7 +166,7 @@ class Scheduler:
         return Answered(turns, outcome, time.perf_counter() - task.start_s)
 
     def _wait_s(self, turn: WaitingRequest) -> float:
-        """Seconds until its turn, as far as known."""
+        """Predicted seconds until a request is answered."""
         larger = [each.turn for each in self._tasks if turn.seconds >= SMALL_SHARE * each.turn.seconds]
         left_s = (max(0.0, self._turns.seconds(each.cost, each.level) - each.spent_s) for each in larger)
         before_s = self._turns.seconds_before(turn) + sum(left_s)
@@ -183,15 +183,15 @@ class Scheduler:
         del self._tasks[place]
 
     def _coarsest(self, request: SceneRequest) -> int:
-        """The coarsest level of detail that will do."""
+        """The coarsest level of detail that the request accepts."""
         may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
         return COARSEST if self._pace.trains and may_be_coarse else 0
 
     def _level(self, turn: WaitingRequest) -> int:
-        """The level of detail at which it is answered now: as fine as time allows.
+        """The level of detail at which a request is answered now: as fine as time allows.
 
-        0, the finest, if no job trains, the format is exact, or nobody else waits and the pace affords it. 1 if the
-        answers of this level to all who wait take less than ALL_WITHIN_S. 2 otherwise.
+        0, the finest, if no job trains, the format is exact, or nobody else waits and the pace affords it. 1 if answers
+        of this level to all waiting requests take less than ALL_WITHIN_S. 2 otherwise.
         """
         others = self._turns.others(turn.request)
         if self._coarsest(turn.request) == 0 or (others == 0 and self._pace.affords(turn.seconds)):

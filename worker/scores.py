@@ -1,6 +1,6 @@
-"""The scores of finished scenes: waited for while the device process measures them, made up for where that was cut off.
+"""Wait for the scores that the device process measures, and score scenes whose scoring was interrupted.
 
-No torch here, so nothing can hang.
+Nothing here uses torch, so nothing can hang.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from worker.hang import HangDetector
 from worker.orders import Advanced, Scored, ScoreScene, StopJob, Stopped
 
 ASK_PERIOD_S = 1.0
-"""How often the queue is asked whether a job waits while nothing but scores is to do."""
+"""How often the worker asks the queue for waiting jobs while it only scores."""
 
 RETRY_AFTER_S = 60.0
-"""How long a scene waits after a try that ended without scores."""
+"""How long a scene waits after an attempt that ended without scores."""
 
 logger = logging.getLogger("intrasplat.worker")
 
 
 class AwaitedScores:
-    """Waits for the scores of a finished scene and adds them to it. name: the worker's."""
+    """Waits for the scores of a finished scene and adds them to it. name: the worker's name."""
 
     def __init__(self, store: Store, name: str, record: JobRecord) -> None:
         self._store = store
@@ -43,10 +43,10 @@ class AwaitedScores:
     def take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool = False) -> bool:
         """Wait until the child has scored the scene, is stopped, hangs or dies.
 
-        gives_up: a child that hangs or dies is the scene's fault, and its report says that there will be no scores.
+        gives_up: blame the scene if the child hangs or dies: its report then says that there will be no scores.
 
         Returns:
-            Whether the scene is settled: its scores are added, or no longer expected.
+            Whether the scene is complete: its scores are added, or no longer expected.
         """
         name, job_id, attempt = self._scene
         with traces.span("score", self._trace, job_id=job_id, attempt=attempt, worker=name):
@@ -72,7 +72,7 @@ class AwaitedScores:
         return False
 
     def _settle(self, scored: Callable[[], Report]) -> bool:
-        """Add the report that this gives. False: it is still expected, and made up for later."""
+        """Add the report that `scored` returns. False: that failed, and the scene will be scored again later."""
         try:
             try:
                 self._store.add_scores(*self._scene, scored())
@@ -86,7 +86,7 @@ class AwaitedScores:
 
 
 class LeftScores:
-    """Scores the scenes whose scoring a death or the end of this worker cut off. name: the worker's."""
+    """Scores scenes whose scoring a death or the end of this worker interrupted. name: the worker's name."""
 
     def __init__(self, queue: Queue, store: Store, name: str, end: threading.Event) -> None:
         self._queue = queue
@@ -95,10 +95,10 @@ class LeftScores:
         self._end = end
         self._warned: set[str] = set()
         self._tried_s: dict[str, float] = {}
-        """When the last try ended, on the monotonic clock."""
+        """When the last attempt ended, on the monotonic clock."""
 
     def make_up(self, child: DeviceChild) -> None:
-        """Score one of these scenes, until a job waits. One whose files cannot be had keeps no other waiting."""
+        """Score one of these scenes; stop when a job waits. A scene whose files cannot be fetched is skipped."""
         try:
             expected = self._store.unscored(self._name)
         except UnavailableError as error:
@@ -121,7 +121,7 @@ class LeftScores:
                 return
 
     def _order_for(self, job_id: str, attempt: int) -> ScoreScene | None:
-        """None: nobody needs these scores any more."""
+        """The order to score a scene; None: its scores are not needed any more."""
         record = self._queue.get(job_id)
         if record is None or record.state is not JobState.DONE or record.attempt != attempt:
             self._store.expect_no_scores(self._name, job_id, attempt)
@@ -132,7 +132,7 @@ class LeftScores:
             self._warn_once(job_id, attempt, error)
             self._store.expect_no_scores(self._name, job_id, attempt)
             return None
-        if report.scored:  # adding the same scores again completes what a kill may have cut off
+        if report.scored:  # adding the same scores again completes an addition that a kill interrupted
             self._store.add_scores(self._name, job_id, attempt, report)
             return None
         spool, scene = self._store.fetch_clip(job_id), self._store.scene_folder(job_id, attempt)
@@ -144,7 +144,7 @@ class LeftScores:
         self._warned.add(job_id)
 
     def _is_to_stop(self) -> Callable[[], bool]:
-        """A question: whether this worker ends, or a job waits, which the queue is asked every ASK_PERIOD_S."""
+        """A function: whether this worker ends or a job waits. It asks the queue every ASK_PERIOD_S."""
         asked_s = time.monotonic()
 
         def is_to_stop() -> bool:
@@ -160,5 +160,5 @@ class LeftScores:
 
 
 def _named(job_id: str, attempt: int) -> dict[str, object]:
-    """What a line of the log carries of a job."""
+    """The fields of a log line that name a job."""
     return {"job_id": job_id, "attempt": attempt}

@@ -1,9 +1,9 @@
 """Answer render and export requests: a ZeroMQ ROUTER in a thread during training (contract/wire/rendering.py).
 
-The thread reads all that has come, lets the scheduler make one part of one answer (worker/scheduler.py), sends
-what that completes, and reads again. A request whose turn is too far off is refused, with the time at which to ask
-again. The folder of a unix socket protects it. TCP is encrypted, and only callers who know the installation's secret
-are answered.
+The thread reads all waiting messages, lets the scheduler compute one part of one answer (worker/scheduler.py), sends
+completed answers, and reads again. A request that would wait too long is refused, with the time at which to ask again.
+The permissions of its folder protect a unix socket. TCP is encrypted, and only callers who know the installation's
+secret are answered.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from worker.reply import NotYetError, Reply
 from worker.scheduler import Answered, Scheduler
 
 POLL_MS = 50
-"""How soon the thread notices that it shall end."""
+"""How soon the thread notices that it must end."""
 
 MAX_REQUEST_BYTES = 64 * 1024
-"""Of one part of a message; a request has some hundred bytes. A caller who sends more loses the connection."""
+"""Limit of one part of a message; a request has some hundred bytes. A caller who sends more loses the connection."""
 
 BETWEEN_PERIOD_S = 1.0
 
 MAX_READ = 1000
-"""Messages read in one go, so that whoever floods the worker keeps nobody else from being answered."""
+"""Most messages that are read before the next part is computed, so that a flood does not stop the answers."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -45,10 +45,10 @@ class RequestServer:
     """A context manager that answers requests at `endpoint`.
 
     Args:
-        scheduler: answers them. An InputError, SceneError or NotYetError is sent to the caller; any other error is
-            logged, and the caller gets its type.
+        scheduler: computes the answers. An InputError, SceneError or NotYetError is sent to the caller; any other error
+            is logged, and the caller gets its type.
         between: called about once a second, in the same thread.
-        render_secret: needed for tcp:// alone.
+        render_secret: needed only for tcp://.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class RequestServer:
         self._socket.close()
 
     def _read(self, wait_s: float) -> None:
-        """Take in what has come; wait so long if nothing has."""
+        """Read the waiting messages; wait up to wait_s if there are none."""
         assert self._socket is not None
         if not self._socket.poll(math.ceil(wait_s * 1e3)):
             return
@@ -141,7 +141,7 @@ class RequestServer:
             return
         try:
             wait_s = self._scheduler.take_in(caller, request_id, request, envelope.trace)
-        except Exception as error:  # what one caller asks must not end the loop for all
+        except Exception as error:  # one caller's request must not end the loop for all
             self._send(caller, request_id, WorkerReply(error=_reply_error(error)))
             return
         if wait_s is not None:
@@ -187,14 +187,14 @@ def _head(reply: Reply, seconds: float) -> WorkerReply:
 
 
 def _busy(wait_s: float) -> ReplyError:
-    """The answer to who would wait too long."""
+    """The answer to a caller who would wait too long."""
     retry_after_s = round(wait_s, 1)
     problem, remedy = "The worker has other pictures to make first.", f"Ask again in {math.ceil(wait_s)} s."
     return ReplyError(kind="busy", problem=problem, remedy=remedy, retry_after_s=retry_after_s)
 
 
 def _reply_error(error: Exception) -> ReplyError:
-    """An error as the caller is told. Of an unforeseen one only its type, because its text may hold anything."""
+    """The error that the caller gets. For an unforeseen error only its type, because its text may contain anything."""
     if isinstance(error, InputError):
         return ReplyError(kind="input", problem=error.problem, field=error.field, remedy=error.remedy)
     if isinstance(error, SceneError):
@@ -210,7 +210,7 @@ def _reply_error(error: Exception) -> ReplyError:
 
 
 def _encrypt(socket: zmq.Socket[bytes], render_secret: str) -> ThreadAuthenticator:
-    """Make the socket a CURVE server that admits only services with this secret; the caller must stop the result."""
+    """Make the socket a CURVE server that admits only services with this secret. The caller must stop the result."""
     own = worker_keys(render_secret)
     socket.curve_server = True
     socket.curve_publickey, socket.curve_secretkey = own.public, own.secret
@@ -232,7 +232,7 @@ class _OneKey:
 
 
 def _bind_address(endpoint: str) -> str:
-    """The address to listen on: every one where `endpoint` has the name by which others reach this machine."""
+    """The address to listen on: all addresses, if `endpoint` has the name by which others reach this machine."""
     parts = urlsplit(endpoint)
     if parts.scheme != "tcp" or parts.hostname in ("127.0.0.1", "::1"):
         return endpoint

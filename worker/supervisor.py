@@ -1,4 +1,4 @@
-"""The worker's process: it holds the claims, its child holds the device, and either may die at any time.
+"""The worker's main process: it holds the claims, and its child uses the device. Either may die at any time.
 
 Nothing here imports torch or compiles anything, so this process starts fast, needs little memory and never hangs.
 """
@@ -26,10 +26,10 @@ from worker.child import ChildKeeper
 from worker.consume import Consumer
 
 LOOK_PERIOD_S = 0.1
-"""How soon a change is announced."""
+"""How soon a change of the address is announced."""
 
 TIDY_PERIOD_S = 600.0
-"""How long a local copy may outlive a scene that was purged on another machine."""
+"""Time between two clean-ups of the store: so long a local copy may outlive a scene purged on another machine."""
 
 DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 
@@ -63,7 +63,7 @@ def run_supervisor(
     queue = RedisQueue(settings.redis_url)
     environment = {**os.environ, **settings.to_environment()}
     keeper = ChildKeeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
-    # The owner's name is new at each start, so that what an earlier process of this name has sent changes nothing.
+    # The owner's name is new at each start, so that late messages of an earlier process of this name have no effect.
     consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
     try:
         check_queue(queue)
@@ -83,7 +83,7 @@ def run_supervisor(
 
 
 def keep_rendering(keeper: ChildKeeper, end: threading.Event) -> None:
-    """Keep the child running, which answers renders, until `end` is set; raises as ChildKeeper.child."""
+    """Keep the child, which answers renders, running until `end` is set; raises as ChildKeeper.child."""
     while keeper.child(end) is not None and not end.wait(LOOK_PERIOD_S):
         pass
 
@@ -119,7 +119,7 @@ def kept_tidy(store: Store) -> Iterator[None]:
                 logger.warning("the store was not tidied: %s", error.problem)
             end.wait(TIDY_PERIOD_S)
 
-    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not joined: a bucket may answer slowly
+    threading.Thread(target=tidy, name="tidy", daemon=True).start()  # not joined: an S3 bucket may answer slowly
     try:
         yield
     finally:

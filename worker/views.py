@@ -1,6 +1,6 @@
-"""Render and export finished scenes, which stay loaded between requests, and render the job that trains.
+"""Render and export finished scenes, which stay loaded between requests, and render the job in training.
 
-A scene whose folder is gone leaves memory at once: a deleted patient's tissue is neither shown nor kept.
+A scene whose folder was removed leaves memory at once: a deleted patient's tissue is neither shown nor stored.
 """
 
 from __future__ import annotations
@@ -54,23 +54,23 @@ from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshot, Snapshots
 
 COPIES = 3
-"""A loaded scene takes memory three times: its tensors, the arrays of its renderer, and about as much in buffers
-(measured: 100 MB more for each scene of 32 MB, of 36,000 Gaussians with 17 bases, shown at 640 x 512)."""
+"""A loaded scene takes three times its size in memory: its tensors, the arrays of its renderer, and about as much in
+buffers (measured: 100 MB for each scene of 32 MB, with 36,000 Gaussians and 17 bases, shown at 640 x 512)."""
 
 MEDIA_TYPE_OF_BYTES, MEDIA_TYPE_OF_JSON = "application/octet-stream", "application/json"
 
 MAX_HELD_SCENES = 64
-"""However small they are: each announcement of the worker names all of them."""
+"""Most scenes in memory, however small: each announcement of the worker names all of them."""
 
 
 LARGE_PIXELS = 1 << 19
-"""Pictures of more take so long to encode that other answers are made meanwhile."""
+"""Pictures of more pixels take so long to encode that other answers are computed meanwhile."""
 
 
 class Views:
-    """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
+    """Answers render and export requests from a store's scenes and a job's snapshots; for use in one thread.
 
-    `held` names the scenes in memory, the last used one at the end; other threads may read it.
+    `held` names the scenes in memory, with the last used one at the end; other threads may read it.
     """
 
     def __init__(
@@ -87,27 +87,27 @@ class Views:
         self._scenes: OrderedDict[tuple[str, int], TrainedScene] = OrderedDict()
         self._kept = KeptReplies()
         self._exports = OpenExports()
-        self._snapshot: Snapshot | None = None  # the last that was shown, of the job
+        self._snapshot: Snapshot | None = None  # the job's snapshot that was shown last
         self._job_id = ""
         self.held: tuple[str, ...] = ()
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
-        """As answer_in_parts, at once."""
+        """As answer_in_parts, in one call."""
         return whole(self.answer_in_parts(request, level))
 
     def answer_in_parts(self, request: SceneRequest, level: int = 0) -> Parts[Reply]:
-        """The encoded image or file. Other answers may be made between its parts.
+        """The encoded image or file. Other answers may be computed between its parts.
 
-        Recorded frames and cameras count as kept: they say nothing of renders' time.
+        Recorded frames and cameras have is_kept set: their time does not predict that of renders.
 
-        level: of the LEVELS of detail, for a render in a format for eyes. Others are exact.
+        level: index into LEVELS of detail, for renders as jpeg or webp. Other formats are exact.
 
         Raises:
             SceneError: the scene is missing or damaged.
             NotYetError: the running job has no snapshot here yet.
             LimitError: the image would exceed request.max_pixels.
-            InputError: the scene cannot be exported so, has no such eye, or nothing can be measured there.
-            UnavailableError: too many exports are under way.
+            InputError: the scene does not allow this export, has no such eye, or nothing can be measured there.
+            UnavailableError: too many exports are in progress.
         """
         if isinstance(request, RecordedRequest):
             return self._recorded(request)
@@ -117,7 +117,7 @@ class Views:
             return self._measured(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
-            yield  # it may have been loaded
+            yield  # loading the scene may have taken long
         else:
             snapshot = self._trained(request.scene_id)
             scene = snapshot.scene
@@ -127,7 +127,7 @@ class Views:
         level = level if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
             reply = yield from self._rendered(scene, request, snapshot, level)
-            # Between the parts of a render a scene may be purged, or a newer snapshot shown.
+            # Between the parts of a render, a scene may be purged or a newer snapshot shown.
             is_held = (
                 (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
             )
@@ -136,7 +136,7 @@ class Views:
         return reply
 
     def cost(self, request: SceneRequest) -> float:
-        """What the answer will take, in pixels x Gaussians; 0 if it is kept at full resolution."""
+        """The cost of the answer in pixels x Gaussians; 0 if it is cached at full detail."""
         if isinstance(request, RenderRequest):
             kept = self._kept.get(request)
             if kept is not None and kept.level == 0:
@@ -164,7 +164,7 @@ class Views:
         return sum(render_cost(each, gaussians) for each in drawn)
 
     def forget_purged(self) -> None:
-        """Drop scenes whose folders are gone, and jobs that have ended. Call it now and then."""
+        """Drop scenes whose folders were removed, and jobs that have ended. Call it regularly."""
         for key in [key for key in self._scenes if not self._store.has_scene(*key)]:
             self._forget(key)
         self._exports.forget(lambda *key: not self._store.has_scene(*key))
@@ -173,7 +173,7 @@ class Views:
             self._snapshot = None
 
     def _recorded(self, request: RecordedRequest) -> Reply:
-        """A recorded frame or its mask: of the job that trains, or of those that a scene keeps."""
+        """A recorded frame or its mask, of the job in training or from a scene's file."""
         media_type = MEDIA_TYPES[ImageFormat.PNG if request.masks is RecordedMasks.ONLY else ImageFormat.JPEG]
         wanted = request.t, request.eye, request.masks
         if request.attempt is not None:
@@ -200,7 +200,7 @@ class Views:
         return snapshot
 
     def _is_newest(self, scene: TrainedScene) -> bool:
-        """Whether no newer snapshot has been shown while this one was rendered."""
+        """Whether no newer snapshot was shown while this one was rendered."""
         return self._snapshot is not None and self._snapshot.scene is scene
 
     def _stored(self, scene_id: str, attempt: int) -> TrainedScene:
@@ -222,7 +222,7 @@ class Views:
     def _rendered(
         self, scene: TrainedScene, request: RenderRequest, snapshot: Snapshot | None, level: int
     ) -> Parts[Reply]:
-        """One render; snapshot: that the scene is of, None for a finished one; level: of detail."""
+        """One render. snapshot: the one that the scene comes from; None: the scene is finished. level: of detail."""
         pose, lens = self._standing(scene, request)
         camera = camera_of(lens, request.camera, request.max_pixels)
         size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
@@ -248,10 +248,10 @@ class Views:
         return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=taken_by)
 
     def _standing(self, scene: TrainedScene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
-        """Where the caller stands, None at the endoscope's left eye, and the lens unless another is given.
+        """The pose of the caller's camera (None: the endoscope's left eye), and its lens before the caller's overrides.
 
         Raises:
-            InputError: it is the right eye's, and that is not known, or a pose is given, too.
+            InputError: the right eye is asked for, and it is not known, or a pose is given, too.
         """
         if request.eye == "left":
             return pose_of(scene, request.pose), scene.intrinsics
@@ -268,13 +268,13 @@ class Views:
         return right_eye(scene, shown_time(scene, request.t), told)
 
     def _measured(self, scene: TrainedScene, request: MeasureRequest) -> Reply:
-        """A Measurement as JSON. It tells nothing of the time of renders."""
+        """A Measurement as JSON. Its time does not predict that of renders."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, self._device)
         return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_kept=True)
 
     def _export(self, scene: TrainedScene, request: ExportRequest) -> Reply:
-        """One part of an export. It tells nothing of the time of renders."""
+        """One part of an export. Its time does not predict that of renders."""
         content, more = self._exports.part(
             request, lambda: export_parts(scene, request.format, request.options, self._device)
         )
@@ -296,7 +296,7 @@ class Views:
 
 
 def _encoded(frame: View, request: RenderRequest, depth_range_mm: tuple[float, float] | None) -> Parts[bytes]:
-    """The file. A large picture takes long and cannot be encoded in parts, so another thread does it."""
+    """The encoded file. A large picture takes long and cannot be encoded in parts, so another thread does it."""
     how = request.layer, request.format, request.quality, request.unseen
     encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
     with traces.span("encode", layer=request.layer.value, format=request.format.value):
@@ -306,17 +306,17 @@ def _encoded(frame: View, request: RenderRequest, depth_range_mm: tuple[float, f
 
 
 def _reply(scene: TrainedScene, frame: View, request: RenderRequest, snapshot: Snapshot | None, body: bytes) -> Reply:
-    """A frame as it is sent."""
+    """The reply with a rendered frame."""
     iteration = None if snapshot is None else snapshot.iteration
     warnings = frame.warnings
     if snapshot is not None:
-        # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
+        # `seen` is computed only when training has ended, so until then the trust is unknown.
         text = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
         goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
         unknown = {NoticeCode.HARDLY_SEEN}
         if snapshot.of_one_moment:
             goes_on = Notice.warning(NoticeCode.FIRST_PICTURE, "First picture: one moment, not yet a model.")
-            # It is shown at every time, and no eye has taught it.
+            # One moment is shown at every time, and no eye has trained the scene.
             unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
         warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
     shown = shown_time(scene, request.t)
@@ -342,5 +342,5 @@ def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:
 
 
 def shown_time(scene: TrainedScene, t: float) -> float:
-    """Model time that is shown for t: after the last frame, that of the last frame."""
+    """The model time that is shown for t: at most that of the last frame."""
     return min(t, (scene.frame_count - 1) / scene.frame_count)

@@ -1,4 +1,5 @@
-"""Command-line options in; a scene or pictures in files out, on this machine and without a service.
+"""The commands of the library, which work on this machine without a service.
 
-Verbs: run_cli of reconstruct and render. Nothing here imports torch before a command runs, so --help answers at once.
+In: command-line options. Out: a scene, pictures or other files. Verbs: add_cli_arguments and run_cli of each command.
+Nothing here imports torch before a command runs, so --help answers at once.
 """

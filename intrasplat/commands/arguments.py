@@ -1,4 +1,4 @@
-"""What the command lines of client and worker share: commands, options made from a model's fields, numbers."""
+"""Helpers of all command lines: add commands, create options from a model's fields, parse numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 def add_command(
     commands: Commands, name: str, summary: str, command: Callable[[argparse.Namespace], int]
 ) -> argparse.ArgumentParser:
-    """A parser for one command, which leaves `command` in the namespace and tells the exit codes in its help."""
+    """A parser for one command. It stores `command` in the namespace and lists the exit codes in its help."""
     parser = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
     parser.epilog = EXIT_CODES_HELP
     parser.set_defaults(command=command)
@@ -31,7 +31,7 @@ def add_options(
 ) -> None:
     """Add one command-line option for each named field of `model` (default: all): flag, type, choices and help.
 
-    The namespace holds None for an option that was not given. The parser refuses more than one of `model.exclusive`. In
+    The namespace has None for an option that was not given. The parser refuses more than one of `model.exclusive`. In
     the help, the last word of an option's name stands for its value (--budget-s S), unless it lists choices.
     `overrides` go to every add_argument, such as nargs="+".
     """
@@ -57,10 +57,10 @@ def add_options(
 
 
 def given_options(namespace: argparse.Namespace, model: type[Options]) -> Options:
-    """The options of add_options that the user gave, as a model; the others have its defaults.
+    """The options of add_options that the user gave, as a model; the others get its defaults.
 
     Raises:
-        InputError: names the option at fault.
+        InputError: an option is invalid; the error names it.
     """
     values = {name: getattr(namespace, name) for name in model.model_fields}
     return parse_options(model, {name: value for name, value in values.items() if value is not None})

@@ -1,4 +1,4 @@
-"""The option --device, which several commands have."""
+"""The option --device of several commands."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from intrasplat.names import DeviceName
 
 
 def add_device(parser: argparse.ArgumentParser, default: str) -> None:
-    """Adds --device."""
+    """Add --device to a parser."""
     what = "auto: an NVIDIA GPU if all of its requirements are met, else the CPU"
     parser.add_argument("--device", choices=get_args(DeviceName), default=default, help=f"{what} (default: {default})")

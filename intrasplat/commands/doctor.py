@@ -1,4 +1,4 @@
-"""`intrasplat doctor`: what is installed, which queue and device would be used, what is missing and how to mend it."""
+"""`intrasplat doctor`: what is installed, which queue and device would be used, what is missing and how to fix it."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ MIN_PYTHON = (3, 11)
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One line of the doctor's answer. remedy is there exactly when something should be done."""
+    """One line of the doctor's output. It has a remedy exactly when the user should do something."""
 
     topic: str
     found: str
     remedy: str | None = None
     blocks: bool = False
-    """Whether intrasplat cannot work like this."""
+    """Whether intrasplat cannot work in this state."""
 
 
 def examine(device: str = "auto", segmenter: Path | None = None) -> list[Diagnosis]:
-    """What the library needs, in the order it is printed.
+    """Findings about everything that the library needs, in the order in which they are printed.
 
     Args:
-        device: what would be asked for: auto, cpu or cuda.
+        device: the setting to examine: auto, cpu or cuda.
         segmenter: an ONNX file that finds instruments; None: there is none.
     """
     return [
@@ -73,7 +73,7 @@ def examine(device: str = "auto", segmenter: Path | None = None) -> list[Diagnos
 
 
 def format_findings(findings: list[Diagnosis]) -> str:
-    """One line a finding, its remedy below it."""
+    """A line for each finding, with its remedy below."""
     lines = []
     for finding in findings:
         mark = "missing" if finding.blocks else ("look" if finding.remedy else "ok")
@@ -90,7 +90,7 @@ def _python() -> list[Diagnosis]:
 
 
 def package_findings(required: Sequence[str], optional: Mapping[str, str]) -> list[Diagnosis]:
-    """A finding for each distribution, with its version. optional: what each is needed for."""
+    """A finding for each distribution, with its version. optional: the purpose of each optional distribution."""
     findings = []
     for name in (*required, *optional):
         try:
@@ -111,7 +111,7 @@ def _device(asked: str) -> list[Diagnosis]:
 
 
 def device_finding(asked: str, gpu: Gpu) -> Diagnosis:
-    """What would be trained on, where this is the setting and that is there."""
+    """The device that training would use with this setting and this GPU."""
     backend = importlib.import_module("intrasplat.splat.backend")
     try:
         device = backend.choose_device(asked, gpu, cpu_by=backend.CPU_BY_VARIABLE)
@@ -141,7 +141,7 @@ def _video() -> list[Diagnosis]:
 
 
 def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
-    """Version of the FFmpeg inside OpenCV's wheel; None if the wheel carries none. cv2 itself does not tell it."""
+    """Version of the FFmpeg inside OpenCV's wheel, which cv2 does not report; None if the wheel has no FFmpeg."""
     for library in site_packages.glob("opencv_*.libs/libavutil*"):
         found = re.search(rb"FFmpeg version n?(\d+(?:\.\d+)+)", library.read_bytes())
         if found:
@@ -152,7 +152,7 @@ def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
 def _segmenter(path: Path | None) -> list[Diagnosis]:
     if path is None:
         return []
-    from intrasplat.instruments import load_segmenter  # needs packages that _packages may miss
+    from intrasplat.instruments import load_segmenter  # needs packages that may be missing
 
     try:
         load_segmenter(path)
@@ -166,7 +166,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Print the findings, those of an installed server too; UNAVAILABLE if something that is needed is missing."""
+    """Print the findings, also those of an installed server; return UNAVAILABLE if something required is missing."""
     segmenter = os.environ.get("INTRASPLAT_SEGMENTER")
     findings = examine(os.environ.get("INTRASPLAT_DEVICE") or "auto", Path(segmenter) if segmenter else None)
     server = server_part("doctor")

@@ -1,4 +1,4 @@
-"""`intrasplat evaluate`: several methods on one clip of your own; a row and a curve for each, and one chart."""
+"""`intrasplat evaluate`: compare several methods on a clip; write a row and a curve for each, and one chart."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COLUMNS = (
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `evaluate`; run_cli reads them."""
+    """Add the options of `evaluate`; run_cli reads them."""
     parser.add_argument("clip", type=Path, metavar="INPUT", help="a video, a folder or a zip, as for reconstruct")
     parser.add_argument(
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
@@ -49,11 +49,11 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Trains with each method, unless its scene is there already, and returns the exit code.
+    """Train with each method, unless its scene exists already, and return the exit code.
 
     Raises:
         InputError: the clip or an option cannot be used.
-        UnavailableError: the device or matplotlib is not there; rows and scenes are written all the same.
+        UnavailableError: the device or matplotlib is missing. Without matplotlib, rows and scenes are still written.
     """
     from intrasplat.reconstruction import load, reconstruct
     from intrasplat.recording import read_clip
@@ -82,7 +82,7 @@ def run_cli(options: argparse.Namespace) -> int:
 
 
 def _row(method: str, report: Report, scene_bytes: int) -> dict[str, object]:
-    """What runs.csv says of a scene; "" where something was not measured."""
+    """The row of a scene in runs.csv; "" where a value was not measured."""
     found = {
         "method": method,
         "t_train_s": _rounded(report.seconds.get("t_train_s"), 1),
@@ -111,13 +111,13 @@ def _write_rows(path: Path, rows: list[dict[str, object]]) -> None:
 
 
 def _curve(path: Path) -> list[tuple[float, float]]:
-    """Seconds of training and psnr_tissue_db on the way."""
+    """The points of a curve: seconds of training and psnr_tissue_db."""
     with path.open(newline="") as file:
         return [(float(each["t_train_s"]), float(each["psnr_tissue_db"])) for each in csv.DictReader(file)]
 
 
 def _draw(path: Path, rows: list[dict[str, object]], curves: dict[str, list[tuple[float, float]]]) -> None:
-    """A line for each method: seconds of training against held-out decibels; dashed: copying the neighbours.
+    """Draw a line for each method, held-out dB over seconds of training; dashed: the copy baselines.
 
     Raises:
         InputError: no frame was held out, so there is nothing to draw.

@@ -1,4 +1,4 @@
-"""Exit codes of every intrasplat command, the same for work here and on a server; and the last words of a process."""
+"""Exit codes of every intrasplat command, local or on a server; and the error that a process leaves when it ends."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXIT_CODES_HELP = (
 
 
 def exit_code_of(error: IntrasplatError) -> ExitCode:
-    """The exit code that stands for `error`."""
+    """The exit code for `error`."""
     if isinstance(error, InputError):
         return ExitCode.BAD_INPUT
     if isinstance(error, UnavailableError):
@@ -41,11 +41,11 @@ def exit_code_of(error: IntrasplatError) -> ExitCode:
 
 
 LAST_WORDS_VARIABLE = "INTRASPLAT_LAST_WORDS"
-"""Names the file in which a process leaves the UnavailableError that ends it; Supervised sets it."""
+"""Environment variable set by Supervised: the file for last words, the UnavailableError that ends a process."""
 
 
 def end_by(error: IntrasplatError) -> ExitCode:
-    """Say on stderr why this process ends, leave an UnavailableError as last words, and return the exit code."""
+    """Print on stderr why this process ends, write an UnavailableError as last words, and return the exit code."""
     print(f"intrasplat: {_in_flags(error)}", file=sys.stderr)
     if isinstance(error, UnavailableError):
         leave_last_words(error)
@@ -53,7 +53,7 @@ def end_by(error: IntrasplatError) -> ExitCode:
 
 
 def leave_last_words(error: UnavailableError) -> bool:
-    """Leave the error to the process that started this one; False: nobody asked, or the file cannot be written."""
+    """Write the error for the process that started this one; False: no file was asked for, or writing failed."""
     path = os.environ.get(LAST_WORDS_VARIABLE)
     if not path:
         return False
@@ -71,7 +71,7 @@ def flag_of(name: str) -> str:
 
 
 def _in_flags(error: IntrasplatError) -> str:
-    """The error's sentences; an option is named as the command line names it."""
+    """The error's sentences, with options named as on the command line."""
     prefix = f"{FIELD_PREFIX}."
     if not isinstance(error, InputError) or not error.field.startswith(prefix):
         return str(error)
@@ -79,7 +79,7 @@ def _in_flags(error: IntrasplatError) -> str:
 
 
 def take_last_words(path: Path) -> UnavailableError | None:
-    """The last words of a process that has ended; None if it left none. Removes their file."""
+    """Read and remove the last words of a process that has ended; None if it left none."""
     try:
         return UnavailableError(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""`intrasplat export`: writes a scene that is on this machine as a file for other programs."""
+"""`intrasplat export`: write a scene on this machine as a file for other programs."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from intrasplat.names import MANIFEST
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `export`; run_cli reads them."""
+    """Add the options of `export`; run_cli reads them."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
     formats = "; ".join(f"{name}: {each.about}" for name, each in EXPORT_FORMATS.items())
     parser.add_argument("--format", default="ply", metavar="FORMAT", help=f"{formats} (default: ply)")
     add_options(parser, ExportOptions)
     parser.add_argument("--out", type=Path, metavar="PATH", help="the file (default: beside SCENE, under its name)")
-    add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
+    add_device(parser, "cpu")  # a GPU takes longer to start than the CPU takes for a few images
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Writes the file and returns the exit code. A file that could not be finished is removed.
+    """Write the file and return the exit code. An unfinished file is removed.
 
     Raises:
         InputError: there is no scene, or an option cannot be used with it.
-        UnavailableError: the device is not there.
+        UnavailableError: the device is missing.
     """
     given = {name: getattr(options, name) for name in ExportOptions.model_fields}
     try:

@@ -1,4 +1,4 @@
-"""The commands of the library. It imports nothing, so that they start at once."""
+"""The list of the library's commands. This module imports nothing, so that the command line starts at once."""
 
 from __future__ import annotations
 
@@ -11,4 +11,4 @@ LOCAL_COMMANDS = {
     "poses": "estimate the path of a stereo clip's camera, and compare it with a known one",
     "doctor": "say what is installed, what would be used, what is missing",
 }
-"""Summaries by command; each is a module of this folder with add_cli_arguments and run_cli."""
+"""Summaries by command. Each command is a module of this folder with add_cli_arguments and run_cli."""

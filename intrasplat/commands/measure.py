@@ -1,4 +1,4 @@
-"""`intrasplat measure`: depths and distances in a scene, as JSON."""
+"""`intrasplat measure`: print depths and distances in a scene as JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from intrasplat.names import MANIFEST
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `measure`; run_cli reads them."""
+    """Add the options of `measure`; run_cli reads them."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
     parser.add_argument(
         "--points",
@@ -30,11 +30,11 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Prints a Measurement (intrasplat/measuring.py) and returns the exit code.
+    """Print a Measurement (intrasplat/measuring.py) and return the exit code.
 
     Raises:
-        InputError: there is no scene, or nothing can be measured there.
-        UnavailableError: the device is not there.
+        InputError: there is no scene, or nothing can be measured in it.
+        UnavailableError: the device is missing.
     """
     from intrasplat.pose import parse_pose
     from intrasplat.scene.checkpoint import load_scene

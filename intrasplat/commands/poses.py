@@ -1,4 +1,4 @@
-"""`intrasplat poses`: estimates the path of a stereo clip's camera, and compares it with a known one."""
+"""`intrasplat poses`: estimate the path of a stereo clip's camera, and compare it with a known one."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ OPTIONS = (
     "min_depth_mm",
     "max_depth_mm",
 )
-"""Those of reconstruct that decide on poses."""
+"""The options of `reconstruct` that affect poses."""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `poses`; run_cli reads them."""
+    """Add the options of `poses`; run_cli reads them."""
     parser.add_argument("clip", type=Path, metavar="CLIP", help="as for reconstruct")
     parser.add_argument(
         "right", type=Path, metavar="RIGHT", nargs="?", help="the right eye, if it is a file of its own"
@@ -55,7 +55,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Estimates, prints, writes. Returns the exit code.
+    """Estimate the path, print and write it, and return the exit code.
 
     Raises:
         InputError: the clip, an option or the true path cannot be used.
@@ -93,10 +93,10 @@ def run_cli(options: argparse.Namespace) -> int:
 
 
 def _of_frames(clip: DepthClip, times_s: Reals, poses: Reals) -> Reals:
-    """The known poses [T, 4, 4] of the clip's frames: a line for each, or those at their times since the first line.
+    """The known poses [T, 4, 4] of the clip's frames: one line per frame, or interpolated at its time.
 
     Raises:
-        InputError: the path is not this clip's.
+        InputError: the path does not belong to this clip.
     """
     from intrasplat.poses.trajectory import at_times
 

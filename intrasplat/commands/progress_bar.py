@@ -1,4 +1,4 @@
-"""The progress bar of every command: one line on a terminal, one line a stage in a log file."""
+"""The progress bar of every command: one line on a terminal, one line for each stage in a log file."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ LINE_COLUMNS = 78
 
 
 class ShownProgress(Protocol):
-    """Progress of a stage: of this process (intrasplat/machine/hooks.py) or of a job on a service.
+    """Progress of a stage of this process (intrasplat/machine/hooks.py) or of a job on a service.
 
-    fraction is of the stage, in [0, 1]; psnr_db is the last held-out psnr_tissue.
+    fraction: the stage's completed share, in [0, 1]. psnr_db: the last held-out psnr_tissue.
     """
 
     @property
@@ -27,7 +27,7 @@ class ShownProgress(Protocol):
 
 
 def format_progress(progress: ShownProgress) -> str:
-    """`train      [######..................]  25 %  31.24 dB  42 s left`, without the parts that are unknown."""
+    """`train      [######..................]  25 %  31.24 dB  42 s left`, without unknown parts."""
     fraction = min(1.0, max(0.0, progress.fraction)) if math.isfinite(progress.fraction) else 0.0
     filled = round(fraction * BAR_CELLS)
     parts = [f"{progress.stage:<10} [{'#' * filled}{'.' * (BAR_CELLS - filled)}] {fraction:4.0%}"]
@@ -39,7 +39,7 @@ def format_progress(progress: ShownProgress) -> str:
 
 
 class ProgressBar:
-    """Writes progress to `stream`. As a context it closes the line whatever happens."""
+    """Writes progress to `stream`. As a context manager it always ends the line."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -48,7 +48,7 @@ class ProgressBar:
         self._line_open = False
 
     def show(self, progress: ShownProgress) -> None:
-        """Redraw the line; on anything but a terminal, write one line a stage."""
+        """Redraw the line on a terminal; elsewhere write one line for each stage."""
         if self._on_terminal:
             self._stream.write(f"\r{format_progress(progress):<{LINE_COLUMNS}}")
             self._line_open = True

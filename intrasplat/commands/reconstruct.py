@@ -1,4 +1,4 @@
-"""`intrasplat reconstruct`: trains a scene from a clip."""
+"""`intrasplat reconstruct`: train a scene from a clip."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
 _BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, MASKS, RECORDED, SCENE)
 UNFINISHED = {*_BEFORE_MANIFEST, *(aside_of(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
-"""What a run that was stopped or killed may leave. The manifest is written last: with it the scene is finished."""
+"""Files that a stopped or killed run may leave. The manifest is written last: it marks a finished scene."""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `reconstruct`; run_cli reads them."""
+    """Add the options of `reconstruct`; run_cli reads them."""
     parser.add_argument(
         "clip", type=Path, metavar="INPUT", help="a video, a folder or a zip: both eyes, or the left one"
     )
@@ -61,11 +61,11 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Reconstructs; SIGINT or SIGTERM stops the run, and the same command resumes it. Returns the exit code.
+    """Reconstruct and return the exit code. SIGINT or SIGTERM stops the run; the same command resumes it.
 
     Raises:
-        InputError: --out holds something else, or as intrasplat.pipeline.reconstruct.
-        Cancelled: a signal came.
+        InputError: --out contains other files, or as intrasplat.pipeline.reconstruct.
+        Cancelled: a signal stopped the run.
     """
     accepted_at_s = time.time()
     from intrasplat.machine.hooks import Hooks
@@ -105,12 +105,12 @@ def _compile(on_cpu: bool) -> None:
 
 
 def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_at_s: float) -> Report:
-    """Reconstruct. torch is imported and kernels are loaded while the clip is opened, unless a GPU may match it, which
-    torch must find."""
+    """Reconstruct. A thread imports torch and loads the kernels while the clip is opened, unless the run may use a GPU,
+    which torch must find first."""
     given = given_options(options, ReconstructionOptions)
     from intrasplat.decode import keep_decoder_ready
 
-    keep_decoder_ready()  # it loads its libraries while this process loads its own
+    keep_decoder_ready()  # the decoder loads its libraries while this process loads its own
     from intrasplat.machine.gpu import may_have_gpu
     from intrasplat.machine.timing import Timings
     from intrasplat.stereo import ClipPaths, open_with_depth
@@ -120,7 +120,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     on_cpu = options.device == "cpu" or not may_have_gpu()
     aside = ThreadPoolExecutor(1)
     pipeline = aside.submit(import_module, "intrasplat.pipeline")
-    aside.submit(_compile, on_cpu)  # nobody waits for it here: the pipeline does, and shows it
+    aside.submit(_compile, on_cpu)  # not awaited here: the pipeline waits for it, and shows that as a stage
     if on_cpu:
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
@@ -145,7 +145,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
 
 
 def _once(event: threading.Event) -> Callable[[int, FrameType | None], None]:
-    """A handler that sets the event at the first signal; the second raises KeyboardInterrupt."""
+    """A signal handler that sets the event at the first signal and raises KeyboardInterrupt at the second."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         event.set()

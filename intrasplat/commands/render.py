@@ -1,4 +1,4 @@
-"""`intrasplat render`: writes images of a scene."""
+"""`intrasplat render`: write images of a scene."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_RENDER_PIXELS = 8192 * 8192
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `render`; run_cli reads them."""
+    """Add the options of `render`; run_cli reads them."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="the folder that reconstruct wrote")
     when = parser.add_mutually_exclusive_group(required=True)
     when.add_argument("--t", type=finite, help="time: 0 is the first frame, 1 the end of the clip")
@@ -64,7 +64,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"
     )
-    add_device(parser, "cpu")  # a GPU needs longer to begin than the CPU for a few images
+    add_device(parser, "cpu")  # a GPU takes longer to start than the CPU takes for a few images
 
 
 def _frames(text: str) -> list[int]:
@@ -78,11 +78,11 @@ def _frames(text: str) -> list[int]:
 
 
 def run_cli(options: argparse.Namespace) -> int:
-    """Renders what is asked for and returns the exit code.
+    """Render the images and return the exit code.
 
     Raises:
         InputError: there is no scene, or an option cannot be used with it.
-        UnavailableError: the device is not there.
+        UnavailableError: the device is missing.
     """
     from intrasplat.pose import parse_pose
     from intrasplat.scene.checkpoint import load_scene
@@ -127,7 +127,7 @@ def _camera(options: argparse.Namespace) -> IntrinsicsOverride:
 
 
 def _targets(options: argparse.Namespace, frame_count: int) -> list[tuple[float, Path]]:
-    """Times and files to write; frame i is shown at t = i / T and written as 00000i.png."""
+    """Model times and the files to write: frame i of T is shown at t = i / T and written as 00000i.png."""
     if options.frames is None:
         return [(options.t, options.out)]
     beyond = [frame for frame in options.frames if frame >= frame_count]

@@ -1,6 +1,6 @@
-"""A stored scene as a file for other programs, in parts.
+"""Export a stored scene as a file for other programs.
 
-In: a Scene, the name of a format and its options. Out: the file's bytes, part by part. Verb: export_parts.
+In: a scene, the name of a format and its options. Out: the file's bytes, part by part. Verb: export_parts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PART_BYTES = 1 << 20
 
 
 def _moment(encode: Callable[[TrainedScene, float], bytes]) -> Writer:
-    """A writer of a function from a scene and a model time to a whole file."""
+    """The writer for a function that encodes a scene at a model time as a whole file."""
     return lambda target: iter((encode(target.scene, target.t),))
 
 
@@ -52,11 +52,11 @@ EXPORTS: dict[str, Writer] = {
 """The writers by the names of EXPORT_FORMATS (intrasplat/formats.py)."""
 
 DRAWN = frozenset({"depth", "webm", "mp4", "mesh-stl", "mesh-ply", "mesh-glb"})
-"""Formats whose parts take renders of the clip's size."""
+"""Formats that need renders of the clip's size."""
 
 
 def export_parts(scene: TrainedScene, name: str, options: ExportOptions, device: Device = CPU) -> Generator[bytes]:
-    """The file in parts of at most PART_BYTES. An empty part means that the work goes on.
+    """The file in parts of at most PART_BYTES bytes. An empty part means that the next one is not ready yet.
 
     Raises, at the first part:
         InputError: there is no such format, or the scene cannot be written in it with these options.
@@ -69,7 +69,7 @@ def export_parts(scene: TrainedScene, name: str, options: ExportOptions, device:
 
 
 def _cut(pieces: Iterator[bytes]) -> Generator[bytes]:
-    """Pieces of any size as parts: large ones cut, small ones joined; empty where nothing is ready."""
+    """Parts from pieces of any size: large pieces are cut, small ones joined; empty if nothing is ready."""
     ready = bytearray()
     for piece in pieces:
         ready += piece

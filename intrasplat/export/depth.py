@@ -15,11 +15,11 @@ from intrasplat.view.render import render_frame
 
 
 def depth_parts(target: ExportTarget) -> Iterator[bytes]:
-    """NPY [F, H, W] float32: the camera's z in mm, from the endoscope's own poses; 0 where nothing solid is, and where
+    """NPY [F, H, W] float32: the camera's z in mm, from the endoscope's own poses; 0 where nothing is solid, and where
     no training frame saw what is shown.
 
     Raises:
-        LimitError: it would take too many bytes.
+        LimitError: the file would have more than MAX_EXPORT_BYTES.
     """
     camera = target.scene.intrinsics
     target.check_size(4 * camera.width * camera.height)

@@ -14,27 +14,27 @@ FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 5126, 5121, 5125
 COMPONENTS = {"f": FLOAT, "u": UNSIGNED_INT}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 VERTICES, INDICES = 34962, 34963
-"""What a part of the buffer is for."""
+"""glTF's targets of a buffer view: vertex attributes or vertex indices."""
 GENERATOR = "intrasplat"
 
 
 def to_gltf(points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[N, 3] in mm and OpenCV axes as glTF has them: metres, +Y up, the camera looks along -Z."""
+    """[N, 3] points, from mm and OpenCV axes to glTF's: metres, +Y up, the camera looks along -Z."""
     return np.asarray(points_mm * np.array([1e-3, -1e-3, -1e-3], np.float32), np.float32)
 
 
 @dataclass
 class Glb:
-    """Arrays are added and give their accessors' numbers; then one mesh of one primitive makes the file."""
+    """A GLB file with one mesh of one primitive: add() its arrays, then call file()."""
 
     _buffer: bytearray = field(default_factory=bytearray)
     _views: list[dict[str, Any]] = field(default_factory=list)
     _accessors: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, values: NDArray[Any], target: int = VERTICES, *, bounds: bool = False, unit: bool = False) -> int:
-        """The accessor of an array [N] or [N, 3 or 4] of float32, uint32 or uint8.
+        """Add an array [N] or [N, 3 or 4] of float32, uint32 or uint8; return the index of its accessor.
 
-        bounds: its least and largest numbers are told. unit: uint8 stands for 0 to 1.
+        bounds: write its minimum and maximum. unit: uint8 means 0 to 1.
         """
         kind = values.dtype.kind
         view = {"buffer": 0, "byteOffset": len(self._buffer), "byteLength": values.nbytes, "target": target}
@@ -58,7 +58,7 @@ class Glb:
         return len(self._accessors) - 1
 
     def file(self, primitive: dict[str, Any], extensions: tuple[str, ...] = (), **more: Any) -> bytes:
-        """The file of a scene with one node that shows a mesh of this primitive; `more` goes into its JSON."""
+        """The file: a scene with one node, whose mesh has this primitive; `more` is added to its JSON."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": GENERATOR},
             "scene": 0,

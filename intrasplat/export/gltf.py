@@ -1,4 +1,4 @@
-"""The Gaussians at one moment as binary glTF with the extension KHR_gaussian_splatting (ratified).
+"""Export the Gaussians at one moment as binary glTF with the extension KHR_gaussian_splatting (ratified).
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
@@ -13,21 +13,21 @@ from intrasplat.scene.scene import TrainedScene
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
-"""The mode of a primitive that is drawn as points."""
+"""glTF's mode of a primitive that is drawn as points."""
 
 TURNED = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""What becomes of the 16 real harmonics when y and z change signs: -1 for those that are odd in y and z together."""
+"""Factors of the 16 real harmonics when y and z change signs: -1 for those that are odd in y and z together."""
 
 
 def export_gltf(scene: TrainedScene, t: float) -> bytes:
     """GLB of N points in metres, +Y up. Programs that do not know the extension show coloured points.
 
     ROTATION is a unit xyzw quaternion, SCALE the standard deviations in metres, OPACITY in [0, 1]; colours are sRGB as
-    shown. The turn of the axes is in the numbers, harmonics included, and not in a node.
+    shown. The numbers themselves, harmonics included, are rotated into glTF's axes; the node has no rotation.
     """
     splats, glb = splats_at(scene, t), Glb()
     w, x, y, z = splats.quaternion.T
-    # Turned by 180 degrees about x: (0, 1, 0, 0) (w, x, y, z) = (-x, w, -z, y), in wxyz.
+    # Rotate by 180 degrees about x: (0, 1, 0, 0) (w, x, y, z) = (-x, w, -z, y), in wxyz.
     rotation = np.stack([w, -z, y, -x], axis=1)
     rgba = np.concatenate([as_bytes(splats.colour), as_bytes(splats.opacity)[:, None]], axis=1)
     attributes = {

@@ -1,4 +1,4 @@
-"""The tissue's surface at one moment in the formats of meshes: STL, PLY and GLB.
+"""Export the tissue's surface at one moment as a mesh: STL, PLY and GLB.
 
 Symbols: V vertices, F faces.
 """
@@ -21,7 +21,7 @@ FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<
 
 
 def mesh_parts(encode: Callable[[Mesh, float], bytes]) -> Callable[[ExportTarget], Iterator[bytes]]:
-    """The writer of a function from a mesh and its model time to a whole file."""
+    """The writer for a function that encodes a mesh at a model time as a whole file."""
 
     def parts(target: ExportTarget) -> Iterator[bytes]:
         mesh = yield from surface(target)
@@ -35,7 +35,7 @@ def _about(t: float) -> str:
 
 
 def stl(mesh: Mesh, t: float) -> bytes:
-    """Binary STL in mm, OpenCV axes; it has no colours. The head of 80 bytes says what it is."""
+    """Binary STL in mm, OpenCV axes, without colours. The header of 80 bytes names its content."""
     rows = np.zeros(len(mesh.faces), FACE)
     corners = mesh.vertices_mm[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -60,7 +60,7 @@ def ply(mesh: Mesh, t: float) -> bytes:
 
 
 def glb(mesh: Mesh, t: float) -> bytes:
-    """Binary glTF in metres, +Y up, seen along -Z, with linear colours at the vertices and no light of its own."""
+    """Binary glTF in metres, +Y up, seen along -Z, with linear colours at the vertices and an unlit material."""
     del t
     made = Glb()
     attributes = {
@@ -74,5 +74,5 @@ def glb(mesh: Mesh, t: float) -> bytes:
 
 
 def _linear(shown: NDArray[np.float32]) -> NDArray[np.float32]:
-    """sRGB numbers in [0, 1] as light (IEC 61966-2-1), which glTF has at vertices."""
+    """sRGB numbers in [0, 1] as linear ones (IEC 61966-2-1), which glTF expects at vertices."""
     return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Large arrays as NPY files, part by part."""
+"""Write large arrays as NPY files, part by part."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Gaussians as PLY files that splat viewers open: of one moment, or of each frame in a zip.
+"""Export the Gaussians as PLY files that splat viewers open: one moment, or all frames in a zip.
 
 Symbols: N Gaussians, K = (degree + 1)^2 coefficients a colour channel.
 """
@@ -50,7 +50,7 @@ def export_ply(scene: TrainedScene, t: float) -> bytes:
 
 
 def ply_head(comment: str, vertices: int, properties: Sequence[tuple[str, str]], faces: int | None = None) -> bytes:
-    """The header of a little-endian PLY: vertices with (type, name) properties and, if given, faces of three."""
+    """The header of a little-endian PLY: vertices with (type, name) properties and, if given, triangles."""
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -72,10 +72,10 @@ def structured(columns: Sequence[tuple[str, NDArray[np.generic]]]) -> NDArray[np
 
 
 def ply_zip_parts(target: ExportTarget) -> Iterator[bytes]:
-    """A zip of 000000.ply and so on, a file for each frame, and times.csv with frame, t and seconds.
+    """A zip with a file for each frame, 000000.ply and so on, and times.csv with frame, t and seconds.
 
     Raises:
-        LimitError: they would take too many bytes.
+        LimitError: the files would have more than MAX_EXPORT_BYTES.
     """
     scene = target.scene
     numbers_each = 17 + 3 * (scene.gaussians.sh.shape[1] - 1)

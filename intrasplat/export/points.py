@@ -1,4 +1,4 @@
-"""The Gaussians' centres at one moment as a coloured point cloud, which any program for point clouds opens."""
+"""Export the Gaussians' centres at one moment as a coloured point cloud."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from intrasplat.scene.scene import TrainedScene
 def export_points(scene: TrainedScene, t: float) -> bytes:
     """Binary PLY of N points: x y z (mm, OpenCV axes), red green blue, alpha (opacity), and trust in [0, 1] (`seen`).
 
-    A point is a Gaussian's centre. It lies within the tissue's surface by about the Gaussian's size.
+    A point is a Gaussian's centre. It lies below the tissue's surface by about the Gaussian's size.
     """
     splats = splats_at(scene, t)
     colour = as_bytes(splats.colour)

@@ -1,4 +1,4 @@
-"""The Gaussians at one moment as a .splat file: 32 bytes each, for viewers in a browser."""
+"""Export the Gaussians at one moment as a .splat file: 32 bytes each, for viewers in a browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), 
 
 def export_splat(scene: TrainedScene, t: float) -> bytes:
     """Rows of position and standard deviations (mm, OpenCV axes), red green blue opacity, and the quaternion wxyz as
-    128 + 128 q. The most visible come first, as converters to this format order them: a viewer may show what has come.
+    128 + 128 q. The most visible ones come first, as in other converters: a viewer may draw while it loads.
     """
     splats = splats_at(scene, t)
     rows = np.empty(len(splats.mean_mm), ROW)

@@ -1,7 +1,7 @@
-"""The tissue's surface at one moment as a coloured mesh: depth of several views, fused.
+"""The tissue's surface at one moment as a coloured mesh, fused from the depth of several views.
 
-Depth of the endoscope's view and of four around it is fused into a truncated signed distance (Curless and Levoy, A
-volumetric method for building complex models from range images, SIGGRAPH 1996), whose zero scikit-image makes a mesh.
+The depths of the endoscope's view and of four around it are fused into a truncated signed distance (Curless and Levoy,
+A volumetric method for building complex models from range images, SIGGRAPH 1996). scikit-image meshes its zero level.
 
 Symbols: X Y Z voxels, H W pixels, V vertices, F faces.
 """
@@ -26,18 +26,18 @@ from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.render import render_frame
 
 SIDE_DEG = 8.0
-"""How far the views around stand from the endoscope's, about the middle of what it sees."""
+"""Angle between the endoscope's view and those around it, about the middle of what it sees."""
 MAX_VOXELS = 4_000_000
 MIN_VOXEL_PX = 1.5
-"""A voxel is at least as large as so many pixels at the median depth."""
+"""Smallest side of a voxel, in pixels at the median depth."""
 TRUNCATION = 4.0
-"""Voxels in front of and behind a surface that its distance is told to."""
+"""Truncation distance: so many voxels in front of a surface and behind it."""
 MAX_STEP = 0.03
-"""Pixels whose neighbours' depths differ by more than this share are edges, and belong to no surface."""
+"""A pixel is an edge, and belongs to no surface, if its neighbours' depths differ by more than this share."""
 STRAYS = 0.5
-"""Percentage of the points at each side that may lie outside the volume."""
+"""Percentage of outliers: points that may lie outside the volume, at each side."""
 MIN_PIECE = 0.01
-"""Pieces with a smaller share of the faces are left out."""
+"""Connected pieces with a smaller share of the faces are removed."""
 SLAB_VOXELS = 500_000
 
 Points = NDArray[np.float32]
@@ -62,16 +62,16 @@ class _SurfaceView:
     camera: Intrinsics
 
     def points_mm(self) -> NDArray[np.float64]:
-        """[M, 3] what it sees, in the world."""
+        """[M, 3] points that the view sees, in the world."""
         pixels = np.flatnonzero(self.depth_mm)
         return unproject(pixels, self.depth_mm.ravel()[pixels], self.camera, self.pose)
 
 
 def surface(target: ExportTarget) -> Generator[bytes, None, Mesh]:
-    """The mesh at the target's moment; yields b"" now and then meanwhile.
+    """Return the mesh at the target's moment; yield b"" now and then meanwhile.
 
     Raises:
-        InputError: scikit-image is not installed, or nothing solid is seen.
+        InputError: scikit-image is not installed, or the views show nothing solid.
     """
     try:
         from skimage.measure import marching_cubes
@@ -121,7 +121,7 @@ def _nothing() -> InputError:
 
 
 def _edges(depth_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[H, W] where depth jumps."""
+    """[H, W] whether depth jumps."""
     square = np.ones((3, 3), np.uint8)
     far, near = cv2.dilate(depth_mm, square), cv2.erode(depth_mm, square)
     return np.asarray(far - near > MAX_STEP * far, np.bool_)
@@ -129,7 +129,7 @@ def _edges(depth_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _Volume:
-    """distance [X, Y, Z] in -1..1, weight [X, Y, Z], colour [3, X, Y, Z] times weight; first_mm: of voxel (0, 0, 0)."""
+    """distance [X, Y, Z] in -1..1, weight [X, Y, Z], colour [3, X, Y, Z] times weight; first_mm: voxel (0, 0, 0)."""
 
     distance: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -139,7 +139,7 @@ class _Volume:
 
 
 def _fused(views: list[_SurfaceView], points_mm: NDArray[np.float64]) -> Generator[bytes, None, _Volume]:
-    """All views in one volume around the points."""
+    """Fuse all views into one volume around the points."""
     first_mm, last_mm = np.percentile(points_mm, (STRAYS, 100 - STRAYS), axis=0)
     own = views[0]
     pixel_mm = float(np.median(own.depth_mm[own.depth_mm > 0])) / own.camera.fx
@@ -168,7 +168,7 @@ def _fuse(
     weight: NDArray[np.float32],
     colour: NDArray[np.float32],
 ) -> None:
-    """Add what a view says of the voxels at the places [X], [Y], [Z]: sums of distance, weight and colour."""
+    """Add a view to the sums of distance, weight and colour of the voxels with the coordinates [X], [Y], [Z]."""
     camera, own = view.camera, np.linalg.inv(view.pose).astype(np.float32)
     x, y, z = at_mm[0][:, None, None], at_mm[1][None, :, None], at_mm[2][None, None, :]
     right, down, ahead = (own[row, 0] * x + own[row, 1] * y + own[row, 2] * z + own[row, 3] for row in range(3))
@@ -188,7 +188,7 @@ def _fuse(
 
 
 def _whole_cubes(told: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[X, Y, Z]: where a voxel and its neighbours before it are all told of: scikit-image asks a cube's last corner."""
+    """[X, Y, Z] whether all corners of the cube that ends at a voxel are known: scikit-image reads the last corner."""
     whole = told.copy()
     for axis in range(3):
         first, rest = (np.moveaxis(whole, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
@@ -198,7 +198,7 @@ def _whole_cubes(told: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _large_pieces(vertices: Points, faces: NDArray[np.uint32]) -> tuple[Points, NDArray[np.uint32]]:
-    """The mesh without the pieces that have less than MIN_PIECE of the faces."""
+    """The mesh without pieces that have less than MIN_PIECE of the faces."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     links = coo_array((np.ones(len(ends), np.bool_), ends.T), shape=(len(vertices), len(vertices)))
     piece = connected_components(links, directed=False)[1][faces[:, 0]]

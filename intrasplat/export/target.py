@@ -24,7 +24,7 @@ MAX_EXPORT_BYTES = 4 << 30
 
 @dataclass(frozen=True)
 class ExportTarget:
-    """A scene, what of it is wanted, and the device that renders it."""
+    """A scene, the options of its export, and the device that renders it."""
 
     scene: TrainedScene
     options: ExportOptions
@@ -32,12 +32,12 @@ class ExportTarget:
 
     @property
     def t(self) -> float:
-        """The model time of a format of one moment, within the clip."""
+        """The model time, clamped to the clip, for formats of one moment."""
         return min(self.options.t or 0.0, (self.scene.frame_count - 1) / self.scene.frame_count)
 
     @cached_property
     def frames(self) -> range:
-        """The frames of a format over time."""
+        """The frames to write, for formats over time."""
         return range(0, self.scene.frame_count, self.options.every or 1)
 
     def time_of(self, frame: int) -> float:
@@ -83,7 +83,7 @@ class Splats:
 
     @property
     def colour(self) -> NDArray[np.float32]:
-        """[N, 3] in [0, 1]: the part of the colour that no view changes."""
+        """[N, 3] in [0, 1]: the part of the colour that is the same from every direction."""
         return np.asarray(np.clip(0.5 + SH_C0 * self.sh[:, 0], 0, 1), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Where each Gaussian is over time, as an NPZ.
+"""Export the Gaussians' positions over time as an NPZ.
 
 Symbols: F frames, N Gaussians.
 """
@@ -21,7 +21,7 @@ def tracks_parts(target: ExportTarget) -> Iterator[bytes]:
     (mm), trust [N] (`seen`), and colour [N, 3] uint8 and opacity [N] of the first of these frames.
 
     Raises:
-        LimitError: it would take too many bytes.
+        LimitError: the file would have more than MAX_EXPORT_BYTES.
     """
     scene, frames = target.scene, target.frames
     count = len(scene.gaussians)

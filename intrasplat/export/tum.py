@@ -1,4 +1,4 @@
-"""The endoscope's path as a TUM file."""
+"""Export the endoscope's path as a TUM file."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ def export_tum(scene: TrainedScene) -> bytes:
 
     The pose is world_from_camera of the left eye.
     """
-    from intrasplat.poses.trajectory import tum_lines  # renders need none of what it imports
+    from intrasplat.poses.trajectory import tum_lines  # imported late: renders do not need what it imports
 
     return tum_lines(scene.frame_times_s, scene.world_from_camera).encode()

@@ -1,4 +1,4 @@
-"""The clip as a video without instruments: as the endoscope saw it, circling about it, or with both eyes side by side.
+"""Export the clip as a video without instruments: from the endoscope, from a circling camera, or for both eyes.
 
 Symbols: F frames of the video, H W pixels.
 """
@@ -28,17 +28,17 @@ CODECS = {"webm": "VP80", "mp4": "vp09"}
 """VP8 takes a third of the time and twice the bytes of VP9, but does not exist in MP4. OpenCV's build has no H.264."""
 MIN_RATE_HZ, MAX_RATE_HZ = 1.0, 120.0
 STILL_RATE_HZ = 25.0
-"""Of a video of one moment."""
+"""Frame rate of a video of one moment."""
 CIRCLE_S = 6.0
 CIRCLE_DEG = (10.0, 6.0)
-"""How far a circle leads to the sides, and up and down, about the middle of what the endoscope sees."""
+"""Half angles of the circle, to the sides and up and down, about the middle of what the endoscope sees."""
 PIECE_BYTES = 1 << 20
 
 Picture = NDArray[np.uint8]
 
 
 def video_parts(container: str) -> Callable[[ExportTarget], Iterator[bytes]]:
-    """The writer of a video in one of CODECS."""
+    """The writer of a video in a container of CODECS."""
 
     def parts(target: ExportTarget) -> Iterator[bytes]:
         pictures, rate_hz = _pictures(target)
@@ -53,7 +53,7 @@ def video_parts(container: str) -> Callable[[ExportTarget], Iterator[bytes]]:
 
 
 def _encoded(pictures: Iterator[Picture], rate_hz: float, path: Path, codec: str) -> Iterator[bytes]:
-    """Write pictures [H, W, 3] RGB into a file; yields b"" after each. An odd row or column is left out."""
+    """Write pictures [H, W, 3] RGB into a file; yield b"" after each. An odd last row or column is cut off."""
     writer = None
     try:
         for picture in pictures:
@@ -72,7 +72,7 @@ def _encoded(pictures: Iterator[Picture], rate_hz: float, path: Path, codec: str
 
 
 def _pictures(target: ExportTarget) -> tuple[Iterator[Picture], float]:
-    """The video's pictures, and how many are shown in a second."""
+    """The video's pictures, and the frame rate in Hz."""
     options, scene = target.options, target.scene
     seconds = float(scene.frame_times_s[-1] - scene.frame_times_s[0])
     rate_hz = STILL_RATE_HZ
@@ -87,7 +87,7 @@ def _pictures(target: ExportTarget) -> tuple[Iterator[Picture], float]:
 
 
 def _shown(target: ExportTarget, t: float, pose: NDArray[np.float64] | None = None, shift_px: float = 0.0) -> Picture:
-    """A picture from a pose (None: the endoscope's own), moved so many pixels to the right; the unseen is hatched."""
+    """A picture from a pose (None: the endoscope's own), shifted right by shift_px; unseen pixels are hatched."""
     camera = target.scene.intrinsics
     camera = dataclasses.replace(camera, cx=camera.cx + shift_px)
     frame = render_frame(target.scene, t, pose, camera, target.device)
@@ -95,7 +95,7 @@ def _shown(target: ExportTarget, t: float, pose: NDArray[np.float64] | None = No
 
 
 def _circle(target: ExportTarget, rate_hz: float) -> Iterator[Picture]:
-    """The camera circles while the clip goes on, or once about the moment that is chosen."""
+    """Pictures of a camera that circles while the clip plays, or once at the chosen moment."""
     scene, fixed_t = target.scene, target.options.t
     pivot_mm = MEDIAN_DEPTH_UNITS / scene.units_per_mm
     turn = round(CIRCLE_S * rate_hz)
@@ -107,10 +107,10 @@ def _circle(target: ExportTarget, rate_hz: float) -> Iterator[Picture]:
 
 
 def _baseline_mm(target: ExportTarget) -> NDArray[np.float64]:
-    """[3] where the right eye is, in the left one's axes.
+    """[3] position of the right eye in the left one's axes.
 
     Raises:
-        InputError: neither the scene nor the caller knows.
+        InputError: neither the scene nor the caller gives it.
     """
     if target.options.baseline_mm is not None:
         return np.array([target.options.baseline_mm, 0.0, 0.0])
@@ -121,8 +121,8 @@ def _baseline_mm(target: ExportTarget) -> NDArray[np.float64]:
 
 
 def _both_eyes(target: ExportTarget, baseline_mm: NDArray[np.float64]) -> Iterator[Picture]:
-    """Left and right side by side, each of full width. Both look the same way, and the right picture is moved so that
-    tissue at the median depth lies in the plane of the screen.
+    """Left and right side by side, each of full width. Both eyes look in the same direction. The right picture is
+    shifted so that tissue at the median depth appears in the plane of the screen.
     """
     scene = target.scene
     shift_px = scene.intrinsics.fx * float(baseline_mm[0]) * scene.units_per_mm / MEDIAN_DEPTH_UNITS

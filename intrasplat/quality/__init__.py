@@ -1,4 +1,5 @@
-"""A trained run and its held-out frames in, the quality report out: scores, checks, what the clip saw of each Gaussian.
+"""Judge a trained scene.
 
-Verbs: trust.trust, quality.first_report, judge.judged, baselines.copy_baselines.
+In: a trained model, its clip, the held-out frames. Out: the quality report, and the trust in each Gaussian.
+Verbs: trust.trust, report.first_report, judge.judged, baselines.copy_baselines.
 """

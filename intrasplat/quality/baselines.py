@@ -1,4 +1,4 @@
-"""What copying scores: held-out frames made from their neighbours in time, with no model at all.
+"""The copy baselines: scores of held-out frames that are copied from their neighbours in time, without a model.
 
 Symbols: H W pixels; a, b the nearest earlier and later training frames of held-out frame i, s = (i - a) / (b - a).
 A fixed camera and slow tissue make copying strong, so every quality figure is compared with these two.
@@ -20,12 +20,12 @@ from intrasplat.train.scoring import Mapping
 Flow = NDArray[np.float32]  # [H, W, 2] px
 
 MIN_FLOW_PX = 16
-"""The optical flow's finest patches do not fit into a smaller image; there the flow counts as 0."""
+"""The optical flow's finest patches do not fit into a smaller image; its flow is 0."""
 
 
 @dataclass(frozen=True)
 class CopyBaselines:
-    """psnr_tissue in dB of each held-out frame, in the order asked for: [F] each. Only training frames are copied."""
+    """psnr_tissue in dB of each held-out frame, [F] in the given order. Only training frames are copied."""
 
     blend_db: tuple[float, ...]
     flow_db: tuple[float, ...]
@@ -34,22 +34,22 @@ class CopyBaselines:
 def copy_baselines(
     clip: DepthClip, train: Sequence[int], held_out: Sequence[int], mapping: Mapping = map
 ) -> CopyBaselines:
-    """Scores both ways of copying, by mapping, which may use several threads.
+    """Score both methods of copying; `mapping` may use several threads.
 
     blend  (1 - s) C_a + s C_b
-    flow   the same of C_a and C_b, each first warped to time i along its share of the optical flow (DIS) between them
-    A pixel that is instrument in one neighbour is copied from the other alone. Outside the training frames' span the
-    nearest one is copied as it is.
+    flow   the same, after warping C_a and C_b to time i along their shares of the optical flow (DIS) between them
+    A pixel that shows an instrument in one neighbour is copied from the other alone. Outside the training frames' span
+    the nearest one is copied.
 
     Raises:
-        ValueError: held-out frames without any training frame.
+        ValueError: there are held-out frames but no training frame.
     """
     if held_out and not train:
         raise ValueError(f"{len(held_out)} held-out frames have no training frame to be copied from")
     between = {index: _neighbours(index, train) for index in held_out}
 
     def score(first: int) -> list[tuple[float, float]]:
-        """Of all frames between the neighbours of this one, which share their flow."""
+        """Scores of all frames between two neighbours, which share their flow; `first` is one of these frames."""
         pair = between[first]
         frames = [index for index in held_out if between[index] == pair]
         found = score_between(pair, frames)
@@ -75,7 +75,7 @@ def copy_baselines(
 
 
 def _neighbours(index: int, train: Sequence[int]) -> tuple[int, int]:
-    """The nearest training frames before and after; outside their span twice the nearest."""
+    """The nearest training frames before and after; outside their span, the nearest one twice."""
     earlier = max((each for each in train if each < index), default=None)
     later = min((each for each in train if each > index), default=None)
     nearest = later if earlier is None else earlier
@@ -86,19 +86,19 @@ def _neighbours(index: int, train: Sequence[int]) -> tuple[int, int]:
 def _copies(
     clip: DepthClip, earlier: int, later: int, index: int, flows: tuple[Flow, Flow]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The held-out frame by blending and by flow, [H, W, 3] in [0, 1]."""
+    """The held-out frame copied by blending and by flow, [H, W, 3] in [0, 1]."""
     share = (index - earlier) / (later - earlier)
     frames = [clip.rgb[each].astype(np.float32) / np.float32(255) for each in (earlier, later)]
     tissue = [clip.tissue[each].astype(np.float32) for each in (earlier, later)]
     forward, backward = flows
-    # From time i back to a is -share of the motion a -> b, for which the flow b -> a at the same place stands.
+    # From time i back to a is -share of the motion a -> b; the flow b -> a at the same pixel approximates it.
     warped = [_warp(frames[0], share * backward), _warp(frames[1], (1 - share) * forward)]
     warped_tissue = [_warp(tissue[0], share * backward), _warp(tissue[1], (1 - share) * forward)]
     return _blend(frames, tissue, share), _blend(warped, warped_tissue, share)
 
 
 def _blend(frames: list[NDArray[np.float32]], tissue: list[NDArray[np.float32]], share: float) -> NDArray[np.float32]:
-    """(1 - share) of the first + share of the second, where only one is tissue all of that one."""
+    """(1 - share) of the first + share of the second; where only one is tissue, that one alone."""
     weights = [(1 - share) * tissue[0], share * tissue[1]]
     nowhere = weights[0] + weights[1] <= 0
     weights = [
@@ -109,7 +109,7 @@ def _blend(frames: list[NDArray[np.float32]], tissue: list[NDArray[np.float32]],
 
 
 def _flows(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> tuple[Flow, Flow]:
-    """Forward and backward flow: earlier's pixel x shows what later shows at x + forward(x), and the reverse."""
+    """Forward and backward flow: pixel x of `earlier` shows the point that `later` shows at x + forward(x)."""
     if min(earlier.shape[:2]) < MIN_FLOW_PX:
         still = np.zeros((*earlier.shape[:2], 2), np.float32)
         return still, still
@@ -121,7 +121,7 @@ def _flows(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> tuple[Flow, 
 
 
 def _warp(image: NDArray[np.float32], flow: NDArray[np.float32]) -> NDArray[np.float32]:
-    """image at x + flow(x)."""
+    """The image sampled at x + flow(x)."""
     rows, columns = np.indices(flow.shape[:2], dtype=np.float32)
     return np.asarray(
         cv2.remap(

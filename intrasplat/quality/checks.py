@@ -1,7 +1,7 @@
-"""What in the pictures, masks and depth of a clip makes its scene doubtful, in plain words.
+"""Check the pictures, masks and depth of a clip, and warn about what may harm its scene.
 
-Symbols: T frames, H W pixels. Each check is one number and one bound. The bounds lie between what clean clips show,
-real and synthetic, and what harms a scene (docs/decisions/evaluation.md). Held-out frames are not looked at.
+Symbols: T frames, H W pixels. No check reads held-out frames. Each compares a number with a bound that lies between
+the numbers of clean clips, real and synthetic, and those that harm a scene (docs/decisions/evaluation.md).
 """
 
 from __future__ import annotations
@@ -23,43 +23,44 @@ from intrasplat.train.scoring import sample_frames
 MIN_FRAMES = 16
 MIN_CONFIDENT_SHARE = 0.8
 SMOOTH_LEVELS = 2.0
-"""Standard deviation in 9 x 9 pixels, of 255: below it there is only noise to match."""
+"""Standard deviation in 9 x 9 pixels, in grey levels of 255; below it stereo has only noise to match."""
 MAX_SMOOTH_SHARE = 0.4
 MIN_TISSUE_SHARE = 0.3
 MAX_BRIGHTNESS_DRIFT = 0.25
-"""Range of the median brightness over its mean; beyond it, changing light and moving tissue are hard to tell apart."""
+"""Range of the median brightness over its mean; beyond it, changing illumination and motion are hard to tell apart."""
 ANALYSED_WIDTH = 640
-"""Larger pictures are shrunk to it first: 4K endoscopes are soft from pixel to pixel, and in focus all the same."""
+"""Larger pictures are shrunk to this width first: those of 4K endoscopes are soft at the pixel scale even in focus."""
 DARK_PERCENTILE, MAX_DARK_LEVEL = 5.0, 85.0
-"""Of each pixel's weakest colour: at most 68 of 255 in clean clips, and 90 behind a veil that takes a quarter."""
+"""Of each pixel's weakest colour (of 255): at most 68 in clean clips, and 90 behind a veil that takes a quarter."""
 FOCUS_SIGMAS_PX = (1.0, 2.0)
 MIN_FINE_DETAIL = 0.62
 """Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
 MIN_DETAIL_LEVELS = 0.4
-"""Of 255; below it there is nothing to be sharp: that is said of the texture."""
+"""Detail in grey levels of 255; below it there is nothing that could be sharp, and the texture check warns."""
 MIN_EQUAL_DETAIL = 0.75
-"""Of a frame's fine detail, relative to that of the clip's sharpest: 0.93 and more in clean clips."""
+"""Fine detail of a frame relative to that of the clip's sharpest frame: 0.93 and more in clean clips."""
 MIN_DOUBTFUL_FRAMES = 2
-"""Of the frames looked at: one alone may be an accident."""
+"""Smallest number of bad frames among the sampled ones that counts: one alone may be an accident."""
 MAX_COLOUR_DRIFT = 0.25
 """Range of the median red over green, or blue over green, over its mean."""
 BLOOD_RATIO, MAX_FLOODED_SHARE = 3.0, 0.1
-"""Red over green of blood, and by how much its share of the tissue may change: by 0.005 in clean clips."""
+"""Red over green of blood, and by how much blood's share of the tissue may change: by 0.005 in clean clips."""
 MAX_REPEATED_SHARE = 0.1
 MAX_HIDDEN_SHARE = 0.4
 MAX_FLICKER = 3
-"""Frames: no instrument leaves the picture and is back so soon."""
+"""Frames: no instrument leaves the picture and returns within so few."""
 MIN_INSTRUMENT = 0.02
-"""Share of the picture; less may be an instrument's tip that comes and goes."""
+"""Share of the picture; less may be an instrument's tip that appears and disappears."""
 SURE = 128
-"""Of depth_confidence's 255: what stereo itself doubts is told of elsewhere."""
+"""Smallest depth_confidence (of 255) that is checked; another check warns about less confident depth."""
 DEPTH_JUMP, MAX_JUMPING_SHARE = 0.1, 0.03
-"""Of the depth from frame to frame, and of the tissue: 0.012 at most in clean clips, 0.05 with gross errors on 0.05."""
+"""Relative jump of depth between frames, and the tissue's share that may jump: 0.012 in clean clips, 0.05 with gross
+errors on 0.05."""
 MAX_PAIRS = 8
 
 
 def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """What in the clip itself makes the result doubtful; held-out frames are not looked at."""
+    """Warnings about the clip itself; no check reads held-out frames."""
     sampled = sample_frames(train)
     found = []
     if len(train) < MIN_FRAMES:
@@ -103,7 +104,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 
 def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
-    """Doubts about the pictures of some training frames: veiled, out of focus, smeared, of changing colour."""
+    """Warnings about the pictures of the sampled training frames: veiled, out of focus, smeared, changing colour."""
     seen = [index for index in clip.one_by_one(sampled) if clip.tissue[index].any()]
     if not seen:
         return []
@@ -121,7 +122,7 @@ def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
 
 
 def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """Doubts about how the training frames follow each other: repeated, hidden at first, masks or depth that jump."""
+    """Warnings about the sequence of training frames: repeated, hidden at first, with masks or depth that jump."""
     found = []
     pairs = list(itertools.pairwise(train))
     repeated = 0
@@ -184,7 +185,7 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 
 def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
-    """Blood that comes in, or else a white balance that drifts."""
+    """Warn about blood that appears, or else about a white balance that drifts."""
     flooded = float(np.ptp([_blood_share(clip, index) for index in clip.one_by_one(frames)]))
     if flooded > MAX_FLOODED_SHARE:
         return [
@@ -210,7 +211,7 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 
 def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """No tissue comes a tenth nearer within a frame; where depth does, on much of the tissue, it is wrong."""
+    """Warn if the depth of much tissue jumps by a tenth within a frame: no tissue moves so fast, so depth is wrong."""
     still = set(clip.left_out)
     following = {one: two for one, two in itertools.pairwise(train) if still.issuperset(range(one + 1, two))}
     jumps, total = 0, 0
@@ -233,7 +234,7 @@ def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 
 def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:
-    """Colours [M, 3] of the tissue of every other row and column: enough to count; all of it where that is little."""
+    """Colours [M, 3] of the tissue in every other row and column; of all of it where that is little."""
     rgb, tissue = clip.rgb[index], clip.tissue[index]
     sparse: NDArray[np.uint8] = rgb[::2, ::2][tissue[::2, ::2]]
     return sparse if len(sparse) else np.asarray(rgb[tissue])
@@ -255,7 +256,7 @@ def _brightness_warnings(clip: DepthClip, sampled: Iterable[int]) -> list[Notice
 
 
 def _share_of_tissue(clip: DepthClip, frames: Iterable[int], holds: Callable[[int], NDArray[np.bool_]]) -> float:
-    """Share of all tissue pixels of these frames at which something holds; NaN without tissue."""
+    """Share of all tissue pixels of these frames for which `holds` is true; NaN without tissue."""
     kept, total = 0, 0
     for index in clip.one_by_one(frames):
         kept += int((clip.tissue[index] & holds(index)).sum())
@@ -304,14 +305,14 @@ def _fine_detail(clip: DepthClip, index: int) -> float | None:
 
 
 def _repeats(earlier: NDArray[np.uint8], later: NDArray[np.uint8]) -> bool:
-    """Whether two frames are the same picture, as intrasplat/clip/split.py means it; 8th rows first, for speed."""
+    """Whether two frames show the same picture (intrasplat/clip/split.py). Every 8th row comes first, for speed."""
     return all(
         cv2.norm(earlier[::step], later[::step], cv2.NORM_L1) < REPEAT_LEVELS * earlier[::step].size for step in (8, 1)
     )
 
 
 def _flickering(instrument: NDArray[np.floating]) -> int:
-    """Frames without instrument in gaps of at most MAX_FLICKER between frames that have one; shares in, [T]."""
+    """Number of frames without instrument in gaps of at most MAX_FLICKER. instrument: [T] its share of the picture."""
     masked = np.flatnonzero(instrument >= MIN_INSTRUMENT)
     gaps = [
         range(before + 1, after)

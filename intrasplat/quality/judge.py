@@ -1,4 +1,4 @@
-"""The judge: a finished model's own renders against the frames of its clip."""
+"""Score a finished model: compare its renders with the frames of its clip."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def judged(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRen
     Args:
         first: the report of the model before it was scored.
         train: the frames that the model was trained on.
-        render: the model's; several threads may call it.
+        render: renders the model; several threads may call it.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
         Cancelled: hooks.should_stop said so.
     """
     started_s, sampled = time.perf_counter(), sample_frames(train)
     total, done = 2 * len(first.held_out) + len(sampled), 0
 
     def views(eye: DepthClip | Eye) -> FrameRenderer:
-        """Renders the frame of this index from the eye's own pose."""
+        """A function that renders the frame with an index from the eye's own pose."""
 
         def view(index: int) -> RenderedFrame:
             nonlocal done
@@ -66,7 +66,7 @@ def judged(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRen
 
 
 def _until_stopped(pool: ThreadPoolExecutor, hooks: Hooks) -> Mapping:
-    """The pool's map, of work that raises Cancelled as soon as hooks.should_stop says so."""
+    """The pool's map; its work raises Cancelled as soon as hooks.should_stop says so."""
 
     def each(work: Callable[[int], Any], frames: Iterable[int]) -> Iterable[Any]:
         def unless_stopped(index: int) -> Any:

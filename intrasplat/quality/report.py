@@ -1,7 +1,7 @@
-"""The quality report: held-out scores, copy baselines, and in plain words whatever looks wrong.
+"""The quality report: held-out scores, copy baselines, and warnings about whatever looks wrong.
 
-Symbols: T frames, H W pixels. A scene that fails silently is the defect this module exists for: a doubt becomes a
-sentence in the report, and what is not finite is never published.
+Symbols: T frames, H W pixels. No scene may fail silently: every doubt becomes a warning in the report, and a number
+that is not finite is never published.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from intrasplat.train.scoring import FrameRenderer, Mapping
 
 MIN_COVERAGE = 0.98
 MIN_TRAIN_DB = 25.0
-"""A model that does not even reproduce its own frames this well has not learnt them; good ones reach 30 to 38."""
+"""A model that scores less on its training frames has not learnt them; good models reach 30 to 38."""
 MIN_HELD_OUT_DB = 24.0
-"""An error of 6 % of white: clean clips come to 25 within a hundred iterations, what cuts or jumps stays below."""
+"""An error of 6 % of white: clean clips reach 25 within a hundred iterations, clips with cuts or jumps stay below."""
 MAX_GAP_DB = 3.0
-"""Between training and held-out frames: more means frames were memorised, or the gap between frames is not bridged."""
+"""Gap between training and held-out frames; beyond it the model memorised frames, or cannot interpolate them."""
 MAX_RIGHT_GAP_DB = 4.0
-"""Between the left eye and the right eye, some degrees beside it."""
+"""Gap between the left eye and the right eye, which views the tissue from some degrees beside it."""
 OUTLIER_DB = 6.0
-"""A held-out frame this far below the mean is named."""
+"""A warning names held-out frames this far below the mean."""
 MAX_DEPTH_SHARE = 0.03
-"""Of the depth: beyond it model and stereo disagree by more than the stereo's own noise."""
+"""Share of the depth; beyond it model and stereo disagree by more than the stereo's own noise."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of some frames; a list holds one number per frame, NaN where there was no tissue.
+    """Scores of some frames. A list has one number per frame, NaN for a frame without tissue.
 
-    depth_mm is the stereo's median depth where it was compared, to judge depth_agreement_mm by; both NaN without any.
+    depth_mm: the stereo's median depth where it was compared with the model's (depth_agreement_mm); both may be NaN.
     """
 
     frames: tuple[int, ...]
@@ -66,7 +66,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Training:
-    """What the pipeline knows of a run and the report repeats (intrasplat.report.Report has their meaning)."""
+    """What the pipeline knows about a run and the report repeats; intrasplat.report.Report explains the fields."""
 
     preset: str
     eyes: Eyes
@@ -88,7 +88,7 @@ class Training:
 SCORES_PENDING = Notice.info(
     NoticeCode.SCORES_PENDING, "The scores are still being measured: ask for the report again in some seconds."
 )
-_MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report holds both
+_MERGED_FIELDS = ("assumptions", "warnings", "measurements")  # the clip has them, too; the report joins both
 
 
 Errors = NDArray[np.float32]
@@ -98,12 +98,12 @@ NOTHING: Errors = np.zeros(0, np.float32)
 def measure(
     clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map, *, compared: bool = True
 ) -> Scores:
-    """Scores the renders of these frames (clip indices) against the clip, by mapping, which may use several threads.
+    """Score the renders of these frames (clip indices) against the clip; `mapping` may use several threads.
 
-    compared: whether the figures are wanted that compare one scene with another; else psnr_tissue_db alone is no NaN.
+    compared: compute the scores that compare one scene with another, too; else all but psnr_tissue_db are NaN.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
     """
 
     def score(index: int) -> tuple[tuple[float, float, float, float, float], Errors, Errors]:
@@ -138,7 +138,7 @@ def measure(
 
 
 def first_report(clip: DepthClip, split: FrameSplit, training: Training, doubts: Sequence[Notice] = ()) -> Report:
-    """The report of a finished scene before it is scored. doubts: clip_warnings() of the clip."""
+    """The report of a finished scene before it is scored. doubts: the result of clip_warnings()."""
     found = [*clip.warnings, *split.warnings, *training.warnings, *doubts, SCORES_PENDING]
     return Report(
         scored=False,
@@ -174,7 +174,7 @@ def scored_report(
 
     Args:
         first: first_report() of the scene.
-        held_out: measure(clip, first.held_out, ...); of no frames if none was held out.
+        held_out: measure(clip, first.held_out, ...); without frames if none was held out.
         right: measure_right(clip, first.held_out, ...).
         trained: measure(clip, sample_frames(train), ...), for the comparison.
         baselines: copy_baselines(clip, train, first.held_out).
@@ -201,7 +201,7 @@ def scored_report(
 
 
 def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[Notice]:
-    """What the scores say against the model; and why a figure is missing, where one is."""
+    """Warnings about the model that follow from its scores, and reasons for missing scores."""
     model_db = _mean(held_out.psnr_tissue_db)
     train_db = _mean(trained.psnr_tissue_db)
     found = _missing(held_out, model_db)
@@ -252,7 +252,7 @@ def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) 
 
 
 def right_eye_warnings(held_out: Scores, right: RightScores) -> list[Notice]:
-    """What the right eye says against poses beside the left one."""
+    """Warnings about views from beside the left eye that follow from the right eye's scores."""
     left_db, right_db = _mean(held_out.psnr_tissue_db), _mean(right.psnr_db)
     if left_db is None or right_db is None or left_db - right_db <= MAX_RIGHT_GAP_DB:
         return []
@@ -290,7 +290,7 @@ def _missing(held_out: Scores, model_db: float | None) -> list[Notice]:
 
 
 def _worse_than_copying(model_db: float | None, baselines: CopyBaselines) -> list[Notice]:
-    """Says plainly that copying frames would have done better; a model earns its place only elsewhere then."""
+    """Warn if copying frames would have scored better: then the model is useful only at other poses and times."""
     copies = {"blending": _mean(baselines.blend_db), "warping (optical flow)": _mean(baselines.flow_db)}
     better = {name: score for name, score in copies.items() if score is not None and model_db is not None}
     better = {name: score for name, score in better.items() if score > (model_db or 0.0)}
@@ -340,6 +340,6 @@ def _known(value: float) -> float | None:
 
 
 def _mean(values: Sequence[float]) -> float | None:
-    """Mean of those that are known."""
+    """The mean of the known values; None if there is none."""
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else None

@@ -1,7 +1,7 @@
-"""The right eye as a judge: a real view, some degrees beside the left eye, at every held-out moment.
+"""Score a model with the right eye: a real view from some degrees beside the left eye, at every held-out moment.
 
-Judged are the right eye's tissue pixels that the left eye sees, too. Warping the left eye's picture of the same moment
-by its stereo depth is the baseline; no model has that picture.
+The right eye's tissue pixels that the left eye sees, too, are scored. The baseline warps the left eye's picture of the
+same moment, which no model was trained on, by its stereo depth.
 
 Symbols: H W pixels.
 """
@@ -22,14 +22,14 @@ from intrasplat.stereo.right_eye import nearest_known
 from intrasplat.train.scoring import FrameRenderer, Mapping, judged_pixels
 
 FAR_MM = 1e6
-"""Depth at which the eyes see the same."""
+"""Depth at which both eyes see the same picture."""
 
 
 @dataclass(frozen=True)
 class RightScores:
-    """Scores of the right eye's pictures of some frames, in dB, a number per frame; NaN where there was no tissue.
+    """Scores of the right eye's pictures of some frames in dB, one number per frame; NaN for a frame without tissue.
 
-    psnr_db, warp_db    of the model, and of the warped left eye
+    psnr_db, warp_db         the model's score, and that of the warped left eye
     clear_db, warp_clear_db  the same without highlights
     """
 
@@ -40,12 +40,12 @@ class RightScores:
 
 
 def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer, mapping: Mapping = map) -> RightScores:
-    """Scores the renders of these frames (clip indices) from the right eye's pose; nothing for a clip of one eye.
+    """Score the renders of these frames (clip indices) from the right eye's pose; nothing for a clip of one eye.
 
-    By mapping, which may use several threads.
+    `mapping` may use several threads.
 
     Raises:
-        TrainingDiverged: a render holds NaN or infinity.
+        TrainingDiverged: a render contains NaN or infinity.
     """
     right = clip.right
     if right is None:
@@ -67,11 +67,11 @@ def measure_right(clip: DepthClip, frames: Sequence[int], render: FrameRenderer,
 
 
 def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
-    """The left eye's picture [H, W, 3] warped to the right eye by the right eye's depth; gaps take a neighbour's."""
+    """The left eye's picture [H, W, 3] warped to the right eye by the right eye's depth; gaps take the nearest."""
     assert clip.right is not None
     right, left_k = clip.right, clip.intrinsics
     found_mm = nearest_known(right.depth_mm[index], right.depth_mm[index] > 0)
-    depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # no pixel has any
+    depth_mm = np.where(found_mm > 0, found_mm, np.float32(FAR_MM))  # where no pixel has depth
     left_from_right = np.linalg.inv(clip.world_from_camera[index]) @ right.world_from_camera[index]
     across = (np.arange(depth_mm.shape[1], dtype=np.float32) + 0.5 - right.intrinsics.cx) / right.intrinsics.fx
     down = (np.arange(depth_mm.shape[0], dtype=np.float32)[:, None] + 0.5 - right.intrinsics.cy) / right.intrinsics.fy
@@ -82,5 +82,5 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
 
 
 def _scores(image: Image, truth: NDArray[np.uint8], judged: NDArray[np.bool_]) -> tuple[float, float]:
-    """psnr_tissue in dB over the judged pixels, and without highlights."""
+    """psnr_tissue in dB over the judged pixels, and over those without highlights."""
     return psnr_tissue(image, truth, judged), psnr_tissue(image, truth, judged & clear_of_highlights(image, truth))

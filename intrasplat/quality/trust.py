@@ -1,9 +1,9 @@
-"""How likely each Gaussian shows what is right, from what training frames show of it.
+"""The trust in each Gaussian: the probability that it is right, estimated from training frames.
 
 Symbols: N Gaussians, H W pixels.
 
-Two things that the training frames know explain the errors of other views: how many of them saw the Gaussian, and how
-far off the pixels are that it has a part in (docs/decisions/views.md has the rank correlations).
+Two numbers from the training frames predict the errors of other views: how many of them saw the Gaussian, and the error
+of the pixels that it contributes to (docs/decisions/views.md has the rank correlations).
 """
 
 from __future__ import annotations
@@ -20,40 +20,40 @@ from intrasplat.splat.model import Model
 from intrasplat.train.targets import TrainingFrames
 
 SAMPLED_PICTURES = 24
-"""Training frames of all eyes looked at, evenly spread: the share is known to a few per cent."""
+"""Number of training frames of all eyes that are sampled, evenly spread: enough for shares to a few per cent."""
 MIN_TISSUE_PX = 0.5
-"""A frame sees a Gaussian if its weights on tissue add up to so many pixels; of what is hidden less shines through."""
+"""A frame sees a Gaussian if its weights on tissue add up to so many pixels; hidden Gaussians reach less."""
 MIN_TISSUE_SHARE = 0.2
-"""And to this share of all its weights there. Behind an instrument's edge the rest of it is held by what shows."""
+"""And if they are this share of all its weights there. At an instrument's edge, the visible part fixes the rest."""
 
 RIGHT_COLOUR, RIGHT_DEPTH = 0.03, 0.02
-"""What counts as right: a mean error of R G B, 1 being white, and a relative error of depth."""
+"""Largest errors that count as right: mean error of R G B, with white as 1, and relative error of depth."""
 MAX_DEPTH_ERROR = 10 * RIGHT_DEPTH
-"""Beyond it depth is simply wrong."""
+"""Larger relative errors of depth are clamped to it."""
 LEAST = np.array([0.03, 0.05])
-"""Added to share and error before the logarithm: differences below these say nothing."""
+"""Added to share and error before the logarithm: smaller differences carry no information."""
 WEIGHTS = np.array([0.66, -1.22])
-"""Of the logarithms of share and error. `python -m lab.benchmarks.bm_confidence --fit` finds them."""
+"""Weights of the logarithms of share and error. `python -m lab.benchmarks.bm_confidence --fit` finds them."""
 BIAS = 2.3
 LEAST_TRUST = 1 / 63
-"""Of a Gaussian that was seen at all, so that it differs from one that was not."""
+"""Smallest trust of a Gaussian that was seen at all: 0 means not seen."""
 
 
 def trust(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float32]:
-    """[N] in [0, 1]: the probability that what a Gaussian shows is right; 0 if no training frame saw it."""
+    """[N] in [0, 1]: the probability that a Gaussian is right; 0 if no training frame saw it."""
     found = evidence(model, eyes)
     likely = 1 / (1 + np.exp(-(WEIGHTS @ logarithms(found) + BIAS)))
     return np.where(found[0] > 0, np.clip(likely, LEAST_TRUST, 1), 0).astype(np.float32)
 
 
 def logarithms(found: NDArray[np.floating]) -> NDArray[np.floating]:
-    """[2, N] of the evidence: what trust is a logistic function of."""
+    """[2, N] logarithms of the evidence [2, N]; trust is a logistic function of them."""
     return np.asarray(np.log(found + LEAST[:, None]))
 
 
 def evidence(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float64]:
-    """[2, N]: share of training frames that saw the Gaussian, of the eye that saw it oftener; and mean error of the
-    pixels that showed it, in which 1 is what counts as right.
+    """[2, N]: share of training frames that saw the Gaussian, for the eye that saw it more often; and mean error of the
+    pixels that showed it, where 1 is the largest error that counts as right.
     """
     sampled = spread(eyes[0].indices, max(SAMPLED_PICTURES // len(eyes), 1))
     seen = np.zeros((len(eyes), model.count))
@@ -85,8 +85,8 @@ def _weights(model: Model, frames: TrainingFrames, index: int) -> NDArray[np.flo
 
 
 def _errors(frames: TrainingFrames, index: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[H, W] the sum of colour's and depth's errors, each over what counts as right. Depth that stereo did not measure
-    is a guess: it counts as just wrong.
+    """[H, W] sum of the errors of colour and depth, each divided by the largest that counts as right. Depth that stereo
+    did not measure is a guess: its error counts as 1.
     """
     eye = frames.eye
     colour = np.abs(np.clip(image[:3], 0, 1) - eye.rgb[index].transpose(2, 0, 1) / np.float32(255)).mean(0)

@@ -1,4 +1,4 @@
-"""Which Gaussians the clip never saw and must go.
+"""Remove Gaussians that the clip never saw.
 
 Symbols: N Gaussians, H W pixels.
 """
@@ -19,23 +19,23 @@ from intrasplat.splat.model import Model
 from intrasplat.train.targets import TrainingFrames
 
 SAMPLED_FRAMES = 24
-"""Training frames looked at, evenly spread."""
+"""Number of training frames that are sampled, evenly spread."""
 
 MAX_UNSEEN_WIDTH = 3.0
-"""Units, a twentieth of the median depth: a Gaussian that nothing saw may be no wider at any time of the clip."""
+"""Largest width at any time of the clip of a Gaussian that no frame saw, in units: a twentieth of the median depth."""
 MISSED_IN_FRAMES, MISSED_DB = 8, 0.02
-"""Training frames, evenly spread, of which none may lose more of its psnr_tissue with a Gaussian that is taken out."""
+"""Number of training frames, evenly spread, and how much psnr_tissue any of them may lose with a removed Gaussian."""
 HIDDEN_LOGIT = -30.0
-"""Opacity at which nothing is drawn."""
+"""Opacity logit at which nothing is drawn."""
 
 
 def drop_strays(model: Model, eyes: Sequence[TrainingFrames]) -> int:
-    """Take Gaussians out of model that lay on tissue in no training frame, grew wide, and are not missed there; returns
-    how many. Adam's moments go with them, for the model is trained.
+    """Remove Gaussians that lay on tissue in no training frame, grew wide, and are not missed there; return how many.
+    Adam's moments are removed, too: the model is trained.
 
-    Where an instrument never leaves, nothing holds a Gaussian in place but its tail on the tissue beside it. A few are
-    pulled wide at the times nobody sees them, and from another pose they hang over the tissue like a veil. Of few and
-    large Gaussians, though, one may show much tissue from a place where there is none.
+    Where an instrument never leaves, only a Gaussian's tail on the tissue beside it constrains it. A few grow wide at
+    times when no frame sees them, and from another pose they cover the tissue like a veil. But among few, large
+    Gaussians, one whose centre is never on tissue may still show much of it: such a Gaussian would be missed.
     """
     unseen = np.flatnonzero(~_ever_on_tissue(model, eyes))
     sampled = spread(eyes[0].indices, SAMPLED_FRAMES)
@@ -44,12 +44,12 @@ def drop_strays(model: Model, eyes: Sequence[TrainingFrames]) -> int:
     if len(strays) == model.count:
         strays = strays[:0]
     kept = np.setdiff1d(np.arange(model.count), strays)
-    model.take(kept.astype(np.int64), np.ones(len(kept), np.bool_))  # as if all were fresh: moments of 0 take no memory
+    model.take(kept.astype(np.int64), np.ones(len(kept), np.bool_))  # mark all as new: moments of 0 take no memory
     return len(strays)
 
 
 def _not_missed(model: Model, eyes: Sequence[TrainingFrames], wide: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Those of wide [M] without which every frame looked at stays as good: all, or those found one after the other."""
+    """Those of `wide` [M] without which no sampled frame gets worse: all, or those found one by one."""
     if not len(wide):
         return wide
     opacity_logit = model.parameters()["opacity_logit"]
@@ -79,7 +79,7 @@ def _ever_on_tissue(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.
     for index in eyes[0].indices:
         mean = model.deformed_mean(float(eyes[0].t[index]))
         for frames in eyes:
-            sought = np.flatnonzero(~found)  # soon a few
+            sought = np.flatnonzero(~found)  # only a few after the first frames
             inside, i, j = _pixels(mean[:, sought], frames, index)
             found[sought[inside]] = frames.eye.tissue[index][i, j]
             frames.eye.let_go(index)
@@ -105,7 +105,7 @@ def _widest(model: Model, chosen: NDArray[np.intp], times: Sequence[float]) -> N
 def _pixels(
     mean: NDArray[np.float32], frames: TrainingFrames, index: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Which centres (mean [3, N], units) lie in frame `index`; row and column of those."""
+    """Which centres (mean [3, N], units) project into frame `index`, and their rows and columns."""
     camera, (height, width) = frames.cameras[index], frames.eye.tissue[index].shape
     x, y, z = _camera_points(mean, camera)
     column, row = np.floor(camera[FX] * x / z + camera[CX]), np.floor(camera[FY] * y / z + camera[CY])
@@ -116,7 +116,7 @@ def _pixels(
 def _camera_points(
     mean: NDArray[np.float32], camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Camera x, y, z of means [3, N]; z that is not positive becomes -1 so that nothing divides by 0."""
+    """Camera x, y, z of means [3, N]; z that is not positive becomes -1, so that nothing divides by 0."""
     pose = camera[POSE:].reshape(3, 4)
     points = pose[:, :3] @ mean + pose[:, 3:]
     z = np.where(points[2] > 0, points[2], -1.0)

@@ -1,12 +1,12 @@
-"""A scene as one zip: out of one installation and into another.
+"""A scene as one zip file, to move it from one installation to another.
 
     JOB.scene.zip       stored, not compressed
     ├── manifest.json, scene.safetensors, report.json, curve.csv
-    ├── masks.zip, recorded.zip, thumbnail.jpg      if the scene keeps them
+    ├── masks.zip, recorded.zip, thumbnail.jpg      if the scene has them
     └── archive.json    written last: where it came from; size and SHA-256 of each other file
 
-archive_parts() writes one, read_archive() judges one from outside. The numbers in scene.safetensors are judged by the
-worker that takes the scene in (intrasplat/scene/imported.py).
+archive_parts() writes an archive. read_archive() checks one from outside, except the numbers in scene.safetensors: the
+worker that imports the scene checks those (intrasplat/scene/imported.py).
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ from intrasplat.report import Report, VersionText
 from intrasplat.version import version
 
 FIELD = "scene"
-"""Of a form, and of errors."""
+"""Name of the upload's form field, and the field of the errors."""
 ARCHIVE = "archive.json"
 NEEDED = (SCENE, REPORT, CURVE, MANIFEST)
 NESTED = (MASKS, RECORDED)
-"""Archives inside the archive, which hold pictures."""
+"""Zip files of pictures inside the archive."""
 TEXTS = (ARCHIVE, MANIFEST, REPORT, CURVE)
 MAX_TEXT_BYTES = 8 << 20
-"""Of 1,000 frames a manifest has half a megabyte, a report less."""
+"""Limit of a JSON or CSV file. The manifest of a clip of 1,000 frames has half a megabyte, its report less."""
 MAX_SCENE_BYTES = 2 << 30
-"""The numbers and weights that intrasplat/scene/compact.py allows a scene, as floats."""
+"""Size of the numbers and weights that intrasplat/scene/compact.py allows a scene, stored as floats."""
 MAX_NESTING = 32
 MAX_CHARACTERS = 4000
-"""Of one text in a report."""
+"""Limit of one text in a report."""
 PIECE_BYTES = 1 << 20
 AGAIN = "Export the scene again, with format=scene, and send the file as it is."
 
@@ -88,7 +88,7 @@ class ArchiveHead(BaseModel):
 
 
 def _offered(preset: object) -> object:
-    """The preset. ValueError if it is one of the laboratory's."""
+    """Return the preset; raise ValueError if only the laboratory trains it."""
     if preset in LABORATORY_PRESETS:
         raise ValueError(f"{preset} is a variant of the laboratory, and services take in no scene of it")
     return preset
@@ -106,7 +106,7 @@ class ManifestHead(BaseModel):
 
 @dataclass(frozen=True)
 class Archived:
-    """An archive that has passed the checks. sha256: of the files by their names, in this order."""
+    """An archive that has passed the checks."""
 
     head: ArchiveHead
     manifest: ManifestHead
@@ -114,13 +114,13 @@ class Archived:
 
 
 def archive_parts(folder: Path, scene_id: str | None = None) -> Iterator[bytes]:
-    """The archive of the scene in a folder, piece by piece. A scene that is removed meanwhile is sent to its end.
+    """The archive of the scene in a folder, piece by piece. If the scene is removed meanwhile, it is still complete.
 
     Raises, before the first part:
         SceneError: there is no scene.
     """
     with ExitStack() as opening:
-        # The manifest first: scores that are added meanwhile replace it last.
+        # Open the manifest first: add_scores(), which may run meanwhile, replaces it last.
         names = (MANIFEST, SCENE, REPORT, CURVE, MASKS, RECORDED, THUMBNAIL)
         found = {name: folder / name for name in names if name in NEEDED or (folder / name).is_file()}
         try:
@@ -152,11 +152,12 @@ def _written(files: Mapping[str, BinaryIO], scene_id: str | None, closing: ExitS
 
 
 def read_archive(path: Path, max_bytes: int, into: Path | None = None) -> Archived:
-    """Judge an archive from outside; with `into`, write its files there while they are read.
+    """Check an archive from outside; with `into`, write its files there while they are read.
 
     Raises:
-        InputError: it is no archive of a scene, was damaged or changed, or holds what none needs. The field is FIELD.
-        LimitError: it, or a file in it, is larger than accepted.
+        InputError: the file is no archive of a scene, was damaged or changed, or contains a file that does not belong
+            there. The field is FIELD.
+        LimitError: the archive, or a file in it, is larger than accepted.
     """
     limits = replace(ClipLimits(), decoded_bytes=max_bytes)
     archive, members = open_zip(path, FIELD, path.name, limits, nested=NESTED)
@@ -220,7 +221,7 @@ def _parsed(model: type[Model], text: str, name: str) -> Model:
 
 
 def check_words(name: str, content: object) -> None:
-    """InputError if a text of a file's JSON, which is shown to people, is endless or holds control characters."""
+    """Raise InputError if a text in a file's JSON, which people will see, is too long or has control characters."""
     waiting: list[JsonValue] = [TypeAdapter(JsonValue).validate_python(content)]
     while waiting:
         each = waiting.pop()
@@ -236,7 +237,7 @@ def check_words(name: str, content: object) -> None:
 
 
 def _check_curve(text: str) -> None:
-    """curve.csv: a line of names, then numbers or nothing."""
+    """Raise InputError unless curve.csv has a line of names, then lines of numbers or empty cells."""
     head, *rows = csv.reader(text.splitlines()) if text.strip() else [[]]
     is_named = bool(head) and all(re.fullmatch(r"[a-z0-9_]{1,40}", name) for name in head)
     if not is_named or any(len(row) != len(head) or not all(map(_is_number, row)) for row in rows):
@@ -251,7 +252,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _copied(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path | None) -> ArchivedFile:
-    """Size and hash of a member, which is written to `target` if that is given."""
+    """Read a member, write it to `target` if that is given, and return its size and hash."""
     digest, size = hashlib.sha256(), 0
     with ExitStack() as opened:
         writing = target and opened.enter_context(target.open("xb"))

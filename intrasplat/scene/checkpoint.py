@@ -1,11 +1,11 @@
 """A finished scene on disk.
 
     directory/
-    ├── scene.safetensors   "exact": every tensor, gaussians.*, deformation.*, seen; "compact": those of compact.py
+    ├── scene.safetensors   "exact": all tensors, gaussians.*, deformation.*, seen; "compact": the tensors of compact.py
     ├── ...                 files that rendering does not need, such as recorded.zip
     └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
 
-The manifest is written last, so a folder without one holds no scene. docs/scene-file.md describes both files.
+The manifest is written last, so a folder without one contains no scene. docs/scene-file.md describes both files.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from intrasplat.splat.gaussians import Gaussians
 
 FORMAT = "intrasplat-scene"
 FORMAT_VERSION = 2
-"""Raised when an older reader would misread what is written."""
+"""It rises when an older reader would misread what is written."""
 EXACT, COMPACT = "exact", "compact"
 SCENE_FILE, MANIFEST_FILE = SCENE, MANIFEST
 MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
@@ -39,13 +39,13 @@ MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError
 
 
 def save_scene(directory: Path, scene: TrainedScene, beside: Mapping[str, bytes] | None = None) -> None:
-    """Write the scene into a directory, which is made if need be; a scene that is there is replaced.
+    """Write the scene into a directory; create the directory if it is missing, and replace a scene that is there.
 
     beside: the contents of further files, by name.
 
     Raises:
-        SceneError: a number is not finite or out of its range, or the tensors do not belong together. Nothing is
-            written then.
+        SceneError: a number is not finite or out of its range, or the tensors do not belong together. Then nothing is
+            written.
     """
     check(scene)
     tensors = scene.file_tensors()
@@ -78,16 +78,16 @@ def save_scene(directory: Path, scene: TrainedScene, beside: Mapping[str, bytes]
 
 
 def _listed(content: bytes) -> dict[str, Any]:
-    """What the manifest says of a file."""
+    """The manifest's entry of a file."""
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def load_scene(directory: Path) -> TrainedScene:
-    """The scene in a directory, on the CPU; every file is checked against its hash.
+    """The scene in a directory, on the CPU, after a check of every file against its hash.
 
     Raises:
-        SceneError: it is missing, damaged or of another version, or a tensor or number has a wrong shape, type or
-            range.
+        SceneError: the scene is missing, damaged or of another version, or a tensor or number has a wrong shape, type
+            or range.
     """
     manifest = _read_manifest(directory / MANIFEST_FILE)
     _check_motion(manifest.get("deformation"), directory)
@@ -169,7 +169,7 @@ def _scene_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> TrainedSc
 
 
 def _model_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Gaussians, Deformation, Tensor]:
-    """Gaussians, motion and seen of either coding."""
+    """Gaussians, motion and `seen`, from the exact or the compact form."""
 
     def under(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}

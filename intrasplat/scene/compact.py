@@ -1,10 +1,10 @@
-"""The compact form of a scene: a table of whole numbers, which the range coder packs, and back to Gaussians.
+"""The compact form of a scene: a table of integers, which the range coder packs, and its way back to Gaussians.
 
 Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R < B patterns of motion per channel,
 K columns.
 
 A decoder undoes four steps (intrasplat/scene/quantize.py does them): motion is coefficients of patterns, numbers are
-multiples of a step, columns may hold differences between neighbours, and the table is range coded. docs/scene-file.md
+multiples of a step, columns may be differences between neighbours, and the table is range coded. docs/scene-file.md
 describes the file for other readers.
 """
 
@@ -41,25 +41,24 @@ Whole = NDArray[np.int64]
 Floats = NDArray[np.float32]
 
 GROUP_OF = np.array([0] * 3 + [1] * 7 + [2] * 5)
-"""Which power belongs to each number of the state: of place, shape or colour."""
+"""Index of the power of each number of the state: 0 position, 1 shape, 2 colour."""
 PLAIN = 3
-"""Group of the last columns, the powers and seen, whose steps are 1."""
+"""Group of the last columns, the powers and `seen`, whose step is 1."""
 PLAIN_COLUMNS = 4
 MIN_POWER = -3
-"""The least power of two, MAX_POWER being the largest, by which a Gaussian's precision may differ from the mean. What
-the trained frames hardly show may be seen from elsewhere, so it keeps an eighth."""
+"""Smallest power of two by which a Gaussian's precision may differ from the mean; MAX_POWER is the largest. Other views
+may show what the trained frames hardly show, so its precision is at least an eighth of the mean."""
 SEEN_LEVELS = 63
 ROWS_AT_ONCE = 1 << 14
-"""Gaussians whose coefficients are floats at a time."""
+"""Gaussians whose coefficients are converted to floats at once."""
 MAX_NUMBERS = 7 * 2**25
-"""Numbers a scene may have: those of 170 thousand Gaussians and 97 bases. Unpacking takes up to 14 bytes a number
-(where there is one basis; 10 where there are many), so no file, however small, takes more than 3.1 GiB, and what its
-motion's weights take."""
+"""Numbers that a scene may have: those of 170 thousand Gaussians and 97 bases. Unpacking takes up to 14 bytes a number
+with one basis, and 10 with many. So no file, however small, takes more than 3.1 GiB plus its motion's weights."""
 MAX_WEIGHTS = 7 * 2**25
-"""Weights of a motion: 0.9 GiB, so that finishing a clip of 1,000 frames takes 3 GiB. A long clip has more bases
-than patterns."""
+"""Weights that a motion may have: 0.9 GiB, so that finishing a clip of 1,000 frames takes 3 GiB. A long clip has more
+bases than patterns."""
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
-"""Orthonormal: brightness, red - blue, magenta - green."""
+"""Orthonormal colour axes: brightness, red - blue, magenta - green."""
 
 
 TENSORS = {
@@ -70,29 +69,29 @@ TENSORS = {
     "width": (torch.float32, 1),
     "shared": (torch.uint8, 1),
 }
-"""Type and dimensions of the tensors of a file, by name; PARTS codes are the others."""
+"""Type and dimensions of a file's tensors by name. The file's other tensors are the PARTS codes of the table."""
 
 
 class DoesNotFitError(ValueError):
-    """As many and as large whole numbers as a scene may have cannot hold it."""
+    """A scene needs more or larger integers than the compact form allows."""
 
 
 def state_rows(channels: int) -> list[int]:
-    """Rows of intrasplat/splat/layout.py that a table holds of a Gaussian at rest, where its motion has so many
+    """Rows of intrasplat/splat/layout.py that a table stores of a Gaussian at rest, if its motion has `channels`
     channels.
 
-    Without a channel for the gloss there is no gloss.
+    If no channel is for the gloss, the table has no gloss.
     """
     return [row for row in range(VALUES) if row != GLOSS_ROW or channels == ROWS]
 
 
 @dataclass(frozen=True, eq=False)
 class Numbers(ABC):
-    """A scene in whole numbers, wherever they come from.
+    """A scene in integers: a table in memory, or numbers that are computed when they are needed.
 
-    step     [S] float32      of the state at power 0; S = 15, or 14 where the motion has no channel of the gloss
+    step     [S] float32      step of each number of the state at power 0; S = 15, or 14 without a channel for the gloss
     pattern  [C, R, B] float32  weights of one unit of a motion coefficient at power 0
-    centre, width  [B] float32  of the bases
+    centre, width  [B] float32  centre and width of each basis
     """
 
     step: NDArray[np.float32]
@@ -102,19 +101,19 @@ class Numbers(ABC):
 
     @abstractmethod
     def at_rest(self) -> NDArray[np.int32]:
-        """[N, S] of the state."""
+        """[N, S] the state."""
 
     @abstractmethod
     def coefficients(self, first: int, last: int) -> NDArray[np.int32]:
-        """[N, (last - first) R] of the motion in these channels."""
+        """[N, (last - first) R] motion coefficients of the channels from first up to last."""
 
     @abstractmethod
     def powers(self) -> NDArray[np.integer]:
-        """[N, 3] of place, shape and colour."""
+        """[N, 3] powers of position, shape and colour."""
 
     def at(self, times: Sequence[float]) -> Iterator[Floats]:
-        """The Gaussians' numbers at each model time, [VALUES, N], rows as in intrasplat/splat/layout.py: as model()'s
-        deformation would give them but without its large weights."""
+        """The Gaussians' numbers at each model time, [VALUES, N], rows as in intrasplat/splat/layout.py. They equal
+        those of model()'s deformation, but its large weights are not computed."""
         bases = SharedBasis(torch.zeros(0, CHANNELS, len(self.centre)), self.centre, self.width)
         values = np.stack([bases.basis(t).numpy() for t in times], 1)  # [B, times]
         state, motion = self._state().T, self._motion(self.pattern @ values).T  # [VALUES, N], [times, C, N]
@@ -124,7 +123,7 @@ class Numbers(ABC):
             yield numbers
 
     def _scale(self, group: int) -> Floats:
-        """[N] 2**-power of a group."""
+        """[N] 2**-power in a group."""
         return np.exp2(-self.powers()[:, group].astype(np.float32))  # exact
 
     def _state(self) -> Floats:
@@ -137,13 +136,13 @@ class Numbers(ABC):
         return state
 
     def _motion(self, pattern: Floats) -> Floats:
-        """[N, C, X] motion coefficients times patterns [C, R, X], colour as red, green and blue."""
+        """[N, C, X] motion coefficients times patterns [C, R, X], with colour as red, green and blue."""
         channels, patterns, columns = pattern.shape
         motion = np.empty((len(self.powers()), channels, columns), np.float32)
 
         def fill(first: int, last: int, weights: Floats) -> None:
-            """The channels from first to last, whose coefficients the weights [(last - first) R, (last - first) X] mix;
-            few rows at a time, because floats of all of them would take as much memory as the motion."""
+            """Fill the channels from first up to last: their coefficients times weights [(last - first) R,
+            (last - first) X]. Few rows at a time: floats of all rows would take as much memory as the motion."""
             whole, scale = self.coefficients(first, last), self._scale(GROUP_OF[first])[:, None]
             for start in range(0, len(whole), ROWS_AT_ONCE):
                 some = slice(start, start + ROWS_AT_ONCE)
@@ -163,9 +162,9 @@ class Numbers(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Compact(Numbers):
-    """A scene in whole numbers that lie in one table.
+    """A scene in integers, in one table.
 
-    table    [N, K] int32     columns: the state's, then R motion coefficients per channel, then the 3 powers, then seen
+    table    [N, K] int32     columns: the state, then R motion coefficients per channel, then the 3 powers, then `seen`
     """
 
     table: NDArray[np.int32]
@@ -181,13 +180,13 @@ class Compact(Numbers):
         return self.table[:, -4:-1]
 
     def model(self) -> tuple[Gaussians, SharedBasis, Tensor]:
-        """Gaussians, motion and seen [N], as floats."""
+        """Gaussians, motion and `seen` [N], as floats."""
         weight = torch.from_numpy(self._motion(self.pattern))
         share = torch.from_numpy(self.table[:, -1].astype(np.float32) / np.float32(SEEN_LEVELS))
         return _gaussians_of(self._state()), SharedBasis(weight, self.centre, self.width), share
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors of scene.safetensors: the table, differenced where that helps, then coded; the rest as it is."""
+        """The tensors of scene.safetensors: the coded table, with differences where they help; the rest as it is."""
         stored, shared = take_differences(self.table, _powers(self.table), _group(self.pattern.shape))
         codes = [torch.from_numpy(np.frombuffer(code, np.uint8).copy()) for code in encode(stored)]
         return {
@@ -202,10 +201,10 @@ class Compact(Numbers):
 
 
 def unpack(tensors: Mapping[str, Tensor]) -> Compact:
-    """The compact scene of the tensors that Compact.tensors() made.
+    """The compact scene from the tensors that Compact.tensors() returned.
 
     Raises:
-        ValueError: tensors are missing, do not fit together, or unpack to more than MAX_NUMBERS.
+        ValueError: tensors are missing, do not fit together, or unpack to more than MAX_NUMBERS numbers.
     """
     count, step, pattern, centre, width, shared = (
         _checked(tensors, name, kind, dimensions) for name, (kind, dimensions) in TENSORS.items()
@@ -234,7 +233,7 @@ def unpack(tensors: Mapping[str, Tensor]) -> Compact:
 
 
 def compile_coder() -> float:
-    """Compile the coder's kernels for this processor, or load them from the cache; returns seconds."""
+    """Compile the coder's kernels for this processor, or load them from the cache; return the seconds it took."""
     start = time.perf_counter()
     table = np.ones((2, VALUES + 4), np.int32)
     still = np.zeros((ROWS, 0, 1), np.float32)
@@ -249,10 +248,10 @@ def _checked(tensors: Mapping[str, Tensor], name: str, kind: torch.dtype, dimens
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Refuse a table that is empty or larger than MAX_NUMBERS.
+    """Check the size of a table.
 
     Raises:
-        DoesNotFitError: it is.
+        DoesNotFitError: the table is empty or has more than MAX_NUMBERS numbers.
     """
     if rows < 1 or rows * columns > MAX_NUMBERS:
         raise DoesNotFitError(
@@ -268,10 +267,10 @@ def _check_numbers(table: NDArray[np.int32], step: Floats) -> None:
 
 
 def _undo_differences(table: NDArray[np.int32], shared: NDArray[np.bool_], shape: Sequence[int]) -> None:
-    """Turn differences back into numbers, in place; the powers first, because the other columns need them.
+    """Turn differences back into numbers, in place. The powers come first, because the other columns need them.
 
     Raises:
-        ValueError: a number, a power or a share lies outside its range.
+        ValueError: a number, a power or a `seen` lies outside its range.
     """
     group = _group(shape)
     add_differences(table, np.zeros((len(table), PLAIN + 1), np.int64), group, shared & (group == PLAIN))
@@ -282,14 +281,14 @@ def _undo_differences(table: NDArray[np.int32], shared: NDArray[np.bool_], shape
 
 
 def _group(shape: Sequence[int]) -> Whole:
-    """[K] which power belongs to each column of the table; shape [C, R, B]."""
+    """[K] index of the power of each column of the table; shape: [C, R, B]."""
     channels, patterns, _ = shape
     at_rest = GROUP_OF[state_rows(channels)]
     return np.concatenate([at_rest, np.repeat(GROUP_OF[:channels], patterns), np.full(PLAIN_COLUMNS, PLAIN)])
 
 
 def _powers(table: NDArray[np.int32]) -> Whole:
-    """[N, 4] of place, shape and colour, and 0 for the plain columns."""
+    """[N, 4] powers of position, shape and colour, and 0 for the plain columns."""
     powers = table[:, -4:].astype(np.int64)
     powers[:, PLAIN] = 0
     return powers

@@ -1,13 +1,13 @@
-"""Store differences from the mean of two neighbours instead of numbers, in the columns where these are smaller.
+"""Store differences from the mean of two neighbours, in the columns where they are smaller than the numbers.
 
 Symbols: N Gaussians in an order in which neighbours are near, K columns, G groups of columns.
 
-Gaussian i lies between i - s and i + s, where s is the largest power of two that divides i: every second Gaussian is
-predicted from the two beside it, then every second of those left, and so on. Where there is no right neighbour, the
-left one counts twice. The table is coded from the coarsest level to the finest, and decoded in the same order.
+Gaussian i is predicted from i - s and i + s, where s is the largest power of two that divides i: every second Gaussian
+from the two beside it, then every second of the rest, and so on. Where there is no right neighbour, the left one counts
+twice. The table is coded from the coarsest level to the finest, and decoded in the same order.
 
-A number stands for itself times 2**-power, the power being its Gaussian's in the column's group. All arithmetic is on
-integers.
+The value of a number is the number times 2**-power, with its Gaussian's power in the column's group. All arithmetic is
+on integers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Powers = NDArray[np.int64]
 
 MAX_POWER = 4
 MAX_STORED = 2**28
-"""Limit of the magnitude of numbers and of differences; the range coder allows four times as much."""
+"""Largest magnitude of a number or a difference; the range coder allows four times as much."""
 
 
 def coding_order(count: int) -> NDArray[np.int64]:
@@ -32,7 +32,7 @@ def coding_order(count: int) -> NDArray[np.int64]:
 
 
 def take_differences(table: Table, power: Powers, group: NDArray[np.int64]) -> tuple[Table, NDArray[np.bool_]]:
-    """The table in coding order, and which columns [K] now hold differences: those whose sum of magnitudes it lowers.
+    """The table in coding order, and which columns [K] contain differences: those whose sum of magnitudes falls by it.
 
     Args:
         table: [N, K], magnitudes up to MAX_STORED.
@@ -64,7 +64,7 @@ def _runs(group: NDArray[np.int64]) -> NDArray[np.intp]:
 
 @kernel
 def _neighbours(count, i, power, g):  # type: ignore[no-untyped-def]
-    """Both neighbours of Gaussian i; bits to shift their numbers up, and their sum down, in group g."""
+    """Both neighbours of Gaussian i in group g; by how many bits to shift their numbers up, and their sum down."""
     left, right = i - (i & -i), i + (i & -i)
     if right >= count:
         right = left
@@ -87,7 +87,7 @@ def _subtract(table, power, group, runs, order, stored, before, after, largest):
             for k in range(runs[run], runs[run + 1]):
                 number = np.int64(table[i, k])
                 difference = number - (_mean(table[left, k], table[right, k], up, also_up, down) if i else 0)
-                stored[place, k] = difference  # may overflow int32; then the column stays plain
+                stored[place, k] = difference  # may overflow int32; then the column keeps its numbers
                 before[k] += abs(number)
                 after[k] += abs(difference)
                 largest[k] = max(largest[k], abs(difference))
@@ -103,7 +103,7 @@ def _copy_columns(table, order, copied, stored):  # type: ignore[no-untyped-def]
 
 @kernel
 def _add(table, power, group, runs, order, differenced):  # type: ignore[no-untyped-def]
-    """Add the means back, level after level; returns whether all numbers are within MAX_STORED."""
+    """Add the means back, level after level; return whether all numbers are within MAX_STORED."""
     largest = np.int64(0)
     for i in order[1:]:
         for run in range(len(runs) - 1):

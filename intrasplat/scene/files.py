@@ -1,4 +1,4 @@
-"""Read files of tensors: what scene.safetensors and resume.safetensors have in common."""
+"""Read files of tensors: the code that scene.safetensors and resume.safetensors share."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A scene that another installation made, taken in: nothing is kept of its files but what our own reader understood.
+"""Import a scene of another installation: only what our own reader understands is stored.
 
-intrasplat/scene/archive.py has judged the archive before. Symbols: T frames.
+intrasplat/scene/archive.py has checked the archive before. Symbols: T frames.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def take_scene(
     max_bytes: int,
     on_step: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
-    """The report of the scene in an archive, which is put into an empty folder as if it had been made here.
+    """Write the scene of an archive into an empty folder, as if it had been trained here, and return its report.
 
-    limits: of the clips that this installation accepts. on_step(fraction) is called after each step.
+    limits: limits of the clips that this installation accepts. on_step(fraction) is called after each step.
 
     Raises:
-        InputError: the archive is refused, or its scene cannot be shown here. Its field is FIELD.
+        InputError: the archive is refused, or its scene cannot be shown here. The field is FIELD.
         LimitError: the scene has more frames or pixels than this installation accepts.
     """
     read = read_archive(archive, max_bytes, folder)
@@ -60,7 +60,7 @@ def take_scene(
     kept = [name for name in NESTED if (folder / name).exists()]
     for name in kept:
         check_file(folder / name, FIELD, limits)
-    (folder / THUMBNAIL).unlink(missing_ok=True)  # it is rendered anew, so it shows the scene
+    (folder / THUMBNAIL).unlink(missing_ok=True)  # a new one is rendered, so that it shows this scene
     save_scene(folder, _known(scene, warnings), {name: (folder / name).read_bytes() for name in kept})
     report = _from_elsewhere(read.report, imported)
     if RECORDED not in kept:
@@ -71,13 +71,13 @@ def take_scene(
 
 
 def _known(scene: TrainedScene, warnings: tuple[Notice, ...]) -> TrainedScene:
-    """The scene with no other settings than views need: how it was trained elsewhere is for its report to say."""
+    """The scene with only the settings that views need: its report says how it was trained."""
     settings = {"pose_warnings": [each.model_dump(mode="json") for each in warnings]}
     return replace(scene, settings=settings)
 
 
 def _check_recording(scene: TrainedScene, limits: ClipLimits) -> None:
-    """Raise InputError or LimitError unless frames, times, poses and camera are those of a clip that is accepted."""
+    """Raise InputError or LimitError unless a clip of such frames, times, poses and camera is accepted here."""
     if len(scene.gaussians) < 1:
         raise InputError(FIELD, "The scene has no Gaussians.", AGAIN)
     k = scene.intrinsics
@@ -92,14 +92,14 @@ def _check_recording(scene: TrainedScene, limits: ClipLimits) -> None:
 
 
 def _are_rigid(poses: NDArray[np.float64]) -> bool:
-    """Whether poses [T, 4, 4] turn and move, and do nothing else."""
+    """Whether poses [T, 4, 4] are rotations and translations, and nothing else."""
     turns = poses[:, :3, :3]
     is_turn = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max() < MAX_ROTATION_ERROR
     return bool(is_turn and (np.linalg.det(turns) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all())
 
 
 def _check_report(scene: TrainedScene, report: Report) -> None:
-    """Raise InputError unless the report speaks of this scene."""
+    """Raise InputError unless the report describes this scene."""
     k = scene.intrinsics
     pairs = {
         "gaussians": (report.gaussians, len(scene.gaussians)),
@@ -113,7 +113,7 @@ def _check_report(scene: TrainedScene, report: Report) -> None:
 
 
 def _from_elsewhere(report: Report, imported: Imported) -> Report:
-    """The report with where its scene came from, and with the scores that it has."""
+    """The report, with the origin of its scene added and its scores unchanged."""
     if not report.scored:
         report = without_scores(report, "it was exported before they were known")
     text = (

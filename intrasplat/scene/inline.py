@@ -1,6 +1,6 @@
-"""ES modules of the page as one classic script, for a file that opens without a server.
+"""Join ES modules of the page into one classic script, for a file that opens without a server.
 
-It understands the forms that our modules use, and refuses every other instead of guessing:
+It understands these forms, which our modules use, and refuses all others:
 
     import { a, b as c } from "./x.js";             export function, export class, export const NAME
     new Worker(new URL("./x.js", import.meta.url), { type: "module" })
@@ -21,19 +21,19 @@ _ENDS_SCRIPT = re.compile(r"</script|<!--", re.IGNORECASE)
 START_WORKER = """\
 const startWorker = (source) => new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
 """
-"""A classic worker: on a page from a disk Chromium starts no module from a blob."""
+"""Starts a classic worker: on a page from a disk, Chromium starts no module worker from a blob."""
 
 
 class CannotInlineError(ValueError):
-    """A module has a form that is not understood; the message names both."""
+    """A module contains a form that is not understood; the message names the module and the form."""
 
 
 def inlined(entry: Path) -> str:
-    """One script that does what the module does, with all that it imports; safe inside <script>.
+    """One script of a module and all that it imports; safe inside <script>.
 
     Raises:
         CannotInlineError: a form is not understood, or modules import each other in a circle.
-        OSError: a module is not there.
+        OSError: a module is missing.
     """
     script = f'"use strict";\n{START_WORKER}{_Bundle().of(entry)}'
     if found := _ENDS_SCRIPT.search(script):
@@ -42,7 +42,7 @@ def inlined(entry: Path) -> str:
 
 
 class _Bundle:
-    """The modules of one script, each a function that is called once and gives its exports."""
+    """The modules of one script. Each is a function that is called once and returns its exports."""
 
     def __init__(self) -> None:
         self._names: dict[Path, str] = {}
@@ -54,7 +54,7 @@ class _Bundle:
         return "".join(self._text)
 
     def _add(self, path: Path) -> str:
-        """The name that holds a module's exports; the module comes after those that it imports."""
+        """Add a module after those that it imports; return the name of the variable with its exports."""
         if path in self._open:
             raise CannotInlineError(f"{path.name} imports itself, by way of others")
         if path not in self._names:

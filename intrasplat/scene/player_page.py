@@ -1,7 +1,7 @@
 """A scene and the page's player in one HTML file, which opens from a disk without a server or a network.
 
-The page lies in the dashboard's folder `file/`; its style, its script with all modules, and the scene are put into it.
-A policy of its own allows it nothing else.
+The page is in the dashboard's folder `file/`. Its style, its script with all modules, and the scene are inserted. Its
+content security policy allows nothing else.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ PAGE, STYLE, SCRIPT = "alone.html", "alone.css", "alone.js"
 CHARSET = '<meta charset="utf-8">'
 SCENE_TAG = '<script type="text/plain" id="scene">'
 DRAWN = ("compact", "shared")
-"""Coding and motion of the scenes that the player draws."""
+"""Coding and kind of motion of the scenes that the player draws."""
 MAX_SCENE_BYTES = 256 << 20
-"""Browsers have texts of at most half a gigabyte; our presets store a few megabytes."""
-PIECE_BYTES = 3 << 18  # a multiple of 3 ends on a whole character
+"""Browsers limit a string to half a gigabyte; scenes of our presets have a few megabytes."""
+PIECE_BYTES = 3 << 18  # a multiple of 3: base64 of it ends on a whole character
 DASHBOARD_REMEDY = "Set INTRASPLAT_DASHBOARD_DIR to the page's files, the folder client/dashboard."
 
 
@@ -37,7 +37,7 @@ def page_parts(folder: Path, scene_id: str | None, dashboard_dir: Path | None) -
         InputError: the player does not draw scenes of this kind.
         LimitError: the scene is too large for one file.
         SceneError: there is no scene, or its manifest cannot be read.
-        UnavailableError: the page's files are not there.
+        UnavailableError: the page's files are missing.
     """
     try:
         manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_bytes())
@@ -107,5 +107,5 @@ def _page(dashboard_dir: Path | None, documents: dict[str, object]) -> tuple[str
 
 
 def _hash(text: str) -> str:
-    """As a policy names an inline script or style."""
+    """The hash by which a content security policy names an inline script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -1,16 +1,16 @@
-"""Turn a scene into whole numbers: each as coarse as the picture allows.
+"""Round a scene to integers, each as coarse as the picture allows.
 
 Symbols: N Gaussians, C channels (10, 13 with colour, 14 with gloss), B bases, R < B patterns of motion per channel.
 
-`effect` decides what is lost: the mean squared change of the picture that a change of 1 in a number makes.
+`effect` decides how much precision is lost: the mean squared change of the picture when a number changes by 1.
 
 1. Three changes of coordinates lose nothing. A channel's mean over the trained times moves from the motion into the
    canonical state. Quaternions get length 1. Red, green and blue become a brightness and two differences.
 2. Motion becomes coefficients of R patterns per channel: the principal components of all Gaussians' motions at the
    trained times. Errors of equal size in any coefficient then weigh the same in time.
 3. Gaussians are sorted along a curve through the view from the world's origin, so that neighbours are alike.
-4. Every number is divided by its step and rounded. The step is the channel's own, so that all channels' errors weigh
-   the same in the picture, times a power of two for each Gaussian's place, shape and colour.
+4. Every number is divided by its step and rounded. The step is the channel's step, so that all channels' errors weigh
+   the same in the picture, times a power of two for each Gaussian's position, shape and colour.
 
 prepare() does steps 1 to 3, rounding() step 4.
 """
@@ -48,19 +48,19 @@ Reals = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 SHAPE = slice(QUATERNION_ROW, COLOUR_ROW)
-"""Quaternion and log-scale, whose precision is one power."""
+"""Rows of quaternion and log-scale, which share one power."""
 MAX_ROTATION_STEP = 2.0**MIN_POWER / 2
-"""Of a quaternion at power 0. One of length 1 has a number of at least 1/2, which is one step at the lowest power, so
-no quaternion is rounded to 0, which is not a rotation."""
+"""Largest step of a quaternion at power 0. A quaternion of length 1 has a number of at least 1/2, one step at the
+lowest power. So none is rounded to 0, which is not a rotation."""
 MIN_EFFECT = 1e-3
-"""A channel that the frames do not show at all is stored as if they showed it so much. Rotations have 0.02, places
-0.3."""
+"""Smallest effect of a channel: one that the frames do not show at all is stored as if they showed it this much.
+Rotations have 0.02, positions 0.3."""
 RIDGE = 0.01
-"""Added to the bases' strength, as a share of its mean: motion that no trained time shows keeps a tenth of the
+"""Added to the bases' strength, as a share of its mean: motion that no trained time shows is stored with a tenth of the
 precision."""
 MIN_SHOWN = 2e-5
-"""RMS change of the picture, 1 being from black to white, below which a pattern is left out: all its numbers round to 0
-at any step that a scene is stored with."""
+"""Patterns that change the picture less are skipped (RMS; 1 is black to white): all their numbers round to 0 at any
+step that a scene is stored with."""
 CURVE_BITS = 16
 COLOURS, QUATERNIONS = (range(rows.start, rows.stop) for rows in (COLOUR, QUATERNION))
 
@@ -71,11 +71,11 @@ class Prepared:
 
     state    [N, S]      means over the trained times; S as in compact.py
     motion   C of [N, r] coefficients of the channel's r <= R patterns, float32
-    pattern  [C, R, B]   weights of each pattern; 0 of those that a channel has not
-    power    [N, 3]      precision of place, shape and colour, as powers of two
+    pattern  [C, R, B]   weights of each pattern; 0 for patterns that a channel does not have
+    power    [N, 3]      precision of position, shape and colour, as powers of two
     effect   [S]         RMS change of the picture when all Gaussians are off by 2**-power
     seen     [N]         in [0, 1]
-    basis                of the motion, without weights
+    basis                the motion's bases, without weights
     """
 
     state: Reals
@@ -95,11 +95,11 @@ def prepare(
     effect: Reals,
     trained_t: Sequence[float],
 ) -> Prepared:
-    """The scene in the coordinates in which it is rounded; nothing is lost yet.
+    """The scene in the coordinates in which it is rounded; no precision is lost yet.
 
     Args:
-        bases: those of the motion; its own weights are not read.
-        weight: [B, C, N] of the motion, as it lies in a model; read channel by channel.
+        bases: the motion's bases; their own weights are not read.
+        weight: [B, C, N] weights of the motion, as a model stores them; read channel by channel.
         seen: [N] in [0, 1].
         effect: [VALUES, N]; an error e in a number adds effect * e**2 / N to the picture's mean squared error.
         trained_t: model times of the training frames, at least one.
@@ -112,7 +112,7 @@ def prepare(
     mean = np.stack([values.mean(0).astype(np.float32) @ weight[:, c] for c in range(channels)], axis=1)[order]
     state[:, :channels] += mean
     length = np.linalg.norm(state[:, QUATERNION], axis=1)
-    state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # zeros are not a rotation
+    state[length == 0, QUATERNION_ROW], length[length == 0] = 1, 1  # a quaternion of zeros is not a rotation
     state[:, QUATERNION] /= length[:, None]
     effect[QUATERNION] *= length**2
     state[:, COLOUR] = state[:, COLOUR] @ OPPONENT.T
@@ -131,11 +131,10 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class Rounding(Numbers):
-    """A prepared scene as it is when rounded, number by number as they are asked for: its table would take as much
-    memory as the scene.
+    """A prepared scene that rounds its numbers when they are asked for: a table would take as much memory as the scene.
 
     step     [S] as in Numbers
-    per_unit [N, S] float64, of the state and of its channels' motion: whole numbers a unit
+    per_unit [N, S] float64, integer steps per unit, of the state and of its channels' motion
     """
 
     prepared: Prepared
@@ -157,7 +156,7 @@ class Rounding(Numbers):
         return self.prepared.power
 
     def compact(self) -> Compact:
-        """The same in one table, which takes the memory of the prepared motion: nothing else can be rounded then."""
+        """The same in one table. It frees the prepared motion, so that nothing else can be rounded afterwards."""
         channels, patterns, _ = self.pattern.shape
         first = len(self.step)
         columns = first + channels * patterns + PLAIN_COLUMNS
@@ -168,7 +167,7 @@ class Rounding(Numbers):
             self.prepared.motion[channel] = np.zeros((0, 0), np.float32)
             first += patterns
         table[:, -4:-1] = self.powers()
-        # What was seen at all stays so: a render marks what was not.
+        # Do not round a positive `seen` to 0: a render marks what was not seen.
         seen = self.prepared.seen
         table[:, -1] = np.maximum(np.rint(seen * SEEN_LEVELS), seen > 0)
         return Compact(self.step, self.pattern, self.centre, self.width, table)
@@ -177,13 +176,13 @@ class Rounding(Numbers):
 def rounding(prepared: Prepared, step: float) -> Rounding:
     """The scene with every number rounded to a multiple of its step.
 
-    What it gives raises DoesNotFitError where a number would exceed MAX_STORED.
+    The methods of the result raise DoesNotFitError where a number would exceed MAX_STORED.
 
     Args:
         step: change of the picture (1 is black to white) when all Gaussians' numbers of one kind are off by one step.
 
     Raises:
-        DoesNotFitError: there would be more than MAX_NUMBERS.
+        DoesNotFitError: there would be more than MAX_NUMBERS numbers.
     """
     channels, patterns, _ = prepared.pattern.shape
     rows = state_rows(channels)
@@ -197,10 +196,10 @@ def rounding(prepared: Prepared, step: float) -> Rounding:
 
 
 def _whole(numbers: NDArray[np.floating]) -> NDArray[np.int32]:
-    """The numbers rounded, which are overwritten.
+    """The numbers rounded; the input array is overwritten.
 
     Raises:
-        DoesNotFitError: one would exceed MAX_STORED.
+        DoesNotFitError: a number would exceed MAX_STORED.
     """
     largest = max(-float(numbers.min(initial=0)), float(numbers.max(initial=0)))
     if not largest <= MAX_STORED:
@@ -232,16 +231,16 @@ def _power(effect: Reals) -> Whole:
 
 
 def _channels(weight: Floats, order: Whole, mean: Floats, length: Floats) -> Iterator[Floats]:
-    """Each channel's weights [N, B] in the new coordinates and order; a copy of all of them would take much memory.
+    """Each channel's weights [N, B] in the new coordinates and order, one by one to save memory.
 
-    weight [B, C, N] as it was; mean [N, C] over the trained times and length [N] of the quaternions, in the new order.
+    weight: [B, C, N] in the old order. mean [N, C] over the trained times, length [N] of quaternions: in the new order.
     """
 
     def ordered(row: int) -> Floats:
-        """[B, N] of one channel, whose mean is taken out: the bases sum to 1."""
+        """[B, N] weights of one channel less its mean, which each weight contains, because the bases sum to 1."""
         found = np.empty((len(weight), len(order)), np.float32)
         for at_basis, kept in zip(weight, found, strict=True):
-            np.take(at_basis[row], order, out=kept, mode="clip")  # raise would copy it once more
+            np.take(at_basis[row], order, out=kept, mode="clip")  # mode "raise" would make one more copy
         return np.subtract(found, mean[:, row], out=found)
 
     for row in range(weight.shape[1]):
@@ -259,8 +258,8 @@ def _patterns(
 ) -> tuple[list[Floats], Reals]:
     """Coefficients, C of [N, r], and patterns [C, R, B] of C channels' weights [N, B], whose mean over the times is 0.
 
-    A channel has the strongest patterns: those that show, and at most so many. effect [C] as in Prepared; values [T, B]
-    of the bases at the trained times; scale [N, C or more], precision of each Gaussian's channel.
+    A channel gets its strongest patterns, at most `most`, without those below MIN_SHOWN. effect: [C] as in Prepared.
+    values: [T, B] bases at the trained times. scale: [N, C or more] precision of each Gaussian's channel.
     """
     bases = values.shape[1]
     strength = values.T @ values / len(values)
@@ -271,7 +270,7 @@ def _patterns(
         seen = weight @ root.astype(np.float32)
         scaled = seen * scale[:, channel, None].astype(np.float32)
         energy, components = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
-        shown = effect[channel] * np.sqrt(np.maximum(energy[:0:-1], 0) / len(scale))  # of a pattern, in all Gaussians
+        shown = effect[channel] * np.sqrt(np.maximum(energy[:0:-1], 0) / len(scale))  # effect of each pattern
         kept = components[:, :0:-1]  # the weakest is 0, because the mean over time is taken out
         kept = kept[:, : min(int((shown >= MIN_SHOWN).sum()), most)]
         coefficients.append(seen @ kept.astype(np.float32))
@@ -283,7 +282,7 @@ def _patterns(
 
 
 def _along_curve(mean: Reals) -> Whole:
-    """[N] places along a Hilbert curve through the first frame's view; mean [N, 3] in optimiser units."""
+    """[N] positions along a Hilbert curve through the first frame's view; mean: [N, 3] in optimiser units."""
     direction = mean[:, :2] / np.maximum(mean[:, 2:], 1.0)
     direction -= direction.min(0)
     size = 1 << CURVE_BITS

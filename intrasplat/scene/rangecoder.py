@@ -1,13 +1,13 @@
-"""Encode and decode tables of whole numbers with an adaptive binary range coder, as LZMA's.
+"""Encode and decode tables of integers with an adaptive binary range coder like that of LZMA.
 
-Symbols: N Gaussians, K rows of whole numbers, one of each a Gaussian; a table is [N, K].
+Symbols: N Gaussians, K rows of integers with one integer per Gaussian; a table is [N, K].
 
 Each number is coded as bits: how many binary digits its magnitude has (that many ones, then a zero), its sign, and the
 digits below the leading one, from the top. The sign and the third and later of these digits are direct bits, which cost
-one bit each. Every other bit has an adaptive probability. A row's probabilities come in BUCKETS sets. The set is chosen
-by activity: how large, for their rows, the last numbers of this Gaussian and of this row were. Where there is motion,
-there is much of it. All arithmetic is on integers, so a table has the same code on every machine. docs/scene-file.md
-describes the code for other readers.
+one bit each. Every other bit has an adaptive probability. A row has BUCKETS sets of probabilities. The activity chooses
+the set: how large, for their rows, the last numbers of this Gaussian and of this row were, because large motion occurs
+together. All arithmetic is on integers, so a table has the same code on every machine. docs/scene-file.md describes the
+code for other readers.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from intrasplat.machine.cache import kernel
 Table = NDArray[np.int32]
 
 PARTS = 4
-"""A table is split into so many tables of neighbouring rows, which are coded independently and in parallel."""
+"""Number of tables of neighbouring rows into which a table is split, to code them independently and in parallel."""
 MAX_MAGNITUDE = 2**30 - 1
-"""Magnitudes have at most 30 digits."""
+"""The largest magnitude of 30 binary digits."""
 BUCKETS = 10
 """Sets of probabilities per row, by activity."""
 MODELS = 33 + 31 + 2 * 31
-"""Probabilities of a set: of the digit count, of the second digit by that count, of the third by count and second."""
+"""Probabilities in a set: of the digit count, of the second digit by that count, of the third by count and second."""
 SECOND, THIRD = 33, 33 + 31
 ONE = 1 << 16
-"""Probabilities of a 0 are shares of this, each the mean of a quick and a slow estimate."""
+"""Probability 1. A probability of a 0 is the mean of a fast and a slow estimate, in units of 1 / ONE."""
 QUICK, SLOW = 4, 7
 MAX_BIT_COST = 10
 """Most bits of code that one bit with a probability takes: `it >> k` is 0 below 2**k, so estimates stay 15 and 127 away
@@ -40,7 +40,7 @@ AVERAGE = 64
 """Activity of a number as large as its row's average."""
 MAX_ACTIVITY = 6 * AVERAGE
 THRESHOLDS = np.array([14, 21, 31, 46, 69, 103, 154, 231, 346])
-"""Activities at which the next bucket begins: each half as much again, rounded down."""
+"""Activities at which the next bucket starts: each 1.5 times the one before, rounded down."""
 _BUCKET_OF = np.searchsorted(THRESHOLDS, np.arange(MAX_ACTIVITY + 1), side="right")
 _TOP = np.uint64(1 << 24)
 _FULL = np.uint64(0xFFFFFFFF)
@@ -88,7 +88,7 @@ def decode(codes: list[bytes], count: int, rows: int) -> Table:
 
 @kernel
 def _encode(table, out):  # type: ignore[no-untyped-def]
-    """Encode a table into out; returns the number of bytes written."""
+    """Encode a table into out; return the number of bytes written."""
     count, rows = table.shape
     models, average, nearby = _initial_models(rows)
     # low, the range's width, bytes written (the first is 0); passed as plain numbers, as an array would be slower
@@ -121,7 +121,7 @@ def _encode(table, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _decode(code, table):  # type: ignore[no-untyped-def]
-    """Decode a table; returns the number of bytes that its encoder wrote, or -1 if no encoder wrote this code."""
+    """Decode a table; return the number of bytes that its encoder wrote, or -1 if no encoder wrote this code."""
     count, rows = table.shape
     models, average, nearby = _initial_models(rows)
     state = np.uint64(0), _FULL, np.int64(0)  # the code less low, the range's width, bytes read
@@ -157,7 +157,7 @@ def _decode(code, table):  # type: ignore[no-untyped-def]
 
 @kernel
 def _initial_models(rows):  # type: ignore[no-untyped-def]
-    """Probabilities [rows * BUCKETS * MODELS, 2]; of each row its average magnitude * 256 and its activity."""
+    """Probabilities [rows * BUCKETS * MODELS, 2]; each row's average magnitude * 256; each row's activity."""
     models = np.full((rows * BUCKETS * MODELS, 2), ONE // 2, np.uint16)  # they stay below ONE
     return models, np.full(rows, 256, np.int64), np.full(rows, AVERAGE, np.int64)
 
@@ -180,7 +180,7 @@ def _digit_model(digits, digit, magnitude):  # type: ignore[no-untyped-def]
 
 @kernel
 def _update_activity(magnitude, here, average, nearby, k):  # type: ignore[no-untyped-def]
-    """Update row k's average and activity with a number; returns the Gaussian's new activity."""
+    """Update row k's average and activity with a number; return the Gaussian's new activity."""
     average[k] += ((magnitude << 8) - average[k]) >> 7
     activity = 0
     if magnitude:  # most are 0, and the division is the slowest step here
@@ -220,7 +220,7 @@ def _encode_direct_bit(state, out, bit):  # type: ignore[no-untyped-def]
 
 @kernel
 def _narrow(state, out, bound, bit):  # type: ignore[no-untyped-def]
-    """Narrow the range to the bit's part and write the bytes that are settled."""
+    """Narrow the range to the bit's part and write the bytes that can no longer change."""
     low, width, place = state
     if bit:
         low += bound

@@ -2,7 +2,7 @@
 
 left/000012.jpg    frame 12 of the clip as the model's left camera sees it
 left/000012.png    its mask, if there are masks: 1 bit, 255 on instruments, transparent elsewhere
-right/...          the same of the right eye, if both eyes taught
+right/...          the same of the right eye, if the model was trained on both eyes
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PICTURE: Kind = "jpg"
 MASK: Kind = "png"
 
 MAX_FRAME_BYTES = 8 << 20
-"""Of one file in the zip, which may have come from another site."""
+"""Limit of one file in the zip, which may come from another site."""
 NAME = re.compile(r"(left|right)/(\d{6})\.(jpg|png)")
 
 
@@ -31,7 +31,7 @@ def name_of(eye: Eye, frame: int, kind: Kind) -> str:
 
 
 def nearest(frames: Iterable[int], t: float, frame_count: int) -> int:
-    """Which of some frames is nearest to model time t in a clip of frame_count frames; at least one is given."""
+    """The one of `frames` (at least one) that is nearest to model time t in a clip of frame_count frames."""
     wanted = min(t, 1.0) * frame_count
     return min(frames, key=lambda frame: abs(frame - wanted))
 
@@ -40,8 +40,8 @@ def read_frame(path: Path, frame_count: int, t: float, eye: Eye = "left", kind: 
     """The frame nearest to model time t, and its picture or mask.
 
     Raises:
-        SceneError: no frames are kept, or the file is damaged.
-        InputError: none of this eye, or no masks.
+        SceneError: the scene has no recorded frames, or the file is damaged.
+        InputError: it has none of this eye, or no masks.
     """
     try:
         with zipfile.ZipFile(path) as archive:

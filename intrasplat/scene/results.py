@@ -1,7 +1,7 @@
-"""The scores of a finished scene are added to its folder when they are known.
+"""Add the scores of a finished scene to its folder when they are known.
 
-A reader finds either the scene alone, or the scene with its scores: the manifest, which is replaced last, holds hashes
-of the report and the curve from then on.
+A reader finds either the scene alone, or the scene with its scores: the manifest, which is replaced last, contains the
+hashes of the report and the curve.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import Report
 
 RESULTS = (REPORT, CURVE, MANIFEST)
-"""The files that change, in the order in which they do."""
+"""The files that change, in the order in which they are replaced."""
 
 
 def listed_files(manifest: dict[str, Any]) -> dict[str, Any]:
-    """What a scene's manifest says of its files: of those that rendering reads and of those beside them.
+    """A scene's files as its manifest lists them: those that rendering reads, and those beside them.
 
     Raises:
-        KeyError, TypeError: it is not the manifest of a scene.
+        KeyError, TypeError: this is not the manifest of a scene.
     """
     files: dict[str, Any] = manifest["files"] | manifest.get("beside", {})
     return files
 
 
 def add_scores(folder: Path, report: Report) -> None:
-    """Put the scored report into a scene's folder. The curve's last point becomes the report's score.
+    """Write the scored report into a scene's folder. The report's score becomes the curve's last point.
 
-    The points before it are over at most sixteen held-out frames, and of the model in training.
+    The earlier points score the model in training, on at most sixteen held-out frames.
 
     Raises:
         FileNotFoundError: the scene has been removed.

@@ -1,6 +1,6 @@
-"""The state of a training run in one file, resume.safetensors: what a stopped or killed run goes on from.
+"""The state of a training run in one file, resume.safetensors, from which a stopped or killed run continues.
 
-Its header holds a version, the loop's state as JSON, and a CRC-32 of that state and all tensors.
+Its header contains a version, the loop's state as JSON, and a CRC-32 of that state and all tensors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from intrasplat.names import RESUME
 
 RESUME_FILE = RESUME
 RESUME_VERSION = 3
-"""Raised whenever the stored state changes; no version reads another's."""
+"""It rises whenever the stored state changes; no version reads another's."""
 
 _DTYPES = {
     torch.float32: "F32",
@@ -34,10 +34,10 @@ _DTYPES = {
     torch.bool: "BOOL",
 }
 _NO_CHECKSUM = "-" * 8
-"""In its place until the file is whole."""
+"""Stands in place of the checksum until the file is complete."""
 _AT_ONCE_BYTES = 1 << 20
 _PIECE_BYTES, _AT_MOST_BYTES = 1 << 20, 64 << 20
-"""after_each is called after pieces of at least the first size; tensors above the second are written row by row."""
+"""after_each is called after pieces of at least the first size; tensors larger than the second are written by rows."""
 
 
 def begin_resume(
@@ -46,18 +46,18 @@ def begin_resume(
     state: Mapping[str, Any],
     after_each: Callable[[], None] = lambda: None,
 ) -> Callable[[], None]:
-    """Copy a training state to the page cache; the function that this returns waits for the disk, on any thread.
+    """Copy a training state to the page cache; return a function that waits for the disk, on any thread.
 
-    Then directory/resume.safetensors is the new state; until then it is the earlier one. When this returns the tensors
-    may change. Only one file of a directory may be under way at a time.
+    Until that function returns, directory/resume.safetensors is the earlier state; then it is the new one. The tensors
+    may change as soon as begin_resume returns. Only one write to a directory may be in progress at a time.
 
     Args:
-        tensors: of a type in _DTYPES, on any device, for example parameters and Adam's moments.
-        state: what JSON can hold: iteration, seconds, settings.
+        tensors: parameters and Adam's moments, for example, of a type in _DTYPES, on any device.
+        state: iteration, seconds, settings: anything that JSON can represent.
         after_each: called after each large piece, to free pages of tensors that are mapped from files.
 
     Raises:
-        OSError: the disk is full or refuses; the earlier file is as it was. The returned function raises it, too.
+        OSError: the disk is full or refuses; the earlier file is unchanged. The returned function raises it, too.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / RESUME_FILE
@@ -94,11 +94,11 @@ def begin_resume(
 
 
 def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the state that begin_resume wrote, on the CPU. The tensors are read from the file when they are
-    used: load them before it is replaced.
+    """The tensors and the state that begin_resume wrote, on the CPU. The tensors are mapped from the file: use them
+    before it is replaced.
 
     Raises:
-        SceneError: there is none, it is damaged, or another version wrote it.
+        SceneError: the file is missing or damaged, or another version wrote it.
     """
     path = directory / RESUME_FILE
     try:
@@ -118,7 +118,7 @@ def load_resume(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _places(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Type, shape and place of each tensor in the file, in their order, as safetensors wants them."""
+    """Type, shape and offsets of each tensor in the file, in safetensors' format."""
     places, end = {}, 0
     for name, tensor in tensors.items():
         start, end = end, end + tensor.numel() * tensor.element_size()
@@ -127,7 +127,7 @@ def _places(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _header(places: Mapping[str, Any], state: str, checksum: str) -> bytes:
-    """The file's start, as long for every checksum. The tensors after it are aligned."""
+    """The start of the file. Its length does not depend on the checksum, and it aligns the tensors that follow."""
     metadata = {"version": str(RESUME_VERSION), "crc32": checksum, "state": state}
     text = json.dumps({"__metadata__": metadata, **places}).encode()
     text += b" " * (-len(text) % 8)
@@ -135,7 +135,7 @@ def _header(places: Mapping[str, Any], state: str, checksum: str) -> bytes:
 
 
 def _pieces(tensor: Tensor) -> Iterator[memoryview]:
-    """The bytes of a tensor in order, without a copy of all of it: rows of a padded array lie apart."""
+    """The bytes of a tensor in order. It is copied in parts: rows of a padded array are not contiguous."""
     small = tensor.numel() * tensor.element_size() <= _AT_MOST_BYTES
     if (tensor.is_contiguous() and small) or tensor.dim() < 2:
         yield tensor.contiguous().view(-1).view(torch.uint8).numpy().data

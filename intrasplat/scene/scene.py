@@ -1,4 +1,4 @@
-"""A trained model and all that rendering it needs.
+"""A trained model, and everything that rendering it needs.
 
 Symbols: N Gaussians, T frames. Gaussians are in optimiser units (mm * units_per_mm), poses in mm.
 """
@@ -25,15 +25,15 @@ from intrasplat.splat.deformation import Deformation
 from intrasplat.splat.gaussians import Gaussians
 
 POSE_DOUBTS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE, NoticeCode.POSE_JITTER})
-"""Warnings of a clip that every view of its scene repeats: a view is as right as the poses it was made with."""
+"""Warnings of a clip that every view of its scene repeats: a view is only as right as the poses of its training."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
-    """All that rendering needs.
+    """A trained model, and everything that rendering it needs.
 
     gaussians, deformation  the model, optimiser units
-    intrinsics              of the clip's left eye
+    intrinsics              camera of the clip's left eye
     world_from_camera       [T, 4, 4] float64, mm: the endoscope's own poses
     frame_times_s           [T] seconds from frame 0
     units_per_mm            optimiser units = mm * units_per_mm
@@ -41,9 +41,9 @@ class TrainedScene:
     trained_t               model times of the training frames
     seen                    [N] float32 in [0, 1]: how likely each Gaussian is right (intrasplat/quality/trust.py); 0:
                             no training frame saw it
-    right_eye_mm            where the right eye is, in the left one's camera axes, if both taught; the eyes decide what
-                            a view shows of the Gaussians' gloss; None: there is none
-    stored                  the compact tensors that are written to disk instead of the model's own, and from which
+    right_eye_mm            position of the right eye in the left one's camera axes, if both trained the model; the eyes
+                            decide how much of the Gaussians' gloss a view shows; None: the model has no gloss
+    stored                  compact tensors, which are written to disk instead of the model's own, and from which
                             gaussians, deformation and seen were unpacked; None: the scene is exact
     """
 
@@ -73,15 +73,15 @@ class TrainedScene:
 
     @cached_property
     def pose_warnings(self) -> tuple[Notice, ...]:
-        """Why the endoscope's poses are in doubt: the clip's warnings of POSE_DOUBTS. Empty: nothing is known of it."""
+        """The clip's warnings in POSE_DOUBTS: why the endoscope's poses may be wrong."""
         return tuple(Notice.model_validate(each) for each in self.settings.get("pose_warnings", ()))
 
     def without_motion(self) -> TrainedScene:
-        """The scene without the weights of its motion, for whoever has them elsewhere."""
+        """The scene without the weights of its motion, for a caller that has them elsewhere."""
         return replace(self, deformation=self.deformation.select(torch.zeros(0, dtype=torch.int64)))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every tensor of the model by its name in an exact file, on the CPU."""
+        """All tensors of the model by their names in an exact file, on the CPU."""
         named = {f"gaussians.{name}": each for name, each in self.gaussians.tensors().items()}
         moving = self.deformation.parameters() | self.deformation.constants()
         named |= {f"deformation.{name}": each for name, each in moving.items()}
@@ -91,7 +91,7 @@ class TrainedScene:
         return {name: each.detach().cpu().contiguous() for name, each in named.items()}
 
     def file_tensors(self) -> dict[str, Tensor]:
-        """Every tensor of scene.safetensors by its name."""
+        """All tensors of scene.safetensors by name."""
         return self.tensors() if self.stored is None else dict(self.stored)
 
     @property
@@ -101,13 +101,13 @@ class TrainedScene:
 
     @cached_property  # the report needs its length before it is written
     def file_content(self) -> bytes:
-        """The bytes of scene.safetensors, made at the first call."""
+        """The bytes of scene.safetensors, encoded at the first call."""
         content: bytes = save(self.file_tensors())
         return content
 
     @property
     def file_bytes(self) -> int:
-        """Bytes of scene.safetensors."""
+        """Length of scene.safetensors in bytes."""
         return len(self.file_content)
 
 
@@ -123,7 +123,7 @@ def check(scene: TrainedScene) -> None:
 
 
 def check_finite(tensors: dict[str, Tensor]) -> None:
-    """Raise SceneError where a tensor holds NaN or infinity."""
+    """Raise SceneError where a tensor contains NaN or infinity."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not is_finite(tensor):
             broken = int((~torch.isfinite(tensor)).sum())
@@ -131,7 +131,7 @@ def check_finite(tensors: dict[str, Tensor]) -> None:
 
 
 def is_finite(tensor: Tensor) -> bool:
-    """Whether no number is NaN or infinite; takes no memory, as the question for each number would."""
+    """Whether no number is NaN or infinite. It allocates no mask of the tensor's size, as torch.isfinite would."""
     if tensor.dim() > 1 and not tensor.is_contiguous():  # aminmax would copy it
         return all(is_finite(row) for row in tensor)
     return tensor.numel() == 0 or all(math.isfinite(float(each)) for each in tensor.aminmax())

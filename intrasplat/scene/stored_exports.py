@@ -1,4 +1,4 @@
-"""Exports of a scene's stored files: no scene is read, and no worker is needed."""
+"""Export a scene's stored files, without loading the scene and without a worker."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ DASHBOARD_VARIABLE = "INTRASPLAT_DASHBOARD_DIR"
 
 
 def stored_parts(name: str, folder: Path, scene_id: str | None, dashboard_dir: Path | None) -> Iterator[bytes]:
-    """The file of a format of EXPORT_FORMATS whose is_stored is set, piece by piece.
+    """The file in a format of EXPORT_FORMATS that has is_stored set, piece by piece.
 
     Args:
-        scene_id: None: of a folder that is no service's.
+        scene_id: None: the folder belongs to no service.
         dashboard_dir: the page's files; None: they are not known.
 
     Raises, before the first piece:

@@ -1,4 +1,5 @@
-"""A scene, a time, a pose and a camera in; colour, depth, confidence and the unseen pixels out.
+"""Render a scene.
 
-Verbs: view.render_frame, unseen.hatched, encode.encode_layer, measured.measured.
+In: a scene, a time, a pose and a camera. Out: colour, depth, confidence and the unseen pixels.
+Verbs: render.render_frame, unseen.hatched, encode.encode_layer, measured.measured.
 """

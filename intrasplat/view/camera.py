@@ -1,8 +1,8 @@
-"""The rasteriser's camera of a view of a scene, and what that view shows of the gloss.
+"""The rasteriser's camera for a view of a scene, and how much of the gloss that view shows.
 
-Wet tissue mirrors the lamp elsewhere for each eye. A Gaussian's gloss is how much brighter the right eye saw it than
-the left one; between the eyes a view takes its share of it. Where the lamp's image lies for anybody else is not known:
-with the distance from both eyes the view turns to the mean of the two, which is the best guess.
+Wet tissue reflects the lamp at another place for each eye. A Gaussian's gloss is how much brighter the right eye saw
+it than the left one. A view between the eyes interpolates it. Where other cameras would see the reflection is unknown:
+with the distance from both eyes, the view fades to the mean of the two, which is the best guess.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from intrasplat.splat.step import camera_vector
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units
 
 MAX_SIDE = 1 << 20
-"""Pixels as fine as the recording's along a side; a lens of 180 degrees needs fewer."""
+"""Limit of a picture's side in pixels as fine as the recording's; a lens of 180 degrees needs fewer."""
 FADING = 1.0
 """Distance from the line between the eyes, in baselines, at which the gloss has faded to exp(-1/2)."""
 
 
 def endoscope_pose(scene: TrainedScene, t: float) -> NDArray[np.float64]:
-    """world_from_camera [4, 4] (mm) of the endoscope's left eye at model time t, between frames interpolated."""
+    """world_from_camera [4, 4] (mm) of the endoscope's left eye at model time t, interpolated between frames."""
     poses, count = scene.world_from_camera, scene.frame_count
     place = min(max(t * count, 0.0), count - 1.0)
     before = min(int(place), max(count - 2, 0))
@@ -44,7 +44,7 @@ def endoscope_pose(scene: TrainedScene, t: float) -> NDArray[np.float64]:
 
 
 def right_eye(scene: TrainedScene, t: float, told: RightEye) -> tuple[NDArray[np.float64], Intrinsics]:
-    """world_from_camera [4, 4] (mm) and lens of the endoscope's right eye at model time t, as a report tells of it."""
+    """world_from_camera [4, 4] (mm) and lens of the right eye at model time t. told: what the scene's report says."""
     lens = dataclasses.replace(scene.intrinsics, fx=told.fx_px, fy=told.fy_px, cx=told.cx_px, cy=told.cy_px)
     return endoscope_pose(scene, t) @ np.array(told.left_from_right).reshape(4, 4), lens
 
@@ -66,19 +66,19 @@ def view_camera(
 def _as_enlarged(
     camera: Camera, scene: TrainedScene, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
 ) -> Camera:
-    """The camera, told by how much it enlarges the recording (docs/rasterizer.md, "Pixels of the recording")."""
+    """The camera with its enlargement of the recording set (docs/rasterizer.md, "Pixels of the recording")."""
     own, recorder = scene.intrinsics, nearest_recorder(scene, t, world_from_camera[:3, 3])
     enlarged = intrinsics.fx / own.fx, intrinsics.fy / own.fy
     if np.array_equal(recorder[:3, 2:], world_from_camera[:3, 2:]) and max(enlarged) <= 1:
-        return camera  # to the last bit what training saw
+        return camera  # bit-identical to the camera of training
     x, y, z = recorder[:3, 2].tolist()
     origin = -float(recorder[:3, 2] @ recorder[:3, 3]) * scene.units_per_mm
     return dataclasses.replace(camera, enlarged=enlarged, recorded_depth=(x, y, z, origin))
 
 
 def nearest_recorder(scene: TrainedScene, t: float, centre_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """world_from_camera [4, 4] (mm) of the endoscope, at model time t or at a trained frame, where it was nearest to a
-    place [3]."""
+    """world_from_camera [4, 4] (mm) of the endoscope where it was nearest to a point [3]: at model time t or at a
+    trained frame."""
     own, trained = endoscope_pose(scene, t), scene.world_from_camera[scene.trained_frames]
     apart_mm = np.linalg.norm(trained[:, :3, 3] - centre_mm, axis=1)
     nearest = int(apart_mm.argmin())
@@ -86,9 +86,9 @@ def nearest_recorder(scene: TrainedScene, t: float, centre_mm: NDArray[np.float6
 
 
 def as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
-    """The same view in pixels as fine as the recording's, whose lens is `own`: in these, confidence is calibrated.
+    """The same view in pixels as fine as the recording's, whose lens is `own`: confidence is calibrated for these.
 
-    A field of view that is wider than any lens shows has at most MAX_SIDE of them along a side.
+    A side has at most MAX_SIDE pixels, however wide the field of view.
     """
     sides = camera.width * own.fx / camera.fx, camera.height * own.fy / camera.fy
     width, height = (max(round(min(side, MAX_SIDE)), 1) for side in sides)
@@ -100,7 +100,7 @@ def as_recorded(camera: Intrinsics, own: Intrinsics) -> Intrinsics:
 def gloss_seen(
     scene: TrainedScene, t: float, centre_mm: NDArray[np.float64], *, highlights: bool = True
 ) -> tuple[float, float]:
-    """side and dim (intrasplat/splat/camera.py) of a camera whose centre [3] is in the world, mm."""
+    """side and dim (intrasplat/splat/camera.py) of a camera with this centre [3] in the world, mm."""
     if scene.right_eye_mm is None:
         return 0.0, 0.0
     if not highlights:
@@ -116,7 +116,7 @@ def gloss_seen(
 
 
 def pose_of(scene: TrainedScene, pose: MatrixPose | OrbitPose | None) -> NDArray[np.float64] | None:
-    """world_from_camera [4, 4], mm; None stays None, the endoscope's own pose."""
+    """world_from_camera [4, 4] of a pose, mm; None stays None and means the endoscope's own pose."""
     if pose is None:
         return None
     return np.array(world_from_camera(pose, MEDIAN_DEPTH_UNITS / scene.units_per_mm), dtype=np.float64)
@@ -126,7 +126,7 @@ def camera_of(clip: Intrinsics, wanted: IntrinsicsOverride, max_pixels: int) -> 
     """The clip's camera with the caller's overrides.
 
     Raises:
-        LimitError: it has more than max_pixels.
+        LimitError: the camera has more than max_pixels pixels.
     """
     width, height = wanted.size(clip.width, clip.height)
     if width * height > max_pixels:

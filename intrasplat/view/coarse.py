@@ -1,6 +1,6 @@
-"""Levels of detail for pictures that somebody waits for while there is no time: fewer pixels, and fewer Gaussians.
+"""Levels of detail for renders that must be fast: fewer pixels, and fewer Gaussians.
 
-Each Gaussian takes its time at any resolution, so fewer pixels alone are hardly faster.
+The time per Gaussian hardly depends on the resolution, so fewer pixels alone are hardly faster.
 """
 
 from __future__ import annotations
@@ -14,30 +14,29 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.gaussians import Gaussians
 
 GROWTH = 0.8
-"""The standard deviations grow by this x sqrt(n) where one of n Gaussians is left. By sqrt(n) they would cover as much
-as all did; less is sharper, by 1.0 dB."""
+"""The standard deviations grow by GROWTH x sqrt(n) where one of n Gaussians is drawn. With sqrt(n) they would cover as
+much as all Gaussians; less is sharper, by 1.0 dB."""
 
 
 @dataclass(frozen=True)
 class Detail:
-    """What is drawn: one of `pixels` in a row and in a column, and one of `gaussians`."""
+    """A level of detail: draw one of `pixels` pixels along each side, and one of `gaussians` Gaussians."""
 
     pixels: int
     gaussians: int
 
 
 LEVELS = (Detail(1, 1), Detail(2, 2), Detail(4, 6))
-"""From all to the coarsest."""
+"""From full detail to the coarsest level."""
 
 _thinned: WeakKeyDictionary[TrainedScene, dict[int, TrainedScene]] = WeakKeyDictionary()
 
 
 def thinned(scene: TrainedScene, one_of: int) -> TrainedScene:
-    """The scene with one of so many Gaussians, each larger; it is made once, and kept as long as the scene is.
+    """The scene with one of `one_of` Gaussians, each larger. The result is cached as long as the scene exists.
 
-    Neighbours in space are close in the order of the Gaussians, of pixels in training and of a space-filling curve in a
-    finished scene, so those that are left cover all evenly. The
-    tensors are views of the scene's.
+    The order of the Gaussians (of pixels in training, of a space-filling curve in a finished scene) puts neighbours in
+    space close together, so the remaining ones cover the scene evenly. The tensors are views of the scene's.
     """
     if one_of == 1:
         return scene

@@ -1,12 +1,12 @@
-"""How likely each pixel of a view is right: the confidence layer.
+"""The confidence layer: the probability that each pixel of a view is right.
 
 Symbols: H W pixels. A pixel is right if its depth errs by less than 2 % and its colour, in the mean of R G B, by
-less than 0.03 of white. Its likelihood is a logistic function of three numbers (their ranks: docs/decisions/views.md):
+less than 0.03 of white. Its probability is a logistic function of three numbers (their ranks: docs/decisions/views.md):
 
-trust         the Gaussians' own (intrasplat/quality/trust.py), blended: what training frames say of them
-disagreement  mean |difference| of R G B between the pixel and the endoscope's view, at the same time, of the place that
-              the pixel shows. Where the endoscope sees that place, both show the same tissue.
-texture       deviation of brightness around the pixel: where it is rough, a small shift is a large error
+trust         the Gaussians' trust (intrasplat/quality/trust.py), blended: how well training frames support them
+disagreement  mean |difference| of R G B between the pixel and the endoscope's view of the same point at the same time.
+              Where the endoscope sees that point, both show the same tissue.
+texture       standard deviation of brightness around the pixel: where it is large, a small shift is a large error
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from intrasplat.camera import Intrinsics
 Image = NDArray[np.float32]
 
 LEAST_TRUST, LEAST_DISAGREEMENT, LEAST_TEXTURE = 0.01, 0.005, 0.005
-"""Below these, differences say nothing."""
+"""Lower limits of the three numbers; differences below them carry no information."""
 WEIGHTS = np.array([1.0, -1.37, -0.48])
-"""Of the trust's log odds, and of the logarithms of disagreement and texture, found by `python -m
-lab.benchmarks.bm_confidence --fit`."""
+"""Weights of the trust's log odds, and of the logarithms of disagreement and texture. `python -m
+lab.benchmarks.bm_confidence --fit` finds them."""
 BIAS = -8.7
 TEXTURE_SIDE_PX = 7
 
 
 def confidence(found: NDArray[np.float32]) -> Image:
-    """[H, W] in (0, 1) of the evidence [3, H, W]."""
+    """[H, W] confidence in (0, 1) from the evidence [3, H, W]."""
     odds = np.tensordot(WEIGHTS.astype(np.float32), found, axes=1) + np.float32(BIAS)
     return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
 
@@ -39,7 +39,7 @@ def evidence(trust: Image, rgb: Image, known_rgb: Image) -> NDArray[np.float32]:
 
     Args:
         rgb: [3, H, W] the view.
-        known_rgb: [3, H, W] what the endoscope's view shows of the same places (seen_from_endoscope).
+        known_rgb: [3, H, W] the endoscope's view of the same points (seen_from_endoscope).
     """
     likely = np.clip(trust, LEAST_TRUST, 1 - LEAST_TRUST)
     disagreement = np.abs(rgb - known_rgb).mean(0)
@@ -58,12 +58,12 @@ def seen_from_endoscope(
     camera: tuple[Intrinsics, NDArray[np.float64]],
     endoscope: tuple[Intrinsics, NDArray[np.float64]],
 ) -> Image:
-    """[3, H, W]: what the endoscope's view [3, h, w] shows where it sees the places that the pixels of a view show.
+    """[3, H, W]: the endoscope's view [3, h, w], sampled at the points that the pixels of a view show.
 
-    Beyond its edges, the nearest pixel at its edge; whatever stands before a place, if it is hidden.
+    A point outside the endoscope's view gets the nearest pixel at the edge; a hidden point gets what hides it.
 
     Args:
-        depth_mm: [H, W] of the view, above 0.
+        depth_mm: [H, W] depth of the view, above 0.
         camera, endoscope: intrinsics and world_from_camera [4, 4], mm, of the view and of the endoscope.
     """
     (k, pose), (own_k, own_pose) = camera, endoscope

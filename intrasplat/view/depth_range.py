@@ -1,4 +1,4 @@
-"""Between which depths the false colours of a scene lie: the same throughout the clip, so that nothing flickers.
+"""The depth range of a scene's false colours, the same for the whole clip, so that nothing flickers.
 
 Symbols: N Gaussians.
 """
@@ -20,14 +20,14 @@ from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
 from intrasplat.view.out_of_view import seen_by_endoscope
 
 SAMPLED_FRAMES = 8
-"""Trained frames looked at, evenly spread."""
+"""Number of trained frames that are sampled, evenly spread."""
 PERCENTILES = (2.0, 98.0)
-"""Of the Gaussians' depths, so that a few strays do not flatten the picture."""
+"""Percentiles of the Gaussians' depths that bound the range, so that a few outliers do not flatten the picture."""
 
 
 @dataclass(frozen=True)
 class DepthRange:
-    """Depths before the endoscope in whole mm, and the median depth of the clip: the place that orbits turn about."""
+    """Depth range before the endoscope in whole mm, and the clip's median depth, which orbits rotate about."""
 
     near_mm: float
     far_mm: float
@@ -45,8 +45,8 @@ class DepthRange:
         return cls(near_mm, max(math.ceil(far_mm), near_mm + 1), median_mm)
 
     def before(self, world_from_camera: NDArray[np.float64] | None) -> tuple[float, float]:
-        """Nearest and farthest depth in mm before a camera [4, 4] mm: moved by as much as the middle of the tissue
-        lies nearer or farther than before the endoscope. None: the endoscope itself.
+        """Nearest and farthest depth in mm before a camera [4, 4] mm: the endoscope's range, shifted by as much as the
+        middle of the tissue is nearer or farther. None: the endoscope itself.
         """
         if world_from_camera is None:
             return self.near_mm, self.far_mm

@@ -1,4 +1,4 @@
-"""A rendered layer as a file: png and npy are exact, jpeg and webp are for eyes.
+"""Encode a rendered layer as a file: png and npy are exact; jpeg and webp are for viewing only.
 
             png                         npy                   jpeg, webp
 rgb         8 bit                       uint8 [H, W, 3]       8 bit
@@ -7,8 +7,8 @@ confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high
 
 False colours are those of intrasplat/colours.py.
 
-Where unseen pixels are marked, depth and confidence are 0 there, and rgb shows a hatch; png and webp of rgb then have
-an alpha channel: 255 elsewhere, and there UNSEEN_ALPHA, as good as transparent. Whoever ignores alpha sees the hatch.
+If unseen pixels are marked, their depth and confidence are 0, and rgb shows a hatch. Then png and webp of rgb have an
+alpha channel, UNSEEN_ALPHA (practically transparent) there and 255 elsewhere. Programs without alpha show the hatch.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ DEPTH_PNG_PER_MM = 100.0
 DEFAULT_QUALITY = 90
 FOR_EYES = frozenset({ImageFormat.JPEG, ImageFormat.WEBP})
 UNSEEN_ALPHA = {ImageFormat.PNG: 0, ImageFormat.WEBP: 1}
-"""Alpha of an unseen pixel, of 255, in the formats that have alpha. webp's encoder flattens what alpha 0 hides, at any
-quality, and keeps what alpha 1 shows."""
+"""Alpha of an unseen pixel, of 255, in the formats with alpha. webp's encoder discards colours under alpha 0 at any
+quality, and stores those under alpha 1."""
 PNG_COMPRESSION = 1
-"""Fast rather than small: renders travel over the loopback or a hospital's own network."""
+"""Fast rather than small: renders are sent over the loopback or a hospital's own network."""
 
 FALSE_COLOURS = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 1, 3)[:, :, ::-1].copy()
-"""As OpenCV takes them, BGR."""
+"""The false colours [256, 1, 3] in OpenCV's order, BGR."""
 
 
 class Layers(Protocol):
@@ -62,11 +62,11 @@ def encode_layer(
     *,
     depth_range_mm: tuple[float, float] | None = None,
 ) -> bytes:
-    """The file's bytes.
+    """The bytes of a file with one layer of a frame.
 
     Args:
-        quality: 1 to 100, of jpeg and webp.
-        depth_range_mm: what false colours of depth reach from and to; they need it.
+        quality: 1 to 100, for jpeg and webp.
+        depth_range_mm: nearest and farthest depth of the false colours; jpeg and webp of depth need it.
     """
     marked = frame.unseen if unseen is Unseen.MARK else None
     if layer is Layer.RGB:
@@ -87,7 +87,7 @@ def encode_layer(
 def _encode_colour(
     rgb: NDArray[np.uint8], marked: NDArray[np.bool_] | None, image_format: ImageFormat, quality: int
 ) -> bytes:
-    """marked: pixels to hatch, and to make transparent where the format can; None: neither."""
+    """marked: pixels to hatch, and to make transparent if the format has alpha; None: none."""
     if marked is not None:
         rgb = hatched(rgb, marked)
     if image_format is ImageFormat.NPY:
@@ -114,7 +114,7 @@ def _in_false_colours(
 
 
 def _coloured(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """BGR uint8 [H, W, 3] of numbers in [0, 1]; those beyond have the colour of the nearer end."""
+    """BGR uint8 [H, W, 3] of numbers, which are clamped to [0, 1]."""
     steps = np.rint(np.clip(shares, 0, 1) * 255).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(steps, FALSE_COLOURS), np.uint8)
 

@@ -1,6 +1,6 @@
-"""One rendered view: its layers, in more pixels or in fewer.
+"""One rendered view with its layers, and the same view in more or fewer pixels.
 
-H W pixels.
+Symbols: H W pixels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from intrasplat.notices import Notice, NoticeCode
 
 COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
 MOST = 0.5
-"""Of a pixel: more of it decides."""
+"""A smaller picture's pixel is solid or unseen if more than this share of the pixels it covers is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,10 +25,10 @@ class View:
     """One rendered view.
 
     rgb        [H, W, 3] uint8
-    depth_mm   [H, W] float32, camera z, 0 where nothing solid is
-    unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
-    unseen_share   of the view, in [0, 1]
-    warnings   what to distrust about this frame, and what to know of it
+    depth_mm   [H, W] float32, camera z; 0 where nothing is solid
+    unseen     [H, W] bool: no training frame saw what is shown here; the other layers contain the model's guess
+    unseen_share   share of unseen pixels, in [0, 1]
+    warnings   notices about this frame: what to distrust, and what to know
 
     Confidence, unseen_share and warnings do not depend on how many pixels show the view (docs/conventions.md, "Size of
     a picture").
@@ -43,9 +43,8 @@ class View:
 
     @cached_property
     def confidence(self) -> NDArray[np.float32]:
-        """[H, W] float32 in [0, 1]: how likely colour and depth are right (confidence.py); 0 where nothing solid is.
-
-        Computed when it is first asked for: from another pose than the endoscope's it takes a second render.
+        """[H, W] float32 in [0, 1]: the probability that colour and depth are right (confidence.py); 0 where nothing
+        is solid. Computed at the first access; for a pose other than the endoscope's it takes a second render.
         """
         return self._confidence()
 
@@ -64,7 +63,7 @@ class View:
         return View(rgb, depth_mm, unseen, self.unseen_share, warnings, confidence)
 
     def reduced(self, width: int, height: int) -> View:
-        """The frame in fewer pixels: each is the mean of those it covers, as most of them are solid and seen or not."""
+        """The frame in fewer pixels: each is the mean of those it covers; the majority decides on solid and unseen."""
 
         def mean(layer: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.floating]:
             return np.asarray(cv2.resize(layer, (width, height), interpolation=cv2.INTER_AREA))

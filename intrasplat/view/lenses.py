@@ -1,4 +1,4 @@
-"""In how many pixels a frame is drawn and judged, and the endoscope's own view that it is compared with."""
+"""The cameras of a frame: in which pixels it is drawn and judged, and the endoscope's view to compare with."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from intrasplat.picture import MAX_JUDGED_PIXELS
 from intrasplat.view.camera import as_recorded
 
 MAX_JUDGED_SIDE = 8192
-"""If they are so many, at most so many along a side: as many as a caller may ask for."""
+"""Most pixels along a side in which a view is judged: as many as a caller may ask for."""
 AS_FINE = 0.02
-"""A picture whose pixels are by no more larger or smaller than the recording's is judged in its own."""
+"""A picture is judged in its own pixels if their size differs from the recording's by at most this share."""
 
 
 @dataclass(frozen=True)
 class Lenses:
     """The cameras behind one frame.
 
-    asked      the caller's
-    judged     in whose pixels confidence is computed (judged_camera)
-    drawn      whose picture is made: the one of asked and judged that has more pixels
+    asked      the caller's camera
+    judged     camera in whose pixels confidence is computed (judged_camera)
+    drawn      camera that is rendered: asked or judged, whichever has more pixels
     endoscope  the endoscope's lens, in pixels as fine as those of judged: confidence compares with its view
     """
 
@@ -32,7 +32,7 @@ class Lenses:
 
     @classmethod
     def of(cls, asked: Intrinsics, own: Intrinsics, max_pixels: int, *, is_coarse: bool = False) -> Lenses:
-        """Those of a frame of a scene whose lens is `own`; max_pixels and is_coarse as of a View (view.py)."""
+        """The cameras of a frame of a scene whose lens is `own`; max_pixels and is_coarse as in ViewRequest."""
         judged = asked if is_coarse else judged_camera(asked, own, max_pixels)
         drawn = max(asked, judged, key=pixel_count)
         if pixel_count(judged) == pixel_count(drawn):
@@ -41,10 +41,10 @@ class Lenses:
         return cls(asked, judged, drawn, _compared_camera(judged, own, most))
 
     def pixels_drawn(self, *, confidence: bool, from_endoscope: bool) -> list[int]:
-        """Pixels of each picture that is rendered for the frame.
+        """The number of pixels of each picture that is rendered for the frame.
 
-        confidence: it is asked for, too.
-        from_endoscope: the view is from the endoscope's own pose.
+        confidence: whether the confidence layer is asked for, too.
+        from_endoscope: whether the view is from the endoscope's own pose.
         """
         drawn = [self.drawn]
         if confidence and self.judged != self.drawn:
@@ -55,13 +55,13 @@ class Lenses:
 
 
 def pixel_count(camera: Intrinsics) -> int:
-    """Of its picture."""
+    """The number of pixels of a camera's picture."""
     return camera.width * camera.height
 
 
 def judged_camera(asked: Intrinsics, own: Intrinsics, max_pixels: int = MAX_JUDGED_PIXELS) -> Intrinsics:
-    """The view in the pixels in which it is judged: the recording's, as far as they are not too many. A smaller picture
-    is drawn in them, too.
+    """The view in the pixels in which it is judged: the recording's, unless they are too many. A smaller picture is
+    drawn in them, too.
 
     The right eye's lens, and sizes rounded to whole pixels, count as the recording's.
     """
@@ -73,7 +73,7 @@ def judged_camera(asked: Intrinsics, own: Intrinsics, max_pixels: int = MAX_JUDG
 
 
 def _compared_camera(judged: Intrinsics, own: Intrinsics, max_pixels: int) -> Intrinsics:
-    """The endoscope's lens, in pixels as fine as those of a view that is compared with it, and no more than allowed."""
+    """The endoscope's lens in at most max_pixels pixels, as fine as those of the view that is compared with it."""
     across, down = min(judged.fx / own.fx, 1.0), min(judged.fy / own.fy, 1.0)
     as_fine = own
     if across * down < 1 - AS_FINE:
@@ -82,7 +82,7 @@ def _compared_camera(judged: Intrinsics, own: Intrinsics, max_pixels: int) -> In
 
 
 def _at_most(camera: Intrinsics, most: int) -> Intrinsics:
-    """The same view in at most so many pixels."""
+    """The same view in at most `most` pixels."""
     if pixel_count(camera) <= most:
         return camera
     share = math.sqrt(most / pixel_count(camera))

@@ -1,10 +1,10 @@
-"""Places under pixels of a view, in mm, with their standard uncertainty; how far two of them are apart at every frame.
+"""Measure points under pixels of a view in mm, with their standard uncertainty, and the distance of two at every frame.
 
-Symbols: N Gaussians, M of them that make a pixel, T frames, w blending weights of the Gaussians at a pixel.
+Symbols: N Gaussians, M of them that contribute to a pixel, T frames, w blending weights of the Gaussians at a pixel.
 
-A place is the pixel's ray up to the rendered depth. It belongs to the Gaussians that make the pixel: at another time it
-has gone as far as they have, in the mean weighted by w. docs/conventions.md ("Measuring") has what the uncertainties
-mean, lab/benchmarks/bm_measure.py how they were found and how well they hold.
+A place is the point on the pixel's ray at the rendered depth. It moves with the Gaussians that contribute to the pixel:
+by the mean of their motion, weighted by w. docs/conventions.md ("Measuring") defines the uncertainties;
+lab/benchmarks/bm_measure.py finds and checks them.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ from intrasplat.view.render import renderer_of
 from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
 WINDOW_PX = 64
-"""Side of the part of the picture that is drawn about a pixel. Gaussians whose centres lie outside it change its middle
-by less than 0.01 mm."""
+"""Side of the window that is rendered around a pixel. Gaussians whose centres lie outside it change the depth in its
+middle by less than 0.01 mm."""
 LEAST_SHARE = 1e-3
-"""Gaussians of a smaller share in the pixel are left out."""
+"""Gaussians with a smaller share in the pixel are skipped."""
 MIN_CONFIDENCE = 0.5
-"""Where a pixel is rather wrong than right, nothing is measured."""
+"""Nothing is measured at a pixel of less confidence: it is more likely wrong than right."""
 MAX_CONFIDENCE = 0.995
-"""Held at it: nothing is surer."""
+"""Confidence is clamped to this value."""
 DISPARITY_PX = 0.15
-"""With the probability that confidence states, depth errs by less than so much disparity of the eyes and the
-spread of the blended depths together. `python -m lab.benchmarks.bm_measure --fit` finds it."""
+"""With the probability that confidence states, the depth error is below this disparity of the eyes and the spread of
+the blended depths together. `python -m lab.benchmarks.bm_measure --fit` finds it."""
 UNKNOWN_BASELINE_MM = 4.0
-"""Of a clip whose eyes are not known: that of usual stereo endoscopes."""
+"""Baseline of a clip whose eyes are not known: that of usual stereo endoscopes."""
 MOTION_FACTOR = 2.0
-"""Standard uncertainty of a way, in any direction, over the difference of the ways of its Gaussians."""
+"""Standard uncertainty of a displacement, in any direction, over the spread of its Gaussians' displacements."""
 LEAST_KEPT_TRUST = 0.5
-"""A place that has lost more of its trust, because it was out of view for 0.7 s, is not measured at that frame."""
+"""A place is not measured at a frame where less than this share of its trust is left: after 0.7 s out of view."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPlace:
-    """What one pixel shows.
+    """The point that one pixel shows.
 
     point_mm        [3] in the world
-    ray             [3] in the world: by how much point_mm moves where depth_mm grows by 1
-    depth_mm        along the camera's z, as the layer depth has it; 0: nothing solid is there
-    own_depth_mm    before the endoscope
+    ray             [3] in the world: by how much point_mm moves when depth_mm grows by 1
+    depth_mm        along the camera's z, as in the depth layer; 0: nothing solid is there
+    own_depth_mm    depth before the endoscope
     uncertainty_mm  standard uncertainty of depth_mm
-    confidence      as the layer has it
+    confidence      as in the confidence layer
     unseen          whether no training frame saw what is shown
-    gaussians       [M] indices of those that make the pixel
+    gaussians       [M] indices of the Gaussians that contribute to the pixel
     shares          [M] their weights, which add up to 1
     """
 
@@ -84,10 +84,10 @@ def places_at(
     points: Sequence[tuple[float, float]],
     device: Device = CPU,
 ) -> list[MeasuredPlace]:
-    """What the pixels that cover the points (x, y) of a view show at model time t; pose None: the endoscope's.
+    """The places that a view shows at points (x, y), in pixels, at model time t; pose None: the endoscope's.
 
     Raises:
-        InputError: a point lies outside the picture, or the scene does not know how far to trust it.
+        InputError: a point lies outside the picture, or the scene has no trust.
     """
     if not bool(scene.seen.any()):
         problem = "Nothing is known of how far to trust this scene, so nothing can be measured in it."
@@ -98,7 +98,7 @@ def places_at(
             raise InputError(f"points[{number}]", problem, "Give x and y in pixels from the picture's upper left.")
     own_pose = endoscope_pose(scene, t)
     pose = own_pose if world_from_camera is None else world_from_camera
-    sampled = as_recorded(camera, scene.intrinsics)  # so nothing depends on how large the picture is
+    sampled = as_recorded(camera, scene.intrinsics)  # so that nothing depends on the size of the picture
     across, down = sampled.width / camera.width, sampled.height / camera.height
     view = _View(scene, t, pose, sampled, own_pose, device)
     return [view.place(x * across, y * down) for x, y in points]
@@ -114,7 +114,7 @@ class _View:
     device: Device
 
     def place(self, x: float, y: float) -> MeasuredPlace:
-        """What the pixel shows that covers (x, y)."""
+        """The place that the pixel at (x, y) shows."""
         camera, scene = self.camera, self.scene
         window, i, j = _window(camera, x, y)
         image, blended = renderer_of(scene, self.device).layers(self.t, self.pose, window)
@@ -143,7 +143,7 @@ class _View:
         return np.asarray(self.pose[:3, :3] @ [(x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0])
 
     def _gaussians(self, window: Intrinsics, i: int, j: int) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
-        """Indices and shares [M] of the Gaussians that make a pixel, and the standard deviation of their depths, mm."""
+        """Indices and shares [M] of a pixel's Gaussians, and the standard deviation of their depths in mm."""
         renderer = renderer_of(self.scene, self.device)
         weights = renderer.weights(self.t, self.pose, window, i, j).astype(np.float64)
         chosen = np.flatnonzero(weights > LEAST_SHARE * weights.sum())
@@ -154,7 +154,7 @@ class _View:
     def _known_rgb(
         self, rgb: NDArray[np.float32], pixel: tuple[int, int], point_mm: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """[3, h, w] a window, and in its pixel what the endoscope's view shows of the same place."""
+        """[3, h, w] a window whose measured pixel has the colour of the same point in the endoscope's view."""
         known, own = rgb.copy(), self.scene.intrinsics
         if np.array_equal(self.pose, self.own_pose) and self.camera == own:
             return known
@@ -171,11 +171,13 @@ class _View:
 
 
 def uncertainty_mm(scene: TrainedScene, depth_mm: float, spread_mm: float, likely: float) -> float:
-    """Standard uncertainty of a depth of this confidence: of the normal distribution of which so much lies within
+    """Standard uncertainty in mm of a depth: that of the normal distribution of which the share `likely` lies within
     DISPARITY_PX of disparity and the spread of the blended depths together.
 
     Args:
-        depth_mm: before the endoscope.
+        depth_mm: depth before the endoscope.
+        spread_mm: standard deviation of the depths of the pixel's Gaussians.
+        likely: confidence in [0, 1].
     """
     baseline_mm = UNKNOWN_BASELINE_MM if scene.right_eye_mm is None else float(np.linalg.norm(scene.right_eye_mm))
     px_mm = depth_mm**2 / (scene.intrinsics.fx * baseline_mm)
@@ -184,7 +186,7 @@ def uncertainty_mm(scene: TrainedScene, depth_mm: float, spread_mm: float, likel
 
 
 def _window(camera: Intrinsics, x: float, y: float) -> tuple[Intrinsics, int, int]:
-    """The part of a picture about the pixel that covers (x, y), and that pixel's row and column in it."""
+    """The window of a picture around the pixel at (x, y), and that pixel's row and column in it."""
     width, height = min(WINDOW_PX, camera.width), min(WINDOW_PX, camera.height)
     left = min(max(int(x) - width // 2, 0), camera.width - width)
     top = min(max(int(y) - height // 2, 0), camera.height - height)
@@ -193,12 +195,12 @@ def _window(camera: Intrinsics, x: float, y: float) -> tuple[Intrinsics, int, in
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """How far two places are apart.
+    """The distance of two places over time.
 
-    now_mm, now_uncertainty_mm      at the moment at which they were chosen, with the standard uncertainty
-    distances_mm, uncertainties_mm  [T] at every frame, likewise
-    known                           [T] whether both are trusted then
-    paths_mm                        [2, T, 3] where they are in the world
+    now_mm, now_uncertainty_mm      at the time at which they were chosen, with its standard uncertainty
+    distances_mm, uncertainties_mm  [T] the same at every frame
+    known                           [T] whether both places are trusted at that frame
+    paths_mm                        [2, T, 3] positions of both places in the world
     """
 
     now_mm: float
@@ -212,7 +214,7 @@ class Distances:
 def distances(
     scene: TrainedScene, t: float, first: MeasuredPlace, second: MeasuredPlace, device: Device = CPU
 ) -> Distances:
-    """How far two places are apart, chosen at model time t, at that time and at every frame."""
+    """The distance of two places that were chosen at model time t, at that time and at every frame."""
     both = (first, second)
     ways, apart_mm = zip(*(_ways(scene, t, each) for each in both), strict=True)
     paths_mm = np.stack([each.point_mm + way for each, way in zip(both, ways, strict=True)])
@@ -227,10 +229,10 @@ def distances(
 def _apart(
     between_mm: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[F] lengths of vectors [F, 3] of this covariance [F, 3, 3] mm^2, and their standard uncertainties.
+    """[F] lengths of vectors [F, 3] with covariance [F, 3, 3] mm^2, and their standard uncertainties.
 
-    Errors along the vector count as they are, those across it by their square over the length, as far as they are
-    small beside it; no length errs by more than the vector does.
+    An error along the vector changes the length by as much; a small error across it, by its square over the length.
+    The uncertainty of the length never exceeds that of the vector.
     """
     length_mm = np.linalg.norm(between_mm, axis=1)
     safe_mm = np.maximum(length_mm, 1e-6)
@@ -241,8 +243,8 @@ def _apart(
 
 
 def _ways(scene: TrainedScene, t: float, place: MeasuredPlace) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[T, 3] how far a place has gone at every frame, in mm, and [T] by how much the ways of its Gaussians differ: the
-    root of their mean squared distance from that.
+    """[T, 3] displacement of a place at every frame since time t, in mm, and [T] the spread of its Gaussians'
+    displacements: their RMS distance from it.
     """
     rows = torch.from_numpy(place.gaussians)
     gaussians = Gaussians(**{name: each[rows] for name, each in scene.gaussians.tensors().items()})
@@ -259,7 +261,7 @@ def _ways(scene: TrainedScene, t: float, place: MeasuredPlace) -> tuple[NDArray[
 
 
 def _kept_trust(scene: TrainedScene, place: MeasuredPlace, device: Device) -> NDArray[np.float64]:
-    """[T] how much of the trust in a place is left at every frame, of 1 where the endoscope has it in view."""
+    """[T] share of the trust in a place that is left at every frame; 1 where the endoscope has it in view."""
     renderer, seen = renderer_of(scene, device), scene.seen.numpy()[place.gaussians]
     whole = max(float(place.shares @ seen), 1e-9)
     values = (renderer.values(frame / scene.frame_count) for frame in range(scene.frame_count))

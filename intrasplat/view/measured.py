@@ -1,4 +1,4 @@
-"""A measurement as it is told: the points of a view, and the distance of two of them over time."""
+"""A measurement as a caller gets it: the points of a view, and the distance of two of them over time."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from intrasplat.view.render import held_in_clip, renderer_of
 
 OTHER_PLACE = "Choose another place or another moment."
 EXPANDED = 2.0
-"""Told uncertainties over standard ones: about 95 % of the true values lie within what is told."""
+"""Coverage factor: about 95 % of the true values lie within the reported uncertainty, twice the standard one."""
 DIGITS = 4
-"""After the point, of lengths: a tenth of a micrometre."""
+"""Decimals of a length in mm: a tenth of a micrometre."""
 
 
 def measured(
@@ -28,10 +28,10 @@ def measured(
     points: tuple[Point, ...],
     device: Device = CPU,
 ) -> Measurement:
-    """What is seen at the points of a view at model time t (held within the clip); pose None: the endoscope's.
+    """The measurement of the points of a view at model time t (clamped to the clip); pose None: the endoscope's.
 
     Raises:
-        InputError: a point lies outside the picture, or the scene does not know how far to trust it.
+        InputError: a point lies outside the picture, or the scene has no trust.
     """
     shown, outside = held_in_clip(scene, t)
     places = places_at(scene, shown, world_from_camera, camera, points, device)

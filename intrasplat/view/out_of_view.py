@@ -1,7 +1,7 @@
-"""What has left the view: a scene shows its last known state, and trusts that less.
+"""Reduce the trust in tissue that is out of the endoscope's view.
 
-Nobody sees how tissue moves while it is out of view. What the model shows of it is the state in which it was seen last,
-or will be seen next.
+Nobody sees how tissue moves while it is out of view. The model shows the state in which it was seen last, or will be
+seen next.
 
 Symbols: N Gaussians, S sampled frames.
 """
@@ -20,20 +20,20 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.model import Model
 
 SAMPLED_FRAMES = 32
-"""Trained frames looked at, evenly spread, for which Gaussians they have in view."""
+"""Number of trained frames, evenly spread, that are checked for the Gaussians in view."""
 FADES_IN_S = 0.4
-"""After so long out of view, trust has fallen by 1 - 1/e of what it can lose."""
+"""Time constant out of view: by then trust has lost 1 - 1/e of what it can lose."""
 LEFT_TRUST = 0.4
-"""Share of the trust that remains of what left the view long ago."""
+"""Share of the trust that remains after a long time out of view."""
 
 
 @dataclass(frozen=True, eq=False)
 class OutOfView:
     """When each Gaussian was in the endoscope's view.
 
-    seen_s          [S] seconds of the frames looked at, rising
-    before, after   [S + 1, N] seconds of the last of them before each interval, and of the first after it, that has the
-                    Gaussian in view; infinite where none has. Interval s ends at frame s.
+    seen_s          [S] seconds of the sampled frames, rising
+    before, after   [S + 1, N] seconds of the last sampled frame before each interval, and of the first one after it,
+                    with the Gaussian in view; infinite where there is none. Interval s ends at frame s.
     """
 
     seen_s: NDArray[np.float32]
@@ -42,7 +42,7 @@ class OutOfView:
 
     @classmethod
     def of(cls, scene: TrainedScene, model: Model) -> Self | None:
-        """None if the camera never moves."""
+        """Find out when each Gaussian of a scene was in view; None if the camera never moves."""
         if (scene.world_from_camera == scene.world_from_camera[0]).all():
             return None
         frames = spread(scene.trained_frames, SAMPLED_FRAMES)
@@ -55,7 +55,7 @@ class OutOfView:
         return cls(seen_s, before, after)
 
     def faded(self, values: NDArray[np.float32], time_s: float) -> NDArray[np.float32]:
-        """[N] trust at a time, of values [N] that are trust where they are positive."""
+        """[N] values at a time, from values [N] whose positive entries are trust: those are reduced."""
         interval = int(np.searchsorted(self.seen_s, time_s))
         away_s = np.minimum(time_s - self.before[interval], self.after[interval] - time_s)
         away_s -= self._gap_s(interval)
@@ -63,13 +63,13 @@ class OutOfView:
         return np.where(values > 0, values * kept, values).astype(np.float32)
 
     def _gap_s(self, interval: int) -> float:
-        """The length of an interval: what is in view at either end of it was not away for longer."""
+        """The length of an interval: a Gaussian in view at either end was not out of view for longer."""
         first, last = max(interval - 1, 0), min(interval, len(self.seen_s) - 1)
         return float(self.seen_s[last] - self.seen_s[first])
 
 
 def seen_by_endoscope(scene: TrainedScene, model: Model, frame: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """[N] depths of the centres, in mm, before the endoscope at a frame, and whether they lie within its view."""
+    """[N] depths of the Gaussians' centres before the endoscope at a frame, in mm, and whether they are in its view."""
     points_mm = model.deformed_mean(frame / scene.frame_count).T / np.float32(scene.units_per_mm)
     k, (x, y, z) = scene.intrinsics, to_camera(points_mm, scene.world_from_camera[frame]).T
     ahead = np.maximum(z, 1e-6)

@@ -1,6 +1,6 @@
-"""Recorded frames as the model's cameras see them, with their masks: what a user judges model and masks by.
+"""Recorded frames as the model's cameras see them, with their masks, to compare model and masks with.
 
-A scene keeps at most MAX_KEPT moments of them in one file, which intrasplat/scene/recorded_file.py reads.
+A scene stores them of at most MAX_KEPT moments in one file, which intrasplat/scene/recorded_file.py reads.
 Symbols: h w pixels of a picture.
 """
 
@@ -27,18 +27,18 @@ from intrasplat.report import Recorded
 from intrasplat.scene.recorded_file import MASK, PICTURE, name_of, nearest, read_frame
 
 MAX_KEPT = 120
-"""Moments of a clip."""
+"""Most moments of a clip whose frames are stored."""
 MAX_WIDTH = 720
-"""Px of a picture: a wider frame is made smaller by a whole factor, which takes a third of the time of any other."""
+"""Pixels: a wider frame is shrunk by an integer factor, which takes a third of the time of any other factor."""
 MAX_HEIGHT = 4 * MAX_WIDTH
-"""Of a picture that is decoded; it may have come from another site."""
+"""Pixels: limit of a picture that is decoded; it may come from another site."""
 QUALITY = 60
 MARK, MARK_SHARE = (0, 220, 255), 0.45
-"""RGB that no tissue has, and how much of it the masked parts get; their outline gets all of it."""
+"""RGB that no tissue has, and its opacity on the masked parts; their outline is opaque."""
 AFTER_HEADER = 33
-"""Bytes of a PNG before its second chunk."""
+"""Byte offset of a PNG's second chunk."""
 BLACK_IS_CLEAR = b"\x00\x00\x00\x02tRNS\x00\x00\x76\x93\xcd\x38"
-"""A PNG's chunk by which grey level 0 is transparent."""
+"""PNG chunk that makes grey level 0 transparent."""
 EYES: tuple[EyeName, EyeName] = ("left", "right")
 
 Picture = NDArray[np.uint8]
@@ -46,10 +46,10 @@ Mask = NDArray[np.bool_]
 
 
 def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
-    """The zip of a clip's recorded frames, and what the report says of it. The same clip gives the same bytes.
+    """The zip file of a clip's recorded frames, and its entry in the report. The same clip gives the same bytes.
 
-    All frames are kept, or MAX_KEPT that are spread evenly. Where masks were found, frames that nobody looked at have
-    none, and are not kept.
+    It contains all frames, or MAX_KEPT that are spread evenly. If the masks were found in the pictures, it skips frames
+    without a mask: nobody searched them.
     """
     looked_at = clip.used if clip.masks is not None and clip.masks.are_found else range(clip.frame_count)
     frames = spread(looked_at, MAX_KEPT)
@@ -98,10 +98,10 @@ def stored_frame(
     eye: EyeName = "left",
     masks: RecordedMasks = RecordedMasks.MARKED,
 ) -> tuple[int, bytes]:
-    """As live_frame, of those that kept_frames has put into a file.
+    """As live_frame, from the file of kept_frames.
 
     Raises:
-        SceneError: there is no such file, or it is damaged.
+        SceneError: the file is missing or damaged.
         InputError: it has no such eye, or no masks.
     """
     if masks is RecordedMasks.ONLY:
@@ -141,7 +141,7 @@ def _picture(eye: Eye, index: int) -> tuple[Picture, Mask]:
 
 
 def _marked(rgb: Picture, tool: Mask) -> Picture:
-    """The picture with the instruments marked; it writes on the given one."""
+    """Mark the instruments in the given picture, and return it."""
     mark: NDArray[np.float32] = np.array(MARK, np.float32)
     outline = cv2.morphologyEx(tool.view(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     rgb[tool] = (1 - MARK_SHARE) * rgb[tool] + MARK_SHARE * mark
@@ -157,7 +157,7 @@ def _decoded(content: bytes, flags: int) -> Picture:
     """A picture or a mask from a scene's file.
 
     Raises:
-        SceneError: it is none.
+        SceneError: the content is no such picture.
     """
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if picture is None:

@@ -1,6 +1,6 @@
-"""Frames of a stored scene: any time, any pose, any pinhole camera; colour, depth and how far to trust each pixel.
+"""Render a stored scene at any time, from any pose, through any pinhole camera: colour, depth and confidence.
 
-N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so the second frame of a size is fast.
+Symbols: N Gaussians, H W pixels. A scene reuses its kernels' buffers, so the second frame of a size is fast.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ FAR_POSE = 0.35
 """Distance from the nearest trained pose, in median depths, beyond which the frame carries a warning, because it shows
 sides that the clip never saw."""
 LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
-"""A frame warns when more than this share of its pixels show Gaussians that are trusted less, as seen by the clip."""
+"""A frame warns when more than MAX_LOW_SHARE of its pixels show Gaussians of less trust than LOW_TRUST."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
 ROUNDING = 1e-6
-"""Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
+"""Model time by which t may exceed the last frame's without a warning: a caller may have rounded i / T."""
 
 
 class SceneRenderer:
-    """A scene ready to be rendered on a device. Serialises its threads: the kernels share buffers.
+    """A scene ready to be rendered on a device. It serialises its threads, because the kernels share buffers.
 
-    scene: all of it but its motion's weights, which its model has.
+    scene: the scene without its motion's weights, which the model contains.
     """
 
     def __init__(self, scene: TrainedScene, device: Device = CPU) -> None:
@@ -65,14 +65,14 @@ class SceneRenderer:
 
     @cached_property
     def depth_range(self) -> DepthRange:
-        """Of the false colours of depth, the same throughout the clip."""
+        """The range of the false colours of depth, the same for the whole clip."""
         with self._lock:
             return DepthRange.of(self.scene, self._model)
 
     def layers(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
+        """Copies of R G B Z A [5, H, W], with Z unnormalised in units, and of the blended blended_values [H, W]."""
         camera = view_camera(self.scene, t, world_from_camera, intrinsics)
         values = self.values(t)
         with self._lock:
@@ -88,7 +88,7 @@ class SceneRenderer:
         *,
         highlights: bool = True,
     ) -> Iterator[ProjectedPicture]:
-        """R G B Z A, and as sixth plane blended_values if they are known, to be sorted and blended in bands.
+        """The projected picture, to be sorted and blended in bands: planes R G B Z A, and blended_values if known.
 
         Other pictures of the scene may be rendered meanwhile.
         """
@@ -122,7 +122,7 @@ class SceneRenderer:
         """[N] blending weights of the Gaussians at pixel (i, j)."""
         camera = view_camera(self.scene, t, world_from_camera, intrinsics)
         cotangents = np.zeros((5, intrinsics.height, intrinsics.width), np.float32)
-        cotangents[0, i, j] = 1  # the gradient of a pixel's red is how much red of each Gaussian it holds
+        cotangents[0, i, j] = 1  # the gradient of a pixel's red with respect to each Gaussian's red is its weight
         with self._lock:
             gradient = self._model.image_gradient(camera, t, cotangents)
         return np.asarray(gradient[COLOUR_ROW] / np.float32(SH_C0), np.float32)
@@ -138,7 +138,7 @@ _renderers_lock = Lock()
 
 
 def renderer_of(scene: TrainedScene, device: Device = CPU) -> SceneRenderer:
-    """The scene's renderer on a device, made at its first frame there and kept as long as the scene is."""
+    """The scene's renderer on a device, created at its first frame there and cached as long as the scene exists."""
     with _renderers_lock:
         made = _renderers.setdefault(scene, {})
         if device not in made:
@@ -148,15 +148,15 @@ def renderer_of(scene: TrainedScene, device: Device = CPU) -> SceneRenderer:
 
 @dataclass(frozen=True, eq=False)
 class ViewRequest:
-    """What a frame shows, and how it is made.
+    """What a frame shows, and how it is rendered.
 
-    t                  model time, held within the clip
+    t                  model time, clamped to the clip
     world_from_camera  [4, 4] mm; None: the endoscope's own at t
     intrinsics         None: the recording's
-    device             that renders
-    highlights         True: as the endoscope's eyes saw them, and away from both their mean; False: without
+    device             device that renders
+    highlights         True: as the endoscope's eyes saw them, and their mean away from both; False: without highlights
     is_coarse          draw and judge no more pixels than asked for, because time is short
-    max_pixels         a picture of fewer is drawn and judged in no more
+    max_pixels         limit of the pixels in which a smaller picture is drawn and judged
     """
 
     scene: TrainedScene
@@ -170,7 +170,7 @@ class ViewRequest:
 
     @cached_property
     def shown_t(self) -> float:
-        """The model time within the clip."""
+        """The model time, clamped to the clip."""
         return held_in_clip(self.scene, self.t)[0]
 
     @cached_property
@@ -191,7 +191,7 @@ class ViewRequest:
         return Lenses.of(self.intrinsics or own, own, self.max_pixels, is_coarse=self.is_coarse)
 
     def projected(self, pose: NDArray[np.float64], lens: Intrinsics) -> AbstractContextManager[ProjectedPicture]:
-        """The scene at that time, from a pose through a lens, to be blended (SceneRenderer.projected)."""
+        """The scene at that time, projected from a pose through a lens (SceneRenderer.projected)."""
         renderer = renderer_of(self.scene, self.device)
         return renderer.projected(self.shown_t, pose, lens, highlights=self.highlights)
 
@@ -205,17 +205,17 @@ def render_frame(
     *,
     highlights: bool = True,
 ) -> View:
-    """The scene at model time t from a pose through a camera. The arguments are those of a View."""
+    """Render the scene at model time t from a pose through a camera. The arguments are those of ViewRequest."""
     return whole(frame_in_parts(ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights)))
 
 
 def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts[View]:
-    """The frame of a view, in parts of 10 to 30 ms on one core.
+    """Render the frame of a view in parts of 10 to 30 ms on one core.
 
-    with_confidence: compute it now, in parts, and not when somebody asks for it.
+    with_confidence: compute confidence now, in parts, and not at the first access.
     """
     lenses, scene = view.lenses, view.scene
-    renderer_of(scene, view.device)  # the first of a scene takes long
+    renderer_of(scene, view.device)  # takes long for the first frame of a scene
     yield
     picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
     unseen = unseen_pixels(picture.missing)
@@ -240,9 +240,9 @@ class _Picture:
     """A rendered view before it is judged.
 
     rgb       [H, W, 3] uint8
-    depth_mm  [H, W] float32, camera z, 0 where nothing solid is
+    depth_mm  [H, W] float32, camera z; 0 where nothing is solid
     missing   [H, W] bool (missing_pixels)
-    trust     [H, W] float32 in [0, 1]; 0 everywhere if it is not known, as of a snapshot
+    trust     [H, W] float32 in [0, 1]; 0 everywhere if it is not known, as for a snapshot
     colours   [3, H, W] float32, unclipped; None: not needed
     """
 
@@ -254,14 +254,14 @@ class _Picture:
 
     @classmethod
     def empty(cls, height: int, width: int, *, with_colours: bool) -> _Picture:
-        """One to be filled."""
+        """A picture whose rows fill() sets."""
         size = (height, width)
         rgb, depth_mm, missing = np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty(size, np.bool_)
         colours = np.empty((3, *size), np.float32) if with_colours else None
         return cls(rgb, depth_mm, missing, np.zeros(size, np.float32), colours)
 
     def fill(self, rows: slice, band: NDArray[np.float32], units_per_mm: float) -> None:
-        """These rows, from R G B Z A and, if they are known, blended_values as they are blended: [5 or 6, h, W]."""
+        """Set these rows from the blended planes R G B Z A and, if known, blended_values: [5 or 6, h, W]."""
         alpha, blended = band[4], band[5] if len(band) > 5 else None
         solid = alpha >= COVERED_ALPHA
         self.missing[rows] = missing_pixels(solid, blended)
@@ -289,7 +289,7 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Par
 def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float32]]:
     """[H, W] the confidence of a view's picture; 0 where nothing solid is drawn or trust is 0.
 
-    A picture of more pixels than it is judged in is rendered again in those, and its confidence enlarged.
+    If the picture has more pixels than it is judged in, it is rendered again in those, and its confidence is enlarged.
     """
     lenses, judged = view.lenses, picture
     if picture.colours is None:
@@ -311,7 +311,7 @@ def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float3
 
 
 def _endoscope_rgb(view: ViewRequest) -> Parts[NDArray[np.float32]]:
-    """[3, h, w] of the endoscope's own view at the view's time."""
+    """[3, h, w] colours of the endoscope's own view at the view's time."""
     lens = view.lenses.endoscope
     colours = np.empty((3, lens.height, lens.width), np.float32)
     with view.projected(view.endoscope_pose, lens) as projected:
@@ -325,7 +325,7 @@ def _endoscope_rgb(view: ViewRequest) -> Parts[NDArray[np.float32]]:
 
 
 def held_in_clip(scene: TrainedScene, t: float) -> tuple[float, tuple[Notice, ...]]:
-    """The model time that is shown for t, and the warning that says so if it is another."""
+    """t clamped to the clip, and a warning if that changes it."""
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)
     if 0.0 <= t <= last + ROUNDING:
@@ -346,7 +346,7 @@ def _warnings_of_pose(view: ViewRequest, trust: NDArray[np.float32], unseen: NDA
 
 
 def _share(pixels: NDArray[np.bool_]) -> float:
-    """Of the pixels that are true. mean() would take ten times as long."""
+    """The share of pixels that are true. mean() would take ten times as long."""
     return float(np.count_nonzero(pixels) / pixels.size)
 
 

@@ -1,4 +1,4 @@
-"""Pixels of a render that show what no training frame saw, and the hatch that marks them.
+"""Find the pixels of a render that show what no training frame saw, and mark them with a hatch.
 
 Symbols: N Gaussians, H W pixels, w blending weights. docs/conventions.md ("Unseen") has the definition.
 """
@@ -12,38 +12,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 NEVER_SEEN = -0.1
-"""What a Gaussian that no training frame saw counts in the blend: it outweighs as much that is trusted by a tenth. So
-one blended plane decides what is unseen and, above 0, holds the trust."""
+"""Value of an unseen Gaussian in the blend: it cancels an equal weight of trust 0.1. So one blended plane decides what
+is unseen and, where it is positive, contains the trust."""
 SMOOTHED_SHARE = 1 / 128
-"""Side of the square of pixels whose majority decides, as a share of the image's width: 5 pixels of 640."""
+"""Side of the square of pixels that vote, as a share of the image's width: 5 pixels of 640."""
 STRIPE_SHARE = 1 / 96
 """Width of a stripe of the hatch along a row, as a share of the image's width: 3 mm where the picture is 30 cm wide."""
 DARK_GREY, LIGHT_GREY = 40, 74
-"""Of 255; a luminance of 2 and 7 %. Stripes 3 m away are told apart, and nothing in a body is neutral and striped."""
+"""Greys of the stripes, of 255 (luminance 2 and 7 %): distinct from 3 m away; nothing in a body is grey and striped."""
 HATCHES_KEPT = 8
 
 
 def blended_values(seen: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """[N] numbers to blend for a scene's `seen` [N]; None where none was measured, as of a snapshot of training."""
+    """[N] values to blend for a scene's `seen` [N]; None if `seen` was not measured, as in a snapshot of training."""
     if not seen.any():
         return None
     return np.where(seen > 0, seen, np.float32(NEVER_SEEN))
 
 
 def missing_pixels(solid: NDArray[np.bool_], blended: NDArray[np.float32] | None) -> NDArray[np.bool_]:
-    """[H, W] whether each pixel by itself shows nothing solid, or mostly what no training frame saw.
+    """[H, W] whether each pixel, without its neighbours, shows nothing solid or mostly what no training frame saw.
 
     Args:
-        solid: [H, W] whether something solid is drawn.
+        solid: [H, W] whether the pixel shows something solid.
         blended: [H, W] sum of w * blended_values; None: not known.
     """
     return ~solid if blended is None else ~(solid & (blended >= 0))
 
 
 def unseen_pixels(missing: NDArray[np.bool_], picture_width: int | None = None) -> NDArray[np.bool_]:
-    """[H, W] whether most pixels around are missing [H, W].
+    """[H, W] whether most pixels around each pixel are missing [H, W].
 
-    picture_width: of the picture that these pixels are a part of; None: they are all of it.
+    picture_width: width of the whole picture, if these pixels are a part of it; None: they are the whole picture.
     """
     if not missing.any():
         return missing
