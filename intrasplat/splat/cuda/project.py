@@ -1,4 +1,4 @@
-"""Gaussians to the image and back, on the device: the per-Gaussian half of the rasteriser.
+"""The projection of Gaussians onto the image, on the device; project_backward.py has its gradients.
 
 N Gaussians, F frames; rows of N floats: state [F, 10 or more, N] (intrasplat/splat/layout.py) deformed to each
 frame's time, opacity_logit [N], colour [F, 3, N]. A splat is a Gaussian on the image, RECORD floats:
@@ -53,7 +53,7 @@ _LOW_WORD = tl.constexpr(0xFFFFFFFF)
 
 @triton.jit
 def _store_pair(at, first, second, there):  # type: ignore[no-untyped-def]
-    """Two neighbouring float32 as one int64: half as many stores, each of which meets another 32 bytes per lane."""
+    """Store two neighbouring float32 as one int64: half as many stores, and each lane writes other 32 bytes."""
     low = first.to(tl.int32, bitcast=True).to(tl.int64) & _LOW_WORD
     tl.store(at, (second.to(tl.int32, bitcast=True).to(tl.int64) << 32) | low, mask=there)
 
@@ -97,7 +97,7 @@ def project(  # type: ignore[no-untyped-def]
 
     extent2 = (log2_opacity - _LOG2_MIN_ALPHA) * (2.0 * _LN2) + _EXTENT_SLACK
     drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _MAX_DETERMINANT)
-    # What is not drawn has numbers all the same, so that a NaN does not become a tile.
+    # A splat that is not drawn gets finite numbers too, so that no tile number comes from a NaN.
     cxx, cxy, cyy = tl.where(drawn, cxx, 1.0), tl.where(drawn, cxy, 0.0), tl.where(drawn, cyy, 1.0)
     x, y, det = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0), tl.where(drawn, det, 1.0)
     inverse_det = 1.0 / det
