@@ -94,8 +94,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
 def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, kept_dir: Path | None = None) -> Made:
     """Like reconstruct, without the scores: the scene in out_dir is complete and can be viewed.
 
-    kept_dir: folder for the state that the same request resumes from. If given, the caller removes its files after the
-    run; None stores the state in out_dir and removes it here.
+    kept_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
     """
     length, tell = length_of(request.options, request.preset), hooks.on_progress
     forecast = TimeEstimate(*length, most_frames(request.options))

@@ -244,8 +244,7 @@ def reconstruct(
         clip: the result of `read_clip`, or of `Clip.with_depth` or `follow` in memory.
         method: instant, fast, quality and small are ours; paper is Deform3DGS as published (docs/method.md).
         budget_s: about how many seconds to train, often less; None: the method's own.
-        iterations: the exact number of steps, instead of budget_s; then the same seed on the same machine gives a
-            bit-identical scene.
+        iterations: the exact number of steps instead; then the same seed on the same machine gives identical bits.
         seed: seed of all random numbers.
         holdout: frames to measure quality on, never to train on: every8, blocks8, none, or numbers such as "1,9,17".
         device: auto, cpu or cuda.

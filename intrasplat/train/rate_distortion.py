@@ -56,8 +56,7 @@ class QuantizedScene:
 
     scene        the model after rounding, its numbers in scene.stored
     step         mean change of the picture by one step of a number; 1 is from black to white
-    loss_db      psnr_tissue lost on training frames
-    frames       how many training frames loss_db is measured on
+    loss_db      psnr_tissue lost on so many training `frames`
     float_bytes  size of the model before
     """
 

@@ -47,7 +47,7 @@ class Setup:
     def sides(self) -> tuple[float, float]:
         """Camera.side of the left and the right eye, for the gloss; 0 where gloss is not modelled.
 
-        Gloss needs two eyes to be measured. With spherical harmonics it is not modelled, because they replace it.
+        Gloss needs two eyes to be measured; with spherical harmonics it is not modelled.
         """
         return (-0.5, 0.5) if len(self.teaching_eyes) > 1 and self.preset.sh_degree == 0 else (0.0, 0.0)
 

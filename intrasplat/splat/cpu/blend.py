@@ -60,7 +60,7 @@ STATISTICS = 4
 
 _CUT = np.float32(MIN_ALPHA)
 _CAP = np.float32(MAX_ALPHA)
-_DEEP = np.float32(-60.0)  # below this power2 products may underflow float32, so each row becomes a record
+_DEEP = np.float32(-60.0)  # below this power2 products may leave float32's range, so each row becomes a record
 _STOP = np.float32(MIN_TRANSMITTANCE)
 _MIN_COVERAGE = np.float32(MIN_COVERAGE)
 _ZERO = np.float32(0.0)

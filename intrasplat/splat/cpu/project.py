@@ -10,7 +10,7 @@ opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPLAT floa
     10    2**(2 k_yy): the factor, per row, of the ratio of alpha between neighbouring rows (BEND of blend.py)
     11    a value of the caller's that is blended as colour is, at first 0
 Arithmetic is float64 on LANES Gaussians at once, storage float32. Exponentials have float32's precision and are limited
-to 2**MAX_LOG2_EXP, so that every finite log-scale and logit gives finite numbers.
+to 2**MAX_LOG2_EXP, so that results stay finite for any log-scale and logit.
 """
 
 from __future__ import annotations

@@ -93,8 +93,7 @@ class Rasterizer:
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """Project onto this camera, and list the splats of each tile. camera: camera_vector; state [>= 10, N], colour
-        [3, N]."""
+        """Project and list each tile's splats. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         self.place(camera, state, opacity_logit, colour)
         self.sort()
 

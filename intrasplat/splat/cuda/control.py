@@ -1,8 +1,7 @@
 """What changes from step to step, in one small block of memory on the device: the launches of a step never change.
 
 The host writes a step's numbers into a row of page-locked memory, which is copied to the block in order with the
-launches, without waiting. A row is kept until the host knows that its step was made. A step for which the buffers were
-too small is sent again, unchanged.
+launches, without waiting. A row is kept until its step is known to be made; one that exceeded the capacity is resent.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Device functions of a Gaussian and its camera that project.py and project_backward.py share.
 
 N Gaussians; state: one frame's rows of N floats, as in project.py; camera: its CAMERA numbers. Arithmetic is float64 as
-on the CPU. Exponentials have float32's precision and are limited to 2**20, so that every finite log-scale and logit
-gives finite numbers.
+on the CPU. Exponentials have float32's precision and are limited to 2**20, so results are finite for any log-scale and
+logit.
 """
 
 from __future__ import annotations

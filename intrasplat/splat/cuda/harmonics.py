@@ -217,8 +217,7 @@ def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: in
 def carry_back(
     rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, v_colour: Tensor, v_state: Tensor, degree: int
 ) -> None:
-    """Add the gradients that reach the means through the directions, from dL/dcolour [F, 3, columns], to rows 0:3 of
-    v_state [F, 10, columns]."""
+    """Add dL/dmean through the directions, from dL/dcolour [F, 3, columns], to rows 0:3 of v_state [F, 10, columns]."""
     frames, _, columns = state.shape
     colour_from_sh_backward[_grid(columns, frames)](
         rest, state, centre, colour, v_colour, v_state, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK

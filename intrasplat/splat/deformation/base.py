@@ -82,8 +82,7 @@ class Deformation(ABC):
 
     @abstractmethod
     def select(self, rows: Tensor | slice) -> Self:
-        """The motion of some Gaussians. rows: [M] indices, repeats allowed; [N] bool; or a slice. Tensors that all
-        Gaussians share are the same objects in the result."""
+        """The motion of these Gaussians: [M] indices, repeats allowed, [N] bool or a slice. Shared tensors stay so."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,8 +69,7 @@ class SharedBasis(LinearDeformation):
         Args:
             colour: whether the colour's constant harmonic moves too: 13 channels instead of 10.
             gloss: whether colour and gloss move too: 14 channels.
-            times: model times of the training frames; centres are their evenly spaced quantiles. None: centres are
-                evenly spaced over [0, 1].
+            times: model times of the training frames; centres are their even quantiles. None: evenly over [0, 1].
 
         Raises:
             ValueError: bases < 1.
