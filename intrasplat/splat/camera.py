@@ -101,7 +101,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """What a camera sees.
+    """The image of a camera.
 
     rgb    [H, W, 3]  sum w colour, unclamped
     depth  [H, W]     sum w z in units, not divided by alpha

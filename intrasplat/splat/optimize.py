@@ -23,6 +23,7 @@ class Rate:
         return Rate(factor * self.start, None if self.end is None else factor * self.end)
 
     def at(self, progress: float) -> float:
+        """The rate at progress in [0, 1]."""
         if self.end is None or self.start == 0.0:
             return self.start
         return math.exp(math.log(self.start) + (math.log(self.end) - math.log(self.start)) * min(progress, 1.0))

@@ -223,7 +223,7 @@ def _depth_over_place(model: Model, picture: Picture, across: float, bases: int)
 
     `across` is the mean sensitivity to an error across the axis.
     """
-    size = NOISE_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
+    size = NOISE_STEP * math.sqrt(bases / (12 * across))  # at any time a channel adds the errors of `bases` numbers
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
     depth = model.parameters()["canonical"][2]
     exact_depth = depth.clone()

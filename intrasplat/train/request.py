@@ -14,7 +14,7 @@ from intrasplat.options import ReconstructionOptions
 
 @dataclass(frozen=True)
 class ReconstructionRequest:
-    """What to reconstruct, and how.
+    """A clip to reconstruct, and all options of its reconstruction.
 
     clip           a path, or a clip with depth in memory, which is neither decoded nor matched
     seconds        seconds by stage already spent on such a clip, for the report

@@ -1,4 +1,4 @@
-"""The state of a training run: what is trained, on what, and how far it has come."""
+"""The state of a training run: the model, its targets, and the progress so far."""
 
 from __future__ import annotations
 

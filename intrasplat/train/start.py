@@ -43,6 +43,7 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
 
 
 def stride_for(points: int, intrinsics: Intrinsics) -> int:
+    """The stride in pixels of a grid of about `points` points per image."""
     return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 

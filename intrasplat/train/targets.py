@@ -1,4 +1,4 @@
-"""The training frames as the rasteriser compares with them: padded to whole tiles, in optimiser units.
+"""The training frames as targets of the loss: rows padded to whole vectors, depth in optimiser units.
 
 Symbols: T frames, H W pixels; stride = W rounded up to whole vectors.
 """
@@ -51,7 +51,7 @@ def camera_in_units(
 ) -> Camera:
     """The rasteriser's camera: the pose inverted and its translation in optimiser units.
 
-    side and dim say what it sees of the gloss (intrasplat/splat/camera.py).
+    side and dim are its factors of the gloss (intrasplat/splat/camera.py).
     """
     camera_from_world: NDArray[np.float64] = np.linalg.inv(world_from_camera).astype(np.float64)
     camera_from_world[:3, 3] *= scale

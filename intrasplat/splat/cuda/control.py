@@ -1,4 +1,4 @@
-"""What changes from step to step, in one small block of memory on the device: the launches of a step never change.
+"""All numbers that change from step to step, in one block of memory on the device; the launches of a step never change.
 
 The host writes a step's numbers into a row of page-locked memory, which is copied to the block in order with the
 launches, without waiting. A row is kept until its step is known to be made; one that exceeded the capacity is resent.

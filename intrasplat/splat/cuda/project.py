@@ -64,8 +64,8 @@ def project(  # type: ignore[no-untyped-def]
     N, state_rows, width, height, tiles_x, tiles_y,
     TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Splats of frame program_id(1): records [F N, RECORD] and extent [F N, EXTENT] (bins.py), both float32 as int64,
-    half as many; count [F N] of tiles, 0 for a culled one; depth_key [F N], which sorts by frame, then depth, culled
+    """Write the splats of frame program_id(1). records [F N, RECORD] and extent [F N, EXTENT] (bins.py) are float32 in
+    pairs as int64. count [F N]: tiles of a splat, 0 if culled. depth_key [F N]: sorts by frame, then depth, culled
     ones last.
 
     camera: float64 [F, CAMERA] (intrasplat/splat/layout.py).

@@ -39,7 +39,7 @@ class AtRest:
 
 
 class Deformation(ABC):
-    """A motion: what it adds to the canonical Gaussians at time t.
+    """A motion: the canonical Gaussians as a function of time t.
 
     A subclass is a frozen dataclass whose fields are its tensors, or defines from_tensors.
 
