@@ -50,10 +50,8 @@ def stride_for(points: int, intrinsics: Intrinsics) -> int:
 def settled(
     preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[Notice, ...]]:
-    """The preset with what it leaves to the scene filled in, the stride of the grid of points and the number of bases.
-
-    The notices give the reasons, for the report. tracks: of each keyframe, if there are any.
-    """
+    """The preset with the stride of the points' grid and the number of bases chosen for the scene, where it leaves them
+    open, and notices with the reasons for the report. tracks: of each keyframe, if there are any."""
     notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = BasisTrials({})

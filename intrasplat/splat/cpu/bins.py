@@ -71,10 +71,8 @@ def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
-    """Assign homes to splat g, from number `home` on, for tiles in columns first to last of bands highest to lowest.
-
-    Returns the next free number.
-    """
+    """Number the homes of splat g from `home` on, for tile columns first to last and bands highest to lowest; returns
+    the next free number."""
     first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
     step = last_block - first_block + 1
     homes[g, 1] = step * (lowest - highest + 1)
