@@ -1,4 +1,4 @@
-"""What becomes of a run: the scene of its model, finished or at any moment, and what its report repeats of it."""
+"""The results of a run: the scene of its model, finished or as a snapshot, and the report's facts about training."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from intrasplat.train.rate_distortion import QuantizedScene
 from intrasplat.train.run import Run
 
 VERSIONED = ("intrasplat", "torch", "numba")
-"""What decides a scene's numbers; the report names their versions."""
+"""Packages that determine a scene's numbers; the report lists their versions."""
 
 
 def scene_of(run: Run, on_step: Callable[[], None] = lambda: None) -> TrainedScene:
-    """The scene of a trained run; strays are removed from its model first. on_step is called after that."""
+    """The scene of a trained run. Stray Gaussians are removed from its model first; then on_step is called."""
     drop_strays(run.model, run.eyes)
     on_step()
     return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)))
 
 
 def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
-    """A copy of the model as it is now. What it saw is not measured: seen is 0, and so is the confidence.
+    """A copy of the model as it is now. Its visibility is not measured: seen is 0, and so is the confidence.
 
-    as_it_lies: for renders alone, and faster (intrasplat/splat/model.py, export).
+    as_it_lies: faster, and enough for rendering (Model.export in intrasplat/splat/model.py).
     """
     gaussians, deformation = run.model.export(as_it_lies=as_it_lies)
     clip = run.setup.clip
@@ -61,7 +61,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
 
 
 def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
-    """Where the right eye is in the left one's camera axes; None where the left eye alone taught."""
+    """The right eye's position in the left eye's camera axes, mm; None where only the left eye was trained on."""
     if run.right is None:
         return None
     right = run.right.eye
@@ -70,7 +70,7 @@ def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
 
 
 def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None) -> Training:
-    """What the report repeats of the run: what it was made of, what it chose, how long it took."""
+    """The run's part of the report: settings, choices with their reasons, durations, warnings and versions."""
     return Training(
         preset=run.preset.name,
         eyes=run.taught_by,
@@ -91,7 +91,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
 
 
 def _floats(scene: TrainedScene) -> Notice:
-    """What is said of a scene that is not quantized."""
+    """The notice for a scene that is not quantised."""
     text = f"Numbers are stored as floats, in {scene.file_bytes / 1e6:.2f} MB. All scores are of the stored scene."
     return Notice.info(NoticeCode.STORED_PRECISION, text)
 

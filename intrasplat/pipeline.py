@@ -55,12 +55,12 @@ from intrasplat.view.recorded import EYES, kept_frames
 from intrasplat.view.render import SceneRenderer
 
 FINISHING_STEPS = 7
-"""Of finish(), when three steps of rounding are tried."""
+"""Progress reports of finish() when round_model tries three steps; more trials stay at 100 %."""
 
 
 @dataclass(eq=False)
 class Made:
-    """A scene that is finished, and all that judging it needs. Judging uses the scene up."""
+    """A finished scene, and all that judge() needs; judge() deletes the scene from it."""
 
     clip: DepthClip
     split: FrameSplit
@@ -70,16 +70,16 @@ class Made:
 
 
 def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks) -> Report:
-    """Clip in; manifest.json, scene.safetensors, report.json and curve.csv out. Beside them recorded.zip, unless the
-    options say no, and masks.zip if masks were found.
+    """Reconstruct a clip: write manifest.json, scene.safetensors, report.json and curve.csv into out_dir.
 
-    A run that is stopped or killed leaves in out_dir what the same request on the same folder goes on from.
+    It also writes recorded.zip, unless the options turn that off, and masks.zip if masks were found. If the run is
+    stopped or killed, the same request on the same folder resumes it.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
-        UnavailableError: the device is not there, or something it takes.
-        TrainingDiverged: training left the finite numbers.
-        Cancelled: hooks.should_stop said so. While scoring it leaves the finished scene, without scores.
+        UnavailableError: the device is missing, or something that it needs.
+        TrainingDiverged: training produced NaN or infinity.
+        Cancelled: hooks.should_stop() returned True. If that was during scoring, the scene is complete without scores.
     """
     made = make(request, out_dir, hooks)
     try:
@@ -92,9 +92,9 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
 
 
 def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, kept_dir: Path | None = None) -> Made:
-    """As reconstruct, without the scores: the scene in out_dir is whole and can be viewed.
+    """Like reconstruct, without the scores: the scene in out_dir is complete and can be viewed.
 
-    kept_dir: where to keep what the same request goes on from; whoever names it removes it. None: out_dir.
+    kept_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
     """
     length, tell = length_of(request.options, request.preset), hooks.on_progress
     forecast = TimeEstimate(*length, most_frames(request.options))
@@ -116,11 +116,11 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
 
 
 def judge(made: Made, hooks: Hooks) -> Report:
-    """The report with the scores of the scene as it is kept.
+    """The report with the scores of the scene as it is stored.
 
     Raises:
         TrainingDiverged: a render holds NaN or infinity.
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop() returned True.
     """
     renderer = SceneRenderer(made.scene, made.device)
     del made.scene  # the renderer has the weights, and they take much memory
@@ -128,7 +128,7 @@ def judge(made: Made, hooks: Hooks) -> Report:
 
 
 def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
-    """As judge, of the finished scene in a directory: its clip is opened anew, and seen from the scene's poses.
+    """Like judge, for the finished scene in a directory: opens its clip again, and places it at the scene's poses.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
@@ -144,7 +144,7 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
 
 
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:
-    """The clip with depth, its split, its preset, the device and compiled kernels; then the clock starts."""
+    """Open the clip with depth, split it, choose the device and compile the kernels; then the clock starts."""
     accepted_at_s, timings = request.accepted_at_s or time.time(), Timings()
     timings.seconds |= request.seconds
     keep_free_memory(USUAL_BYTES)
@@ -153,14 +153,14 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     out_dir.mkdir(parents=True, exist_ok=True)
 
     def show(moment: DepthClip) -> None:
-        with suppress(InputError):  # no depth: the stages to come say so, if no frame has any
+        with suppress(InputError):  # no depth in this frame; a later stage raises if no frame has any
             if hooks.on_first_picture is not None:
                 hooks.on_first_picture(first_picture(moment))
             timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
 
     showing = dataclasses.replace(hooks, on_first_moment=show)
     clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
-    if "t_first_view_s" not in timings.seconds:  # it was kept with its depth, or the first moment has none
+    if "t_first_view_s" not in timings.seconds:  # the clip was stored with its depth, or its first moment has none
         frames = training_frames(clip.frame_count, options.holdout)
         moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
         show(clip.moment(moment))
@@ -170,17 +170,16 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     timings.add("compile_s", compile_coder())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
-    by_kernels = motion_named(preset.deformation).has_kernels  # they have threads of their own, so torch needs one
+    by_kernels = motion_named(preset.deformation).has_kernels  # kernels have their own threads, so torch needs one
     torch.set_num_threads(1 if by_kernels else cores())
     idle = device != choose_device(request.device)
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 
 
 def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
-    """The clip of a request with depth (intrasplat/stereo/opening.py) and its camera's poses
-    (intrasplat/poses/posed.py).
+    """The clip of a request with depth (intrasplat/stereo/opening.py) and camera poses (intrasplat/poses/posed.py).
 
-    A GPU's kernels are examined before it matches anything.
+    On a GPU the splatting kernels are checked before stereo matching.
     """
     if isinstance(request.clip, DepthClip):
         clip = request.clip if request.clip.left_out else sampled(request.clip, request.options)
@@ -206,7 +205,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
 
 
 def optimise(run: Run, keeper: Keeper) -> None:
-    """Train run to its last iteration; score held-out frames, keep its state and offer snapshots on the way."""
+    """Train run to its last iteration; meanwhile score held-out frames, store its state and offer snapshots."""
     clock, started_s, timings = run.setup.clock, run.setup.clock.elapsed_s, run.setup.timings
     timings.seconds.setdefault("t_first_view_s", time.time() - run.setup.accepted_at_s)
     scored, shown = partial(held_out_score, run), partial(snapshot_of, run, as_it_lies=True)
@@ -221,10 +220,10 @@ def optimise(run: Run, keeper: Keeper) -> None:
 
 
 def finish(run: Run) -> tuple[TrainedScene, QuantizedScene | None]:
-    """The scene to keep, quantized where that loses next to nothing, and what it loses. It uses the run's model up.
+    """The scene to store, and what quantisation cost, if it is quantised. It deletes the run's model.
 
     Raises:
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop() returned True.
     """
     timings, reached = run.setup.timings, itertools.count()
 
@@ -235,19 +234,19 @@ def finish(run: Run) -> tuple[TrainedScene, QuantizedScene | None]:
 
     report()
     with timings.measure("finish_s"):
-        scene = scene_of(run, report).without_motion()  # the model has the weights, and they take much memory
+        scene = scene_of(run, report).without_motion()  # no second copy of the weights, which take much memory
     with timings.measure("shrink_s"):
         rounded = round_model(run.model, scene, run.eyes, device=run.device, on_step=report)
         keep_free_memory(LITTLE_BYTES)
         if rounded is None:
             return dataclasses.replace(scene, deformation=run.model.export()[1]), None
-        del run.model  # its weights would lie beside the stored ones
+        del run.model  # frees its weights before the stored ones are created
         quantized = rounded.stored(scene)
     return quantized.scene, quantized
 
 
 def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
-    """The zip of recorded frames of the eyes that taught, and what the report says of it; nothing where that is off."""
+    """The zip of recorded frames of the eyes trained on, and the report's entry for it; None, None if turned off."""
     if run.setup.options.keep_recorded == "off":
         return None, None
     with run.setup.timings.measure("recorded_s"):
@@ -263,7 +262,7 @@ def publish(
     beside: Mapping[str, bytes],
     recorded: Recorded | None,
 ) -> Report:
-    """Write the report, the curve, and the scene with the files beside it. The report has no scores yet."""
+    """Write the report, the curve, the scene and the files `beside` it, by name. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
     report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)

@@ -1,4 +1,4 @@
-"""A clip becomes a scene: `reconstruct`; a scene is rendered, saved, exported: `Scene`; and read again: `load`.
+"""`reconstruct` turns a clip into a `Scene`, which renders, saves and exports itself; `load` reads a saved one.
 
 Symbols: T frames, H W pixels.
 """
@@ -47,7 +47,7 @@ MAX_RENDER_PIXELS = 8192 * 8192
 
 
 class Scene:
-    """A reconstructed clip: any moment from any pose. `reconstruct` and `load` make it.
+    """A reconstructed clip, to be rendered at any moment from any pose. `reconstruct` and `load` return it.
 
     Example:
         >>> scene.frame_count
@@ -57,7 +57,7 @@ class Scene:
     """
 
     def __init__(self, folder: Path, device: str = "auto") -> None:
-        """folder holds the scene's files, as `reconstruct` and the command line write them."""
+        """folder: contains the scene's files, as `reconstruct` and the command line write them."""
         self._folder, self._device = folder, device
 
     def __repr__(self) -> str:
@@ -73,7 +73,7 @@ class Scene:
         """The quality report: scores of held-out frames, assumptions and warnings.
 
         Raises:
-            InputError: the scene has none.
+            InputError: the scene has no report.
         """
         path = self._folder / REPORT
         if not path.is_file():
@@ -108,11 +108,11 @@ class Scene:
         """The scene at model time t from a pose, instruments removed.
 
         Args:
-            t: 0 is the first frame, i / T frame i; later times show the last frame, with a warning.
+            t: 0 is the first frame, i / T is frame i; later times show the last frame, with a warning.
             pose: `orbit(...)`, `pose(...)`, [4, 4] world_from_camera in mm, or the API's text; None: the endoscope's.
-            width, height: of the picture in pixels; with one of them the other keeps the aspect. Default: the clip's.
+            width, height: size of the picture in pixels; one alone keeps the aspect ratio. Default: the clip's size.
             intrinsics: another camera, instead of width and height.
-            highlights: whether to show highlights that both eyes of a stereo clip told apart.
+            highlights: whether to show the highlights that were separated by means of the two eyes of a stereo clip.
 
         Returns:
             A View with rgb [H, W, 3] uint8, depth_mm [H, W] float32 (0: nothing solid), confidence [H, W] float32 in
@@ -121,7 +121,7 @@ class Scene:
         Raises:
             InputError: the pose or the size cannot be used.
             LimitError: the picture has too many pixels.
-            UnavailableError: the device is not there.
+            UnavailableError: the device is missing.
 
         Example:
             >>> view = scene.render(t=0.4, pose=isp.orbit(10, 0))
@@ -153,7 +153,7 @@ class Scene:
         """Write the scene's files into a new or empty folder; `load` and the command line read them.
 
         Raises:
-            InputError: the folder holds something.
+            InputError: the folder is not empty.
 
         Example:
             >>> scene.save(tmp / "scene")
@@ -164,7 +164,7 @@ class Scene:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise InputError("folder", f"{target} is there already.", "Name a new folder, or empty it.")
         target.mkdir(parents=True, exist_ok=True)
-        files = sorted(self._folder.iterdir(), key=lambda path: path.name == MANIFEST)  # the manifest makes it whole
+        files = sorted(self._folder.iterdir(), key=lambda path: path.name == MANIFEST)  # the manifest completes it
         for path in files:
             if path.is_file() and path.name not in KEPT:
                 shutil.copyfile(path, target / path.name)
@@ -182,12 +182,12 @@ class Scene:
         """Write the scene as a file for other programs.
 
         Args:
-            path: the file. It is written beside its place first, so that it is whole or not there.
-            format: one of `intrasplat export --help` (docs/export.md); None: the first whose files end like path.
-            t: the moment of formats of one moment, and of view="orbit".
-            every: of formats over time: one of so many frames.
-            view: of a video: endoscope, orbit or stereo.
-            baseline_mm: distance of the eyes of view="stereo".
+            path: the file. It is written under another name first, so that it is complete or missing.
+            format: one of `intrasplat export --help` (docs/export.md); None: the first with the ending of path.
+            t: model time, for formats of one moment and for view="orbit".
+            every: for formats over time: use every n-th frame.
+            view: for a video: endoscope, orbit or stereo.
+            baseline_mm: distance between the eyes, for view="stereo".
 
         Returns:
             The path of the file.
@@ -241,25 +241,25 @@ def reconstruct(
     """Train a scene from a clip.
 
     Args:
-        clip: of `read_clip`, or of `Clip.with_depth` or `follow` in memory.
+        clip: the result of `read_clip`, or of `Clip.with_depth` or `follow` in memory.
         method: instant, fast, quality and small are ours; paper is Deform3DGS as published (docs/method.md).
         budget_s: about how many seconds to train, often less; None: the method's own.
-        iterations: exactly how many steps instead; then the same seed gives the same bits on the same machine.
-        seed: of all random numbers.
+        iterations: the exact number of steps instead; then the same seed on the same machine gives identical bits.
+        seed: seed of all random numbers.
         holdout: frames to measure quality on, never to train on: every8, blocks8, none, or numbers such as "1,9,17".
         device: auto, cpu or cuda.
         out: the folder for the scene's files; the same call on the folder of a stopped run resumes it. None: a
-            temporary folder, until the scene is no longer used or `Scene.save` copies it.
-        on_progress: gets a Progress between steps; `print` will do.
-        should_stop: asked between steps; True ends the run.
+            temporary folder, which is deleted when the scene is no longer used.
+        on_progress: receives a Progress between steps, for instance `print`.
+        should_stop: called between steps; True ends the run.
         options: eyes, use_frames, poses, min_depth_mm, max_depth_mm, keep_recorded, as `intrasplat reconstruct --help`
             explains them.
 
     Raises:
         InputError: the clip or an option cannot be used; it names the argument and the remedy.
-        UnavailableError: the device is not there, or the disk is full.
-        TrainingDiverged: training left the finite numbers.
-        Cancelled: should_stop said so.
+        UnavailableError: the device is missing, or the disk is full.
+        TrainingDiverged: training produced NaN or infinity.
+        Cancelled: should_stop() returned True.
 
     Example:
         >>> clip = isp.read_clip(frames, depth_mm=depth_mm, intrinsics=camera)
@@ -310,8 +310,8 @@ def load(folder: FilePath, *, device: str = "auto") -> Scene:
     """The scene in a folder that `Scene.save`, `reconstruct(out=...)` or the command line wrote.
 
     Raises:
-        InputError: the folder holds no scene.
-        SceneError: a file is damaged, or of another version.
+        InputError: the folder contains no scene.
+        SceneError: a file is damaged, or written by another version.
 
     Example:
         >>> scene.save(tmp / "again")
@@ -322,5 +322,5 @@ def load(folder: FilePath, *, device: str = "auto") -> Scene:
     if not (path / MANIFEST).is_file():
         raise InputError("folder", f"{os.fspath(folder)} holds no scene.", "Name a folder that reconstruct wrote.")
     scene = Scene(path, device)
-    _ = scene.trained  # damage shows here, not at the first view
+    _ = scene.trained  # raises here if a file is damaged, not at the first render
     return scene

@@ -35,12 +35,12 @@ from intrasplat.train.request import ReconstructionRequest
 
 FilePath = str | os.PathLike[str]
 CERTAIN = 255
-"""The confidence of a depth that was given (DepthClip.depth_confidence)."""
+"""The confidence of a depth that the caller gave (DepthClip.depth_confidence)."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoFrames:
-    """Frames of both eyes in memory, and how the eyes stand."""
+    """Frames of both eyes in memory, and the calibration of the eyes."""
 
     clip: StereoClip
     calibration: StereoCalibration
@@ -48,11 +48,11 @@ class StereoFrames:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A recorded clip, not yet decoded, rectified or matched: `read_clip` makes it.
+    """A recorded clip, not yet decoded, rectified or matched; `read_clip` returns it.
 
     source     its files, its frames of both eyes, or its frames with depth
-    options    how its files are laid out
-    segmenter  an ONNX file that finds instruments where there are no masks; None: colour and depth find them
+    options    layout of its files
+    segmenter  an ONNX file that finds instruments where there are no masks; None: they are found by colour and depth
     """
 
     source: ClipPaths | StereoFrames | DepthClip
@@ -70,11 +70,11 @@ class Clip:
         """Decode the clip, rectify and match its eyes, and find its camera's path.
 
         Args:
-            holdout: frames that nothing is measured on: every8, blocks8, none, or numbers such as "1,9"; say the same
-                to `reconstruct`.
+            holdout: held-out frames, which no stage here measures on: every8, blocks8, none, or numbers such as "1,9".
+                Pass the same to `reconstruct`.
             device: auto, cpu or cuda.
-            on_progress: gets a Progress now and then.
-            options: instead of holdout, all options of a reconstruction.
+            on_progress: receives a Progress between parts of the work.
+            options: all options of a reconstruction, instead of holdout.
 
         Returns:
             The frames with rgb [T, H, W, 3] uint8, depth_mm [T, H, W] float32 (0: unknown), tissue [T, H, W] bool and
@@ -82,7 +82,7 @@ class Clip:
 
         Raises:
             InputError: a file, an array or an option cannot be used.
-            UnavailableError: the device is not there, or the disk is full.
+            UnavailableError: the device is missing, or the disk is full.
 
         Example:
             >>> matched = isp.read_clip(frames, depth_mm=depth_mm, intrinsics=camera).with_depth(holdout="none")
@@ -140,17 +140,17 @@ def read_clip(
     Args:
         source: a video, folder or zip of both eyes or, with `right`, of the left one; or [T, H, W, 3] uint8 RGB.
         right: the right eye, likewise.
-        calibration: of both eyes: a file, or the values of our JSON (docs/conventions.md). Needed without depth_mm.
+        calibration: of both eyes, a file or the values of our JSON (docs/conventions.md). Needed for stereo frames.
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
-        depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only with frames in memory of one eye.
+        depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
         poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; None: the camera is fixed. Only with depth_mm.
-        intrinsics: the camera of frames with depth_mm.
+        intrinsics: the camera; required with depth_mm.
         frame_times_s: [T] seconds from the first frame; None: 30 frames a second. Only with frames in memory.
         segmenter: an ONNX file that finds instruments where there are no masks.
-        layout, mask_polarity, mask_source, pose_convention: how files are laid out; "auto" finds out.
+        layout, mask_polarity, mask_source, pose_convention: see docs/input.md; "auto" detects the value.
 
     Raises:
-        InputError: a file is not there, or arrays do not fit each other; it names the argument and the remedy.
+        InputError: a file is missing, or arrays do not fit each other; it names the argument and the remedy.
         LimitError: the arrays are larger than this machine accepts.
 
     Example:
@@ -283,7 +283,7 @@ def _depth_clip(
 
 
 def _poses(given: NDArray[Any] | None, count: int) -> NDArray[np.float64]:
-    """[T, 4, 4] world_from_camera, laid so that the world is the camera of frame 0."""
+    """[T, 4, 4] world_from_camera, transformed so that the world is the camera of frame 0."""
     if given is None:
         return np.tile(np.eye(4), (count, 1, 1))
     poses = np.asarray(given, np.float64)

@@ -1,5 +1,5 @@
-"""The methods: everything that decides how a clip is trained, as data. Each file reads from the first point to the end.
+"""The methods as data: all settings of training, listed in the order in which a clip meets them.
 
-Read in this order: method (what a preset says, and what a departure is), paper (the published method), fast (ours: what
-it does otherwise than paper), registry (a preset by its name). docs/method.md has the same in one page, with figures.
+Read method (what a preset and a departure are), paper (the published method), fast (our method, as departures from
+paper), then registry (presets by name). docs/method.md shows the same on one page, with figures.
 """

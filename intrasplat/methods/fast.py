@@ -1,10 +1,10 @@
 """`fast`, our default: `paper` with the departures below, in the order in which a clip meets them.
 
-What no departure names is as in paper.py. A line "Gain" says what `fast` loses without the departure, on held-out
+All other settings are those of paper.py. A line "Gain" says what `fast` loses without the departure, on held-out
 frames after the same number of iterations, and the processor seconds that it costs (saves, where negative);
 `python -m lab.benchmarks.bm_departures` measures and writes these lines. docs/method.md has the table.
 
-`instant`, `quality` and `small` are `fast` with other numbers; they stand at the end.
+`instant`, `quality` and `small`, at the end, are `fast` with other numbers.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from intrasplat.splat.optimize import Rate
 MIN_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
 """Points per image."""
 MANY_POINTS_FROM_S = 9.0
-"""From this budget on MANY_POINTS score more than FEW_POINTS. This is wall-clock time of the two cores of
-docs/decisions/015; a faster machine could afford them sooner. Nothing measures it at run time, because a run that is
-resumed must start with the same points."""
+"""From this budget on MANY_POINTS score more than FEW_POINTS, on two cores (docs/decisions/training.md). A faster
+machine could afford them sooner, but nothing measures it, because a resumed run must start with the same points."""
 
 DEPARTURES = (
     # Points
@@ -41,8 +40,8 @@ DEPARTURES = (
     #
     # Motion
     #
-    # All Gaussians share the centres and widths of their bases (model/deformation/shared.py): a third of the numbers,
-    # linear in them, so that tracks can start them.
+    # All Gaussians share the centres and widths of their bases (intrasplat/splat/deformation/shared.py): a third of
+    # the numbers, and motion is linear in them, so that tracks can initialise them.
     # Gain: phantom-pull +2.61 dB, -7 s; d4d-a-320x256 +2.68 dB, -7 s.
     Departure("shared bases", {"deformation": SharedBasis.kind, "start_width": None}),
     # As many bases as the motion of the tracks needs, not 17 (intrasplat/motion/capacity.py).
@@ -61,7 +60,7 @@ DEPARTURES = (
     # Opaque Gaussians of half the size show the first frame before the first step.
     # Gain: phantom-pull +1.35 dB, -2 s; d4d-a-320x256 +4.77 dB, -3 s.
     Departure("opaque and small at the start", {"opacity": 0.9, "spread": 0.5}),
-    # One colour for all directions: an endoscope sees tissue from too few directions to tell harmonics.
+    # One colour for all directions: an endoscope sees tissue from too few directions to fit spherical harmonics.
     # Gain: phantom-pull +0.00 dB, +2 s; d4d-a-320x256 +0.00 dB, +1 s.
     Departure("no harmonics", {"sh_degree": 0, "sh_every": 0}, rates={"sh_rest": Rate(0.0)}),
     #
@@ -70,13 +69,13 @@ DEPARTURES = (
     # Every frame once before any comes again, so that successive steps see frames from all over the clip.
     # Gain: phantom-pull +0.14 dB, +2 s; d4d-a-320x256 +0.03 dB, +1 s.
     Departure("epochs", {"order": "epochs"}),
-    # A step draws both eyes of its frame, from one motion (docs/decisions/030).
+    # A step renders both eyes of its frame, from one motion (docs/decisions/two-eyes.md).
     # Gain: d4d-a-stereo -0.89 dB (right eye +7.50), +42 s.
     Departure("both eyes", {"both_eyes": True}),
-    # One number of each Gaussian says how much brighter the right eye sees it (docs/decisions/032).
+    # One number of each Gaussian says how much brighter the right eye sees it (docs/decisions/two-eyes.md).
     # Gain: d4d-a-stereo +2.05 dB (right eye +2.29), +0 s.
     Departure("gloss", rates={"gloss": Rate(2e-2, 5e-3), "motion_gloss": Rate(2e-2, 2e-3)}, needs=("both eyes",)),
-    # Motion learns up to thirty times faster: the published rates are made for 3000 steps (docs/decisions/005).
+    # Motion learns up to thirty times faster: the published rates are made for 3000 steps (docs/decisions/training.md).
     # Gain: phantom-pull +1.37 dB, +2 s; d4d-a-320x256 +2.29 dB, +1 s.
     Departure(
         "faster motion",
@@ -86,7 +85,7 @@ DEPARTURES = (
             "motion_log_scale": Rate(5e-2, 5e-3),
         },
     ),
-    # Colour and shape learn four to ten times faster, and all rates fall (docs/decisions/015).
+    # Colour and shape learn four to ten times faster, and all rates fall (docs/decisions/training.md).
     # Gain: phantom-pull +0.08 dB, +3 s; d4d-a-320x256 +0.06 dB, +0 s.
     Departure(
         "faster colour and shape",
@@ -98,13 +97,13 @@ DEPARTURES = (
             "colour": Rate(2.5e-2, 6e-3),
         },
     ),
-    # Adam forgets sooner (0.9 and 0.999 in the paper): what it remembers is about other frames (docs/decisions/015).
+    # Adam forgets sooner (paper: 0.9 and 0.999), since its moments are of other frames (docs/decisions/training.md).
     # Gain: phantom-pull +0.11 dB, +2 s; d4d-a-320x256 +0.51 dB, +0 s.
     Departure("short moments of Adam", rates={"beta1": 0.3, "beta2": 0.95}),
-    # The slope of L1 does not fall with the error; Huber's loss lets steps shrink near the end (docs/decisions/015).
+    # L1 has the same slope for any error; Huber's falls, so steps shrink at the end (docs/decisions/training.md).
     # Gain: phantom-pull +0.55 dB, +3 s; d4d-a-320x256 +0.77 dB, +0 s.
     Departure("Huber loss of colour", loss={"colour_huber_delta": 0.1}),
-    # Depth is divided by alpha, so that a half-transparent surface is not taken for a near one (model/loss.py).
+    # Depth is divided by alpha, so that a half-transparent surface does not count as near (intrasplat/splat/loss.py).
     # Gain: phantom-pull -0.01 dB, +2 s; d4d-a-320x256 +0.41 dB, +0 s.
     Departure("mean depth", loss={"normalised_depth": True}),
     #
@@ -114,13 +113,13 @@ DEPARTURES = (
     # (intrasplat/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one
     # number. Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
     Departure("warm restarts and averages", {"warm_restarts": True}, needs=("no densification",)),
-    # A run with a budget ends when doubling its iterations gained less on validation frames (docs/decisions/017).
+    # A run with a budget ends if doubling its iterations gained less on validation frames (docs/decisions/training.md).
     # Gain: phantom-pull -0.15 dB, -19 s; d4d-a-320x256 -0.08 dB, +2 s.
     Departure("early stopping", {"min_gain_db": 0.25}, needs=("warm restarts and averages",)),
     # Seconds end a run, not iterations.
     Departure("budget in seconds", {"iterations": None, "budget_s": BUDGETS_S["fast"]}),
 )
-"""What `fast` does otherwise than `paper`. No two departures set one value."""
+"""The differences of `fast` from `paper`. No two departures set the same value."""
 
 FAST = departing(PAPER, DEPARTURES, "fast")
 
@@ -134,13 +133,13 @@ INSTANT = replace(
     FAST,
     name="instant",
     points_per_image=FEW_POINTS,
-    rates=FAST.rates.times(1.6),  # a run of a hundred steps gains 0.2 to 0.4 dB by it (docs/decisions/044)
+    rates=FAST.rates.times(1.6),  # a run of a hundred steps gains 0.2 to 0.4 dB by it (docs/decisions/input.md)
     budget_s=BUDGETS_S["instant"],
 )
 """`fast` for a few seconds."""
 
 QUALITY = replace(FAST, name="quality", min_gain_db=0.05, budget_s=BUDGETS_S["quality"])
-"""`fast` for minutes: it stops later."""
+"""`fast` for minutes: early stopping ends it later."""
 
 SMALL = replace(
     FAST,
@@ -151,10 +150,10 @@ SMALL = replace(
     rates=replace(FAST.rates, motion_log_scale=Rate(0.0)),
     budget_s=BUDGETS_S["small"],
 )
-"""`fast` for little room: a quarter of the Gaussians, half the bases and sizes that do not move. That loses least for
-each byte (docs/decisions/017)."""
+"""`fast` for small files: a quarter of the Gaussians, half the bases, and scales that do not move. Of all reductions
+these lose least per byte (docs/decisions/training.md)."""
 
 
 def points_for(budget_s: float) -> int:
-    """Points per image that score most in so many seconds of training."""
+    """The points per image that score best after so many seconds of training."""
     return FEW_POINTS if budget_s < MANY_POINTS_FROM_S else MANY_POINTS

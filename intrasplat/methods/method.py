@@ -1,6 +1,7 @@
-"""What a preset says, and how one preset departs from another.
+"""`Preset`, all settings of a method, and `Departure`, a difference of one preset from another.
 
-A preset is data alone; the stages of intrasplat/pipeline.py read it. Rates are in optimiser units (median depth 60).
+A preset contains only data, which the stages of intrasplat/pipeline.py read. Rates are in optimiser units (median
+depth 60).
 """
 
 from __future__ import annotations
@@ -18,25 +19,25 @@ from intrasplat.splat.loss import LossSettings
 from intrasplat.splat.optimize import Rates
 
 MAX_FRAMES_A_STEP = 16
-"""The GPU's kernels draw at most so many frames at once (intrasplat/splat/cuda/bins.py)."""
+"""The most frames that the GPU's kernels render at once (intrasplat/splat/cuda/bins.py)."""
 MIN_START = 1e-3
-"""Least opacity, spread and width at the start. An opacity is at most 1 - MIN_START, because its logit is trained."""
+"""Least initial opacity, spread and width. An opacity is at most 1 - MIN_START, because its logit must be finite."""
 
 
 @dataclass(frozen=True)
 class DensifySettings:
     """When Gaussians are split and pruned, and which (intrasplat/train/densify.py).
 
-    from_iteration      the first iteration after which it happens; statistics are gathered from the first step on
+    from_iteration      the first iteration that may densify; statistics are gathered from the first step on
     every               iterations between two densifications
-    gradient_threshold  NDC; a Gaussian whose mean gradient is above it is split
+    gradient_threshold  NDC; a Gaussian with a greater mean gradient is split
     split_into          children of one Gaussian
-    min_opacity         a Gaussian below it is dropped
-    max_count           no more Gaussians than this: with FDM's 17 bases and Adam's moments one takes 6.8 kB, these
-                        1.4 GB; the threshold alone bounds nothing on a clip that cannot be fitted
+    min_opacity         a Gaussian below it is removed
+    max_count           limit of Gaussians: with FDM's 17 bases and Adam's moments one takes 6.8 kB, so many 1.4 GB. On
+                        a clip that cannot be fitted, the threshold alone does not bound their number.
 
     Raises:
-        ValueError: a number out of its range.
+        ValueError: a number is out of its range.
     """
 
     from_iteration: int = 600
@@ -64,33 +65,32 @@ class Preset:
     Points
         fusion            which points become Gaussians (intrasplat/fusion)
         points_per_image  fusion "fill" takes the grid stride that comes nearest to this many points per frame; None:
-                          as far apart as the scene's detail allows
+                          the widest stride that the scene's detail allows
         points_by_budget  whether budget_s decides points_per_image instead (registry.preset_named)
     Motion
         deformation       name of a motion in the registry (intrasplat/splat/deformation)
-        bases             B of the deformation; None: as many as the scene's motion needs
-        (intrasplat/motion/capacity.py) max_bases         limit for `bases` where the scene decides; None: no limit
-        tracks            whether optical-flow tracks start the motion (deformation "shared" alone)
-        start_width       sigma of a basis at the start, model time; None where the deformation has its own
+        bases             B of the deformation; None: as many as the scene's motion needs (motion/capacity.py)
+        max_bases         limit of `bases` where the scene decides; None: no limit
+        tracks            whether optical-flow tracks initialise the motion (only deformation "shared")
+        start_width       initial sigma of a basis, model time; None: the deformation's own
     Start
-        opacity           opacity of a Gaussian at the start
-        spread            its standard deviation at the start over the distance to its neighbours
-        sh_degree         degree of the colour's harmonics
+        opacity           initial opacity of a Gaussian
+        spread            its initial standard deviation over the distance to its neighbours
+        sh_degree         degree of the colour's spherical harmonics
         sh_every          iterations after which a degree is added, where sh_degree is 1 or more
     Steps
-        order             "epochs": every training frame once, shuffled, again and again; "random": drawn each iteration
-        frames_a_step     training frames of one iteration, which descends the sum of their losses
-        both_eyes         whether a step takes both eyes of its frames, where the clip has two and options.eyes allows
+        order             "epochs": every training frame once, shuffled, then again; "random": drawn each iteration
+        frames_a_step     training frames of one iteration, which minimises the sum of their losses
+        both_eyes         whether a step uses both eyes of its frames, where the clip has two and options.eyes allows it
         rates, loss       learning rates (intrasplat/splat/optimize.py) and the loss (intrasplat/splat/loss.py)
-        densify           when Gaussians are split and pruned; None: their number stays
+        densify           when Gaussians are split and pruned; None: their number stays the same
     Schedule and end
-        warm_restarts     whether rates rise again when the iterations have doubled, if there are enough for two cycles,
-                          and the last models of each are averaged (intrasplat/train/schedule.py); else rates fall once
-                          and nothing is averaged
-        min_gain_db       a run with budget_s stops early where doubling its iterations gains less; None: no early
-                          stopping
-        iterations        of a run without budget_s and iterations; None: budget_s
-        budget_s          seconds of training of a run without either
+        warm_restarts     whether rates rise again each time the iterations have doubled, if they suffice for two
+                          cycles, and the last models of a cycle are averaged (intrasplat/train/schedule.py); else
+                          rates fall once and nothing is averaged
+        min_gain_db       early stopping: a run with budget_s ends if doubling its iterations gains less; None: never
+        iterations        number of iterations if a request gives neither budget_s nor iterations; None: budget_s counts
+        budget_s          seconds of training if a request gives neither
 
     Raises:
         ValueError: warm restarts with densification, min_gain_db without warm restarts, or a number out of its range.
@@ -146,7 +146,7 @@ class Preset:
         """The preset with so many bases.
 
         Where the scene chose more than USUAL_BASES, Adam has no first moments: they gain next to nothing and take a
-        third of the model's memory (docs/decisions/042).
+        third of the model's memory (docs/decisions/motion.md).
         """
         many = self.bases is None and bases > USUAL_BASES
         return replace(self, bases=bases, rates=replace(self.rates, beta1=0.0) if many else self.rates)
@@ -154,13 +154,13 @@ class Preset:
 
 @dataclass(frozen=True)
 class Departure:
-    """One thing that a method does otherwise than the method it started from: a few values that belong together.
+    """One difference of a method from the method it is based on: a few values that belong together.
 
     name    what the method does, for tables
-    fields  values of the preset's own fields
-    rates   values of preset.rates
-    loss    values of preset.loss
-    needs   names of the departures without which this one has no effect, or no preset can have it
+    fields  new values of the preset's own fields
+    rates   new values in preset.rates
+    loss    new values in preset.loss
+    needs   names of the departures without which this one has no effect or is invalid
     """
 
     name: str
@@ -171,10 +171,10 @@ class Departure:
 
 
 def departing(preset: Preset, departures: Iterable[Departure], name: str) -> Preset:
-    """The preset under another name, with the values of all departures; where two give one value, the later counts.
+    """The preset under another name, with the values of all departures; where two set one value, the later wins.
 
     Raises:
-        ValueError: no preset can have these values together.
+        ValueError: the values are invalid together.
     """
     fields: dict[str, Any] = {}
     rates: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Presets by their names: those of this package, and those that somebody registers."""
+"""Presets by name: those of this package, and those that other code registers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(_PRESETS)
 
 
 def register_presets(*presets: Preset) -> None:
-    """Make presets known by their names, for this process. To register one again changes nothing.
+    """Register presets by their names, in this process. Registering one again changes nothing.
 
     Raises:
         ValueError: another preset has the name.
@@ -28,10 +28,10 @@ def register_presets(*presets: Preset) -> None:
 
 
 def preset_named(name: str, budget_s: float | None = None) -> Preset:
-    """The preset of this name; with points_by_budget, budget_s decides its points_per_image if it is given.
+    """The preset of this name. If it has points_by_budget and budget_s is given, that decides its points_per_image.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such preset.
     """
     if name not in PRESETS:
         raise InputError("options.preset", f"there is no preset {name!r}.", f"Use one of: {', '.join(PRESETS)}.")

@@ -1,6 +1,6 @@
-"""Points come in; Gaussians go out, with their motion, the loss that trains them and the scores that judge them.
+"""Gaussians and their motion, the rasteriser that renders them, the loss and Adam that train them, and the scores.
 
-Verbs: gaussians.initial_gaussians, deformation.motion_named and restore (fdm.py holds the FDM equation),
-optimize.adam_step, metrics. loss.py is the reference of the loss that the kernels compute. constants.py and layout.py
-hold the numbers that kernels compile in.
+Functions: rasterize.rasterize, gaussians.initial_gaussians, deformation.motion_named and restore (fdm.py has the FDM
+equation), optimize.adam_step, metrics. camera.py and loss.py define what the kernels compute. constants.py and
+layout.py contain the numbers that the kernels compile in.
 """

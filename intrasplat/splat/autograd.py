@@ -1,4 +1,4 @@
-"""What every backend's rasterize() needs to pass torch's arguments and cotangents to its kernels and back."""
+"""Conversions between torch's arguments and cotangents and those of the kernels, for every backend's rasterize()."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from intrasplat.splat.camera import Camera, Rendered
 from intrasplat.splat.reference import check_shapes
 
 MAX_LOGIT = 30.0
-"""Stands for opacities 0 and 1, which have no finite logit; sigmoid(30) differs from 1 by 1e-13."""
+"""Replaces the infinite logits of opacities 0 and 1; sigmoid(30) differs from 1 by 1e-13."""
 
 
 def logit_of(opacity: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ def pose_gradient(rows: Tensor, like: Tensor) -> Tensor:
 
 
 def refuse_second_derivatives() -> None:
-    """To be called first in a backward of kernels: torch would take their gradients for constants.
+    """Refuse create_graph=True: torch would treat the kernels' gradients as constants. A backward calls this first.
 
     Raises:
         RuntimeError: this backward runs with create_graph=True.
@@ -59,7 +59,7 @@ def rasterize_by(
     colour: Tensor,
     camera: Camera,
 ) -> Rendered:
-    """rasterize() by a backend's function of (the five, camera_from_world, camera) -> rgb, depth, alpha.
+    """rasterize() by a backend's function (mean ... colour, camera_from_world, camera) -> rgb, depth, alpha.
 
     Raises:
         ValueError: shapes that do not belong together.

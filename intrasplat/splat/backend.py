@@ -1,4 +1,4 @@
-"""Which device computes, and the model for it: an NVIDIA GPU by Triton's kernels, or the processor by Numba's."""
+"""Choose the device, an NVIDIA GPU (Triton kernels) or the processor (Numba kernels), and create the model for it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from intrasplat.splat.model import Model
 logger = logging.getLogger(__name__)
 
 CPU_BY_OPTION, CPU_BY_VARIABLE = "--device cpu", "INTRASPLAT_DEVICE=cpu"
-"""How the CPU is chosen for one reconstruction, and for a worker."""
+"""How a user chooses the CPU for one reconstruction, and for a worker."""
 
 
 @dataclass(frozen=True)
 class Device:
     """Where a model is trained and rendered.
 
-    kind    what the user calls it
-    name    the GPU's own, in reports
-    memory  where its tensors lie, as torch calls it
+    kind    the user's name for it
+    name    the GPU's product name, for reports
+    memory  torch's name of the device that holds its tensors
     """
 
     kind: Literal["cpu", "cuda"]
@@ -47,12 +47,12 @@ def choose_device(asked: str, gpu: Gpu | None = None, *, cpu_by: str = CPU_BY_OP
     """The device for auto, cpu or cuda; auto chooses the GPU if all of its requirements are met, otherwise the CPU.
 
     Args:
-        gpu: what there is; None looks.
+        gpu: the GPU found; None searches for one.
         cpu_by: how the caller's user chooses the CPU, for the remedy.
 
     Raises:
         InputError: there is no device of that name.
-        UnavailableError: cuda is asked for, and one of its requirements is not met.
+        UnavailableError: cuda is requested, and one of its requirements is not met.
     """
     if asked not in get_args(DeviceName):
         raise InputError("options.device", f"there is no device {asked!r}.", "Use auto, cpu or cuda.")
@@ -72,7 +72,7 @@ def examine(device: Device) -> float:
     reference; returns the seconds it took.
 
     Raises:
-        UnavailableError: they differ by more than agreement.LIMIT, or cannot be run; the log has the error.
+        UnavailableError: they differ by more than agreement.LIMIT, or do not run; the log has the error.
     """
     start = time.perf_counter()
     if device.kind == "cuda":
@@ -82,7 +82,7 @@ def examine(device: Device) -> float:
             agreement.check(device.memory, device.name)
         except UnavailableError:
             raise
-        except Exception as error:  # whatever driver, compiler or memory raise
+        except Exception as error:  # driver, compiler and memory errors have many types
             logger.error("%s cannot be used", device, exc_info=error)
             problem = f"{device} cannot be used ({type(error).__name__})."
             remedy = f"Free or mend the GPU (see the log), or use the CPU ({CPU_BY_OPTION}, {CPU_BY_VARIABLE})."
@@ -91,7 +91,7 @@ def examine(device: Device) -> float:
 
 
 def gpu_is_lost() -> bool:
-    """Whether an error has ended what this process may do with its GPU: from then on every use of it fails."""
+    """Whether this process can no longer use its GPU, because after an error every use fails."""
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return False
     try:
@@ -103,10 +103,10 @@ def gpu_is_lost() -> bool:
 
 
 def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
-    """choose_device for training a motion of this name: auto trains one without kernels on the CPU.
+    """The device for training a motion of this name: like choose_device, but auto is the CPU if it has no GPU kernels.
 
     Raises:
-        InputError: cuda is asked for, and the motion trains on the CPU only; or there is no device of that name.
+        InputError: cuda is requested, and the motion trains on the CPU only; or there is no device of that name.
         UnavailableError: as choose_device.
     """
     device = choose_device(asked, gpu)
@@ -119,9 +119,9 @@ def device_for(deformation: str, asked: str, gpu: Gpu | None = None) -> Device:
 
 
 def make_model(gaussians: Gaussians, deformation: Deformation, width: int, height: int, device: Device = CPU) -> Model:
-    """The Gaussians (on the host) and their motion in the form that the device trains and renders.
+    """The model that trains and renders these Gaussians (on the host) and their motion on the device.
 
-    A motion without kernels lies on the CPU, whatever the device. Triton is imported for a GPU alone.
+    A motion without kernels stays on the CPU, whatever the device. Triton is imported only for a GPU.
 
     Raises:
         UnavailableError: as examine.

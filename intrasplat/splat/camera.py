@@ -1,8 +1,8 @@
-"""Splatting: Gaussians and a camera in, colour, depth and alpha out. Every backend obeys this one contract.
+"""The contract of splatting, which every backend follows: Gaussians and a camera in, colour, depth and alpha out.
 
     rasterize(mean, quaternion, scale, opacity, colour, camera) -> Rendered
 
-rasterize.py joins the backends behind one public function of several cameras, in gsplat's names.
+rasterize.py is the public function: it calls one of the backends, for several cameras, with gsplat's names.
 
 Symbols: N Gaussians, H W pixels (rows i, columns j), T transmittance. Lengths in optimiser units. Names in capitals are
 the bounds of intrasplat/splat/constants.py.
@@ -20,8 +20,8 @@ Projection. (x, y, z) = camera_from_world mean; R, S rotation and scale; W the r
     cov2d  = J W Sigma W^T J^T + 0.3 diag(m_x^2, m_y^2) (EPS2D, pixels^2);  conic = cov2d^-1
     m_x    = max(1, e_x z_r / z), e = Camera.enlarged, z_r = Camera.recorded_depth (mean, 1); m_y likewise
 
-Cull. A Gaussian draws nothing where z <= NEAR or opacity < 1/255, or where no pixel centre of the image can reach
-alpha >= 1/255: a bound that only saves work and never changes a pixel.
+Cull. A Gaussian is not drawn if z <= NEAR or opacity < 1/255, or if no pixel centre of the image can reach
+alpha >= 1/255. The last bound only saves work and never changes a pixel.
 
 Order. Ascending z of the mean, stable by index.
 
@@ -29,14 +29,14 @@ Blend. d = pixel centre - mean2d, front to back from T = 1 at every pixel:
     alpha = min(MAX_ALPHA, opacity exp(-d^T conic d / 2))
     alpha = 0 where it is < MIN_ALPHA, and where T before this Gaussian is < MIN_TRANSMITTANCE (the pixel is full)
     w = T alpha;  T <- T (1 - alpha)
-    rgb = sum w colour;  depth = sum w z;  alpha = sum w          no background: what nothing covers is black
+    rgb = sum w colour;  depth = sum w z;  alpha = sum w          no background: uncovered pixels are black
 
 Gradients reach mean, quaternion, scale, opacity, colour and camera_from_world (if it is a tensor that asks), depth's
-also z. They are 0 through a clamped u or v (the rest of J keeps its own), through m_x and m_y, through alpha at
-MAX_ALPHA, and through the cuts and the order; a culled Gaussian gets 0, and so does the last row of camera_from_world.
+also z. They are 0 through a clamped u or v (the other entries of J have gradients), through m_x and m_y, through alpha
+at MAX_ALPHA, and through the cuts and the order. A culled Gaussian and the last row of camera_from_world get 0.
 
 N = 0 and a scene without a visible Gaussian render black, with zero gradients. Inputs must be finite.
-No backend may hold an array of N x H x W.
+No backend may allocate an array of N x H x W.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Camera:
     """A pinhole camera: OpenCV axes, focal lengths and principal point in pixels.
 
     camera_from_world is [4, 4] float64, rigid, translation in optimiser units; a tensor where its gradient is wanted.
-    side and dim say what it sees of the gloss g of a Gaussian (intrasplat/splat/gaussians.py): the colour gains side g
-    and loses dim |g|. The left eye has side -1/2, the right eye 1/2. The rasteriser gets colours that have it already.
-    enlarged and recorded_depth say how large a pixel of the recording is (docs/rasterizer.md): by how much the focal
-    lengths exceed the recording's, and the third row of the recording's camera_from_world. By default it is a pixel.
+    side and dim are the factors of a Gaussian's gloss g (intrasplat/splat/gaussians.py): side g - dim |g| is added to
+    its colour, before the rasteriser gets it. The left eye has side -1/2, the right eye 1/2.
+    enlarged and recorded_depth give the size of a pixel of the recording (docs/rasterizer.md): the ratios of the focal
+    lengths to the recording's, and the third row of the recording's camera_from_world. The default is one pixel.
     """
 
     fx: float
@@ -86,12 +86,12 @@ class Camera:
         return given.to(like) if isinstance(given, Tensor) else torch.tensor(given).to(like)
 
     def centre(self, like: Tensor) -> Tensor:
-        """[3] position in the world, likewise."""
+        """[3] the camera's position in the world, units; dtype, device and gradient as pose()."""
         pose = self.pose(like)
         return -pose[:3, :3].T @ pose[:3, 3]
 
     def ratio_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Least and greatest x / z, then y / z, at which J is taken."""
+        """Least and greatest x / z, then y / z, to which J's u and v are clamped."""
         beyond_x, beyond_y = IMAGE_MARGIN * self.width / self.fx, IMAGE_MARGIN * self.height / self.fy
         return (
             (-self.cx / self.fx - beyond_x, (self.width - self.cx) / self.fx + beyond_x),
@@ -101,7 +101,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """What a camera sees.
+    """The image of a camera.
 
     rgb    [H, W, 3]  sum w colour, unclamped
     depth  [H, W]     sum w z in units, not divided by alpha

@@ -29,7 +29,7 @@ MAX_START_SCALE = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians as the optimiser holds them.
+    """N Gaussians, in the form that is optimised.
 
     mean          [N, 3]     centre in the world, optimiser units
     quaternion    [N, 4]     wxyz, any length but 0: projection normalises it
@@ -71,9 +71,9 @@ class Gaussians:
     def colour(self, camera_centre: Tensor, side: float = 0.0, dim: float = 0.0) -> Tensor:
         """Colour seen from a camera at camera_centre ([3], world, units): [N, 3] RGB, not below 0, unbounded above.
 
-        side, dim: of the camera (intrasplat/splat/camera.py), for the gloss. With other harmonics there is none.
+        side, dim: the camera's factors of the gloss (intrasplat/splat/camera.py). With sh_degree > 0 gloss is ignored.
         """
-        if self.sh.shape[1] == 1:  # no view dependence: spare the directions and their gradients
+        if self.sh.shape[1] == 1:  # no view dependence: skip the directions and their gradients
             shine = side * self.gloss - dim * self.gloss.abs()
             return torch.clamp(0.5 + SH_C0 * self.sh[:, 0] + shine[:, None], min=0.0)
         direction = torch.nn.functional.normalize(self.mean - camera_centre, dim=-1)
@@ -131,7 +131,7 @@ def sh_colour(sh: Tensor, direction: Tensor) -> Tensor:
 
 
 def sh_from_rgb(rgb: Tensor) -> Tensor:
-    """The degree-0 coefficient that shows as rgb [..., 3] in [0, 1]."""
+    """The degree-0 coefficient whose colour is rgb [..., 3] in [0, 1]."""
     return (rgb - 0.5) / SH_C0
 
 
@@ -148,7 +148,7 @@ def initial_gaussians(
         points: [N, 3] world positions in optimiser units.
         rgb: [N, 3] in [0, 1].
         sh_degree: 0..3; coefficients above degree 0 start at 0.
-        opacity: of every Gaussian, in (0, 1).
+        opacity: the opacity of every Gaussian, in (0, 1).
 
     Raises:
         InputError: no points, shapes that do not fit, or values that are not finite.
@@ -169,7 +169,7 @@ def initial_gaussians(
 
 def _neighbour_scale(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N] root mean square distance to the 3 nearest others; with fewer than 3 others the upper clamp."""
-    # The nearest is the point itself; where there are not enough others the distance is inf.
+    # The nearest is the point itself; the distance of a missing neighbour is inf.
     distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     scale: NDArray[np.float64] = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))
     return np.clip(scale, MIN_START_SCALE, MAX_START_SCALE)

@@ -1,4 +1,4 @@
-"""What training minimises, in plain torch: the definition that fused kernels are tested against.
+"""The training loss in plain torch: the definition that the fused kernels are tested against.
 
 Symbols: H W pixels; C [H, W, 3] rendered colour, Z = sum(w z) and A = sum(w) [H, W] of the blend (intrasplat/splat);
 M_c tissue pixels, M_d tissue pixels with valid depth d. Depths are in optimiser units (median 60).
@@ -16,8 +16,8 @@ h'(e) = clip(e / delta, -1, 1), or sign(e) for delta = 0. So the gradients that 
     dL/dZ = -depth_weight / |M_d| h'(D - 1 / d) D / Z                     on M_d, else 0   (both forms)
     dL/dA =  depth_weight / |M_d| h'(D - 1 / d) / Z                       normalised; 0 for "paper"
 
-A pixel of M_d with A < MIN_COVERAGE has no depth to correct: it adds nothing to L_d but stays in |M_d|, so that neither
-the divisions nor the scale depend on what has been covered so far.
+A pixel of M_d with A < MIN_COVERAGE has no rendered depth. It adds nothing to L_d but counts in |M_d|, so that the
+divisions stay finite and the scale does not depend on how much is covered so far.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class LossSettings:
     """Weights of the two terms, the form of depth, and where the L1 becomes quadratic.
 
     normalised_depth   False: 1 / Z, as published; True: A / Z
-    colour_huber_delta of the colour's h, in [0, 1]; 0: plain L1
-    depth_huber_delta  of the inverse depth's h, in 1 / units
+    colour_huber_delta Huber delta of colour, in [0, 1]; 0: plain L1
+    depth_huber_delta  Huber delta of inverse depth, in 1 / units; 0: plain L1
     """
 
     colour_weight: float = 1.0

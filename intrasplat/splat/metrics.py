@@ -1,8 +1,8 @@
-"""How near a render is to the recorded frame (docs/conventions.md, "Scores").
+"""Scores of a render against the recorded frame (docs/conventions.md, "Scores").
 
 Symbols: H W pixels. Colours are RGB: float in [0, 1], or uint8; tissue [H, W] bool, True = tissue.
-Each function judges one frame, except depth_agreement_mm; what has no pixel to be judged on is NaN, and so is the
-score of a picture that is not finite where it is judged.
+Each function scores one frame, except depth_agreement_mm. A score is NaN if there is no pixel to compare, or if the
+render is not finite at one of them.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from numpy.typing import NDArray
 Image = NDArray[np.floating] | NDArray[np.uint8]
 
 BEST_PSNR_DB = 100.0
-"""The PSNR of equal images. The true value is infinite, which neither a mean over frames nor JSON can hold."""
+"""The PSNR of equal images. The true value is infinite, which a mean over frames and JSON cannot represent."""
 SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilisers for a data range of 1 (Wang et al., 2004)."""
 HIGHLIGHT_LEVEL, HIGHLIGHT_PX = 0.6, 7
-"""A pixel whose least channel exceeds this is a highlight, and with it a square of so many pixels around it."""
+"""A pixel whose least channel exceeds this level is a highlight, with the square of HIGHLIGHT_PX pixels around it."""
 COVERED_ALPHA = 0.5
 """Least sum of blending weights at which a pixel counts as covered and its depth as valid."""
 MASK_OVERREAD = 32
-"""Bytes kept behind a mask: cv2.norm of OpenCV 4.14 reads up to 8 past its end with AVX2, which may lie in no page."""
+"""Bytes allocated after a mask: with AVX2, cv2.norm of OpenCV 4.14 reads up to 8 bytes past its end."""
 
 
 def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
     """-10 log10 of the mean squared error over tissue pixels and RGB, in dB; the render is clamped to [0, 1] first.
 
-    Tissue without depth is included. This is the score we go by.
+    Tissue without depth is included. This is our main score.
     """
     _check_shapes(rendered, truth, tissue)
     return _decibel(_squared(rendered, truth, tissue, _unit), 3 * int(np.count_nonzero(tissue)))
 
 
 def clear_of_highlights(rendered: Image, truth: Image) -> NDArray[np.bool_]:
-    """[H, W] pixels at least HIGHLIGHT_PX / 2 away from what is nearly white in either image.
+    """[H, W] pixels at least HIGHLIGHT_PX / 2 away from a highlight in either image.
 
-    A highlight lies elsewhere for every eye: scores without it say how well the tissue itself is modelled.
+    Each eye sees a highlight at another place. Scores without highlights show how well the tissue itself is modelled.
     """
     bright = (_least(_unit(rendered)) > HIGHLIGHT_LEVEL) | (_least(_unit(truth)) > HIGHLIGHT_LEVEL)
     box = np.ones((HIGHLIGHT_PX, HIGHLIGHT_PX), np.uint8)
@@ -50,9 +50,9 @@ def clear_of_highlights(rendered: Image, truth: Image) -> NDArray[np.bool_]:
 
 
 def psnr_paper(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
-    """What the papers print, in dB: both images rounded to 8 bit, the instrument 0 in both, all H W 3 values counted.
+    """PSNR as the papers compute it, in dB: both images in 8 bit, instruments 0 in both, mean over all H W 3 values.
 
-    It exceeds psnr_tissue by -10 log10(share of tissue), since the zeroed pixels are all right.
+    It exceeds psnr_tissue by -10 log10(share of tissue), because the zeroed pixels have no error.
     """
     _check_shapes(rendered, truth, tissue)
     if not tissue.any():
@@ -63,7 +63,7 @@ def psnr_paper(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> floa
 def ssim(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> float:
     """Structural similarity (Wang et al., 2004), 11 x 11 Gaussian, sigma 1.5, its map averaged over tissue and RGB.
 
-    The instrument is 0 in both images, so that a window which reaches over it compares tissue alone.
+    The instrument is 0 in both images, so that a window that overlaps it compares only tissue.
     """
     _check_shapes(rendered, truth, tissue)
     if not tissue.any():
@@ -93,7 +93,7 @@ def ssim_map(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArr
 def depth_errors_mm(
     rendered_mm: NDArray[np.floating], stereo_mm: NDArray[np.floating], tissue: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """|rendered - stereo| in mm at the tissue pixels where both depths are valid (above 0), [M]; of NaN it is NaN."""
+    """[M] |rendered - stereo| in mm at the tissue pixels where both depths are valid (above 0), or NaN if one is."""
     if not rendered_mm.shape == stereo_mm.shape == tissue.shape:
         raise ValueError(f"shapes differ: {rendered_mm.shape}, {stereo_mm.shape}, tissue {tissue.shape}")
     both = tissue & ~(rendered_mm <= 0) & ~(stereo_mm <= 0)
@@ -107,7 +107,7 @@ def depth_agreement_mm(errors_mm: list[NDArray[np.float32]]) -> float:
 
 
 def coverage(alpha: NDArray[np.floating], tissue: NDArray[np.bool_]) -> float:
-    """Share of tissue pixels with a sum of blending weights of at least 0.5, which NaN is not."""
+    """Share of tissue pixels whose alpha is at least COVERED_ALPHA; NaN counts as not covered."""
     if alpha.shape != tissue.shape:
         raise ValueError(f"shapes differ: {alpha.shape}, tissue {tissue.shape}")
     return float((alpha[tissue] >= COVERED_ALPHA).mean()) if tissue.any() else math.nan
@@ -144,7 +144,7 @@ def _squared(
 
 
 def _decibel(squared: float, count: int) -> float:
-    """Of a sum of squares over so many numbers."""
+    """PSNR in dB from the sum of `count` squared errors; NaN without any."""
     if not count or math.isnan(squared):
         return math.nan
     return min(BEST_PSNR_DB, -10 * math.log10(squared / count)) if squared > 0 else BEST_PSNR_DB

@@ -1,13 +1,12 @@
-"""What training needs of a model, whatever computes its steps: Gaussians, their deformation and Adam's moments.
+"""The interface of a model on any device: Gaussians, their deformation and Adam's moments.
 
-Symbols: N Gaussians; H W pixels, as many as the camera says; F frames per step.
-Implementations: CpuModel (intrasplat/splat/cpu/model.py) and CudaModel (intrasplat/splat/cuda/model.py). Each holds a
+Symbols: N Gaussians; H W pixels, the size in the camera vector; F frames per step.
+Implementations: CpuModel (intrasplat/splat/cpu/model.py) and CudaModel (intrasplat/splat/cuda/model.py). Each has a
 Motion, which evaluates and trains the deformation: by kernels, or on the CPU by torch
-(intrasplat/splat/cpu/unfused.py). intrasplat/splat/backend.py makes the one for a device.
+(intrasplat/splat/cpu/unfused.py). intrasplat/splat/backend.py creates the model for a device.
 
-A device may lag behind: step() may return before its step is made. Every other method waits for all steps first, so
-none sees a model between two steps. The sums of a step that lags come with a later answer. They tell whether its loss
-is a number and whether any Gaussian was in view.
+A device may lag behind: step() may return before the device has made the step. Every other method waits for all steps
+first. The sums of a step that lags (StepSums) are returned by a later call.
 """
 
 from __future__ import annotations
@@ -28,20 +27,20 @@ from intrasplat.splat.step import StepSums, TrainingFrame
 
 Floats = NDArray[np.float32]
 FIRST_MOMENTS = "motion.first"
-"""In Model.arrays()."""
+"""Name of a motion's first moments in Model.arrays()."""
 BAND_PIXELS = 1 << 18
-"""One core blends and converts so many in some 12 ms."""
+"""One core blends and converts so many pixels in some 12 ms."""
 
 
 def bands_of(width: int, height: int, multiple: int = 1) -> list[slice]:
-    """The rows of an image, from top to bottom, in bands of about BAND_PIXELS that begin at multiples of a number."""
+    """The rows of an image, from top to bottom, in bands of about BAND_PIXELS that start at multiples of `multiple`."""
     rows = multiple * max(1, BAND_PIXELS // (width * multiple))
     return [slice(first, min(first + rows, height)) for first in range(0, height, rows)]
 
 
 class ProjectedPicture(Protocol):
-    """The Gaussians at one time on one camera's image, in buffers of its own: its bands are blended one by one, and the
-    model may render other pictures in between."""
+    """The Gaussians at one time projected for one camera. Its bands of rows are blended one by one. It has buffers of
+    its own, so the model may render other pictures in between."""
 
     @property
     def bands(self) -> Sequence[slice]:
@@ -49,11 +48,11 @@ class ProjectedPicture(Protocol):
         ...
 
     def sort(self) -> None:
-        """Call it once before the first band: it may take as long as some of them."""
+        """Sort the Gaussians; call it once before the first band. It may take as long as blending several bands."""
         ...
 
     def blend(self, rows: slice) -> Floats:
-        """R G B Z A and the values of one of the bands, [5 or 6, h, W]; a view until close()."""
+        """R G B Z A, and the values if given, of one of the bands, [5 or 6, h, W]; a view until close()."""
         ...
 
     def close(self) -> None:
@@ -63,30 +62,30 @@ class ProjectedPicture(Protocol):
 
 @dataclass(frozen=True)
 class Blended:
-    """A Projected whose bands are blended already. image: [5 or 6, H, W]."""
+    """A ProjectedPicture whose bands are already blended. image: [5 or 6, H, W]."""
 
     image: Floats
 
     @property
     def bands(self) -> list[slice]:
-        """As of Projected."""
+        """See ProjectedPicture."""
         return bands_of(self.image.shape[2], self.image.shape[1])
 
     def sort(self) -> None:
-        """There is nothing left to do."""
+        """Does nothing."""
 
     def blend(self, rows: slice) -> Floats:
-        """As of Projected."""
+        """See ProjectedPicture."""
         return self.image[:, rows]
 
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Does nothing."""
 
 
 class Model(Protocol):
-    """A scene that can be trained, on one frame per step or several, rendered, and edited between two steps.
+    """A scene that can be trained on one or several frames per step, rendered, and edited between two steps.
 
-    Tensors lie on the model's device; NumPy arrays on the host.
+    Tensors lie on the model's device, NumPy arrays on the host.
     """
 
     @property
@@ -96,25 +95,25 @@ class Model(Protocol):
 
     @property
     def answers_every(self) -> int:
-        """Steps from one answer to the next; 1 where every step is waited for."""
+        """Steps from one StepSums to the next; 1 if step() waits for every step."""
         ...
 
     def step(
         self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums | None:
-        """One iteration (counted from 1): one step of Adam down the sum of the frames' losses.
+        """One iteration (counted from 1): one step of Adam on the sum of the frames' losses.
 
         Args:
-            frames: F of one size; a frame may occur more than once. Another F may allocate new buffers.
-            sh_degree: the harmonics in use at this iteration.
+            frames: F frames of one size; a frame may occur more than once. Another F may allocate new buffers.
+            sh_degree: degree of the spherical harmonics in use at this iteration.
 
         Returns:
-            What the steps since the last answer add up to; None where the device has not been asked.
+            The sums of the steps since the last StepSums; None if the device's report was not read.
         """
         ...
 
     def wait(self) -> StepSums | None:
-        """Return when every step is made: their sums, or None if there was none since the last answer."""
+        """Wait until every step is made; the sums of the steps since the last StepSums, or None without any."""
         ...
 
     @property
@@ -125,8 +124,7 @@ class Model(Protocol):
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool, whether any of the last step's frames could see each: in front of the camera, in the image, not too
-        faint."""
+        """[N] bool: in one of the last step's frames it was in front of the camera, in the image and not too faint."""
         ...
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -137,7 +135,7 @@ class Model(Protocol):
         ...
 
     def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
-        """The same picture, to be blended in bands of rows, with the same bits. The caller closes it."""
+        """The same picture, bit-identical, to be blended in bands of rows. The caller closes it."""
         ...
 
     def blend_values(self, values: Floats) -> Floats:
@@ -147,8 +145,8 @@ class Model(Protocol):
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * render(camera, t)), cotangents [5, H, W], to the Gaussians as they are at t.
 
-        [VALUES, N], rows as in intrasplat/splat/layout.py, colours as if none were held above 0. Other harmonics are
-        left out.
+        [VALUES, N], rows as in intrasplat/splat/layout.py. It ignores that colours are clamped at 0, and all harmonics
+        but the constant one.
         """
         ...
 
@@ -161,38 +159,38 @@ class Model(Protocol):
         ...
 
     def parameters(self) -> dict[str, Tensor]:
-        """What is trained, by name; views of the live tensors, on every device of one shape. May be written.
+        """The trained tensors by name: views of the live ones, of the same shapes on every device. May be written.
 
         Among them: canonical [ROWS, N], rows as in intrasplat/splat/layout.py, and opacity_logit [N].
         """
         ...
 
     def arrays(self) -> dict[str, Tensor]:
-        """Everything a resumed run needs, by name; likewise."""
+        """All tensors that a resumed run needs, by name; views that may be written."""
         ...
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave, or some of it, on any device; ValueError if the sizes differ."""
+        """Load what arrays() returned, or some of it, on any device; ValueError if the sizes differ."""
         ...
 
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies).
 
-        as_it_lies: the deformation's tensors need not be contiguous, which saves time to whoever makes a model of them.
+        as_it_lies: the deformation's tensors need not be contiguous, which saves time if a model is created from them.
         """
         ...
 
 
 def state_of(model: Model, beta1: float) -> dict[str, Tensor]:
-    """arrays() without a motion's first moments where no step asks for them: with beta1 = 0 each is the last gradient.
+    """arrays(), without a motion's first moments if beta1 is 0: then no step reads them.
 
-    They take much of the model's memory on a CPU as soon as they are touched.
+    On a CPU they take much of the model's memory as soon as they are read.
     """
     return {name: values for name, values in model.arrays().items() if beta1 or name != FIRST_MOMENTS}
 
 
 def put_back(arrays: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
-    """Copy the stored tensors, on any device, into a model's arrays(). What is not stored stays as it is.
+    """Copy the stored tensors, on any device, into a model's arrays(). Arrays that are not stored do not change.
 
     Raises:
         ValueError: a stored tensor has another shape than the array of its name.

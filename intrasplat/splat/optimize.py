@@ -1,7 +1,7 @@
-"""Adam's rates and their schedules. The arithmetic itself is fused into the backends' steps.
+"""Adam's learning rates and their schedules. The arithmetic itself is fused into the backends' steps.
 
-Rates are in optimiser units (median depth 60). Progress in (0, 1] says how far they have fallen. It reaches 1 before
-every warm restart (intrasplat/train/schedule.py) and at the end of a run.
+Rates are in optimiser units (median depth 60). They fall with progress in [0, 1], which reaches 1 before every warm
+restart (intrasplat/train/schedule.py) and at the end of a run.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ class Rate:
     end: float | None = None
 
     def times(self, factor: float) -> Rate:
-        """The rate larger by the factor."""
+        """The rate multiplied by the factor."""
         return Rate(factor * self.start, None if self.end is None else factor * self.end)
 
     def at(self, progress: float) -> float:
+        """The rate at progress in [0, 1]."""
         if self.end is None or self.start == 0.0:
             return self.start
         return math.exp(math.log(self.start) + (math.log(self.end) - math.log(self.start)) * min(progress, 1.0))
@@ -30,9 +31,9 @@ class Rate:
 
 @dataclass(frozen=True)
 class Rates:
-    """One rate a parameter group. motion_* are those of the deformation's weights for its five kinds of channel.
+    """One learning rate per parameter group. motion_*: the deformation's weights, by their five kinds of channel.
 
-    beta1, beta2  decay of Adam's two moments per step; as published unless a preset says otherwise
+    beta1, beta2  decay of Adam's two moments per step; the defaults are Adam's published ones
     """
 
     mean: Rate
@@ -52,7 +53,7 @@ class Rates:
     beta2: float = 0.999
 
     def times(self, factor: float) -> Rates:
-        """Every rate larger by the factor."""
+        """Every rate multiplied by the factor."""
         found: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
         found |= {name: each.times(factor) for name, each in found.items() if isinstance(each, Rate)}
         return Rates(**found)
@@ -93,7 +94,7 @@ class AdamStep:
 
 
 def rates_at(rates: Rates, progress: float) -> StepRates:
-    """Every group's rate at progress in (0, 1]."""
+    """Every group's rate at progress in [0, 1]."""
     found = {name: getattr(rates, name) for name in StepRates.__dataclass_fields__}
     return StepRates(**{name: each.at(progress) if isinstance(each, Rate) else each for name, each in found.items()})
 

@@ -1,8 +1,7 @@
-"""Gaussians and several pinhole cameras in, colours, depth and alpha out; differentiable by torch.autograd.
+"""Render Gaussians for several pinhole cameras: colours, depth and alpha, differentiable by torch.autograd.
 
 Symbols: N Gaussians, C cameras, D channels of colour, H W pixels. Names and shapes are gsplat's where they mean the
-same (docs/gsplat.md). The equations are those of intrasplat/splat/camera.py A backend draws three channels for one
-camera.
+same (docs/gsplat.md). The equations are in intrasplat/splat/camera.py. A backend renders three channels for one camera.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ BackendName = Literal["auto", "cpu", "cuda", "reference"]
 Draw = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Rendered]
 CHANNELS_PER_PASS = 3
 MIN_QUATERNION = 1e-12
-"""A shorter quaternion names no direction that float32 could normalise."""
+"""A shorter quaternion cannot be normalised in float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rasterized:
-    """What C cameras see. w is a Gaussian's weight in a pixel, transmittance times alpha.
+    """The images of C cameras. w is a Gaussian's weight in a pixel, transmittance times alpha.
 
     colors  [C, H, W, D]  sum w color, not clamped; 0 where nothing is drawn
     depth   [C, H, W, 1]  sum w z in the unit of means, z along the camera's axis; depth / alpha is the expected depth
@@ -63,14 +62,14 @@ def rasterize(
     """Colour, depth and alpha of N Gaussians as C pinhole cameras see them, with gradients.
 
     Gradients reach means, quats, scales, opacities, colors and viewmats, from all three results. Ks gets no gradient,
-    and a Ks that requires one is refused. viewmats gets the gradient of its upper three rows, taken as twelve free
-    numbers. A step along it leaves the rigid transforms, so optimise a parametrisation of the pose and build viewmats
-    from it. The kernels compute first derivatives only: create_graph=True needs the reference. The first call on a
-    machine compiles the kernels, about 10 s of CPU time; later processes load them.
+    and a Ks that requires one raises InputError. viewmats gets the gradient of its upper three rows, as twelve
+    independent numbers. A step along it is not rigid, so optimise a parametrisation of the pose and build viewmats from
+    it. The kernels compute first derivatives only: create_graph=True needs the reference. The first call on a machine
+    compiles the kernels, about 10 s of CPU time; later processes load them.
 
     Lengths may have any unit, the same for means, scales, the translations of viewmats, near_plane and depth.
-    means, quats, scales, opacities and colors share one dtype and one device, which the result has, too: float32 or
-    float64. viewmats may have the other of the two. viewmats and Ks may lie on another device.
+    means, quats, scales, opacities and colors share one dtype, float32 or float64, and one device; the result has both.
+    viewmats may have the other dtype. viewmats and Ks may lie on another device.
 
     Args:
         means: [N, 3] centres in the world.
@@ -80,22 +79,21 @@ def rasterize(
         colors: [N, D] or, if they differ from camera to camera, [C, N, D]; blended as they are. Every three channels
             cost one pass. Spherical harmonics are not evaluated.
         viewmats: [C, 4, 4] camera_from_world in OpenCV axes (x right, y down, z forward), last row 0 0 0 1. The upper
-            left 3 x 3 is meant to be a rotation; it is used as it is.
+            left 3 x 3 should be a rotation; it is not checked.
         Ks: [C, 3, 3] intrinsics in pixels, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. The centre of the first pixel is at
             (0.5, 0.5).
         width: W in pixels, at least 1.
         height: H in pixels, at least 1.
-        near_plane: z up to which a Gaussian is not drawn, above 0. The kernels draw a Gaussian with a scale above
-            5e6 near_plane as if it had that scale.
+        near_plane: a Gaussian up to this z is not drawn; above 0. The kernels clamp scales to 5e6 near_plane.
         backend: "cpu": Numba kernels, float32 on the processor. "cuda": Triton kernels, float32 on an NVIDIA GPU.
             "reference": plain torch, float32 or float64 on any device, slow. "auto": the kernels of the device for
             float32, the reference otherwise.
 
     Raises:
         InputError: an argument has a wrong type, shape, dtype, device or value. Its attribute field names the argument.
-        LimitError: more Gaussians than the kernels of the processor can number; it is an InputError.
+        LimitError: more Gaussians than the processor's kernels can number; a subclass of InputError.
         UnavailableError: the tensors are on a GPU, and something that the kernels need is missing.
-        RuntimeError: in the backward pass, the kernels are asked for create_graph=True.
+        RuntimeError: in the backward pass of the kernels, with create_graph=True.
 
     Equations: intrasplat/splat/camera.py, after Zwicker et al., EWA Splatting, 2002, and Kerbl et al., 3D Gaussian
     Splatting, 2023. docs/rasterizer.md derives the gradients.
@@ -134,7 +132,7 @@ def rasterize(
     cameras = _cameras(viewmats * _with_translation(units, viewmats), Ks, width, height)
     gaussians = (means * units, quats, scales * units, opacities)
     by_camera = colors if colors.ndim == 3 else colors.expand(len(cameras), *colors.shape)
-    # Triton launches on the current GPU; for tensors of the host this does nothing.
+    # Triton launches on the current GPU; for tensors on the host this does nothing.
     with torch.cuda.device_of(means):  # type: ignore[no-untyped-call]
         views = [_draw_channels(draw, gaussians, own, camera) for own, camera in zip(by_camera, cameras, strict=True)]
     rgb, depth, alpha = (torch.stack(layer) for layer in zip(*views, strict=True))
@@ -153,14 +151,14 @@ def _draw_channels(
 
 
 def _with_translation(factor: float, like: Tensor) -> Tensor:
-    """[4, 4] ones, and factor where a pose has its translation."""
+    """[4, 4] ones, with factor at the entries of a pose's translation."""
     factors = like.new_ones(4, 4)
     factors[:3, 3] = factor
     return factors
 
 
 def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
-    """Every camera by itself, its pose still a part of viewmats."""
+    """The cameras one by one; each pose is a view of viewmats, so gradients reach it."""
     size = _pixels("width", width), _pixels("height", height)
     if Ks.requires_grad:
         raise InputError("Ks", "requires a gradient, which is not computed.", "Pass Ks.detach().")
@@ -253,7 +251,7 @@ def _refuse(name: str, values: Tensor, wrong: Tensor, problem: str, remedy: str)
 
 
 def _backend(name: str, means: Tensor) -> Draw:
-    """What draws one camera's view of Gaussians of this dtype on this device."""
+    """The function that renders Gaussians of this dtype on this device for one camera."""
     if name not in get_args(BackendName):
         raise InputError("backend", f"there is no backend {name!r}.", "Use auto, cpu, cuda or reference.")
     device = means.device.type
@@ -282,7 +280,7 @@ def _backend(name: str, means: Tensor) -> Draw:
 
 @cache
 def _require_gpu() -> None:
-    """Look once whether the GPU's kernels can run; raise UnavailableError if not."""
+    """Check once whether the GPU's kernels can run; raise UnavailableError if not."""
     gpu = find_gpu()
     if gpu.missing:
         raise UnavailableError(f"backend 'cuda': {gpu.missing}.", f"{gpu.remedy}, or use backend='reference'.")

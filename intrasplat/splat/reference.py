@@ -1,4 +1,4 @@
-"""The contract of intrasplat.splat in plain torch: any float dtype, autograd, written to be read.
+"""The reference rasteriser in plain torch, for any float dtype and with autograd; its equations are in camera.py.
 
 Symbols: N Gaussians, H W pixels, M (Gaussian, tile) instances, P pixels of a tile, Q Gaussians of a chunk.
 The other backends are tested against this one in float64.
@@ -15,16 +15,16 @@ from intrasplat.splat.camera import Camera, Rendered
 from intrasplat.splat.constants import EPS2D, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
 
 TILE = 16
-"""Pixels: the side of a tile."""
+"""Side of a tile in pixels."""
 CHUNK = 256
-"""Gaussians of one tile that are blended together; bounds memory at TILE^2 * CHUNK numbers an intermediate."""
+"""Gaussians of one tile that are blended together; an intermediate has at most TILE^2 * CHUNK numbers."""
 BOUND_SLACK = 0.01
-"""Pixels added to a footprint, so that rounding in the bound never decides what MIN_ALPHA has to decide."""
+"""Pixels added to a footprint, so that rounding never culls what reaches MIN_ALPHA."""
 
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Gaussians on the image. Rows with visible False hold finite numbers without meaning.
+    """Gaussians on the image. The other numbers of a row with visible False are finite but meaningless.
 
     mean2d       [N, 2]  x, y in pixels
     conic        [N, 3]  (a, b, c) of the inverse covariance [[a, b], [b, c]], 1 / pixels^2
@@ -44,10 +44,10 @@ class Projected:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Which Gaussians touch which tile; tiles row by row, each list in blending order.
+    """The Gaussians that touch each tile; tiles row by row, each list in blending order.
 
-    gaussian  [M] int64 indices, the lists one after the other
-    counts    length of each tile's list, rows * columns of them
+    gaussian  [M] int64 indices, the tiles' lists one after the other
+    counts    length of each tile's list, for rows * columns tiles
     """
 
     rows: int
@@ -64,7 +64,7 @@ def rasterize(
     colour: Tensor,  # [N, 3]
     camera: Camera,
 ) -> Rendered:
-    """Renders N Gaussians as intrasplat.splat says, in the dtype of mean.
+    """Render N Gaussians as camera.py defines it, in the dtype of mean.
 
     Raises:
         ValueError: shapes that do not belong together.
@@ -85,11 +85,11 @@ def check_shapes(mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tenso
 
 
 def project(mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, camera: Camera) -> Projected:
-    """Gaussians of the world -> Gaussians of the image."""
+    """Project Gaussians from the world onto the image (camera.py, "Projection" and "Cull")."""
     pose = camera.pose(mean)
     x, y, depth = (mean @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     in_front = depth > NEAR
-    z = torch.where(in_front, depth, torch.ones_like(depth))  # keeps what is culled finite, in its gradients too
+    z = torch.where(in_front, depth, torch.ones_like(depth))  # keeps values and gradients of culled ones finite
 
     mean2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
     half = pose[:3, :3] @ rotation(quaternion) * scale[:, None, :]  # W R S: [N, 3, 3]
@@ -106,7 +106,7 @@ def project(mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, ca
 
 
 def _low_pass(mean: Tensor, z: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """What is added to the variances along x and y, [N] each."""
+    """The terms added to the variances along x and y, [N] each: 0.3 m_x^2 and 0.3 m_y^2."""
     row = mean.new_tensor(camera.recorded_depth)
     nearer = (mean @ row[:3] + row[3]) / z
     x, y = (EPS2D * torch.clamp(enlarged * nearer, min=1.0) ** 2 for enlarged in camera.enlarged)
@@ -125,7 +125,7 @@ def rotation(quaternion: Tensor) -> Tensor:
 
 
 def projection_jacobian(x_over_z: Tensor, y_over_z: Tensor, z: Tensor, camera: Camera) -> Tensor:
-    """[N, 2, 3] derivative of the pixel by the camera's x, y, z, taken inside the limits of Camera.ratio_limits."""
+    """[N, 2, 3] J, the derivative of the pixel by the camera's x, y, z, with u and v clamped to Camera.ratio_limits."""
     x_limits, y_limits = camera.ratio_limits()
     u, v = torch.clamp(x_over_z, *x_limits), torch.clamp(y_over_z, *y_limits)
     zero = torch.zeros_like(z)
@@ -135,7 +135,7 @@ def projection_jacobian(x_over_z: Tensor, y_over_z: Tensor, z: Tensor, camera: C
 
 
 def _half_extent(variance_x: Tensor, variance_y: Tensor, opacity: Tensor) -> Tensor:
-    """[N, 2]: the box around the ellipse opacity exp(-d^T conic d / 2) = MIN_ALPHA."""
+    """[N, 2] half-size of the bounding box of the ellipse opacity exp(-d^T conic d / 2) = MIN_ALPHA, pixels."""
     squared = 2 * torch.log(torch.clamp(opacity / MIN_ALPHA, min=1.0))
     return torch.sqrt(squared[:, None] * torch.stack([variance_x, variance_y], dim=-1)) + BOUND_SLACK
 
@@ -148,7 +148,7 @@ def _meets_image(mean2d: Tensor, half_extent: Tensor, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def bin_tiles(projected: Projected, camera: Camera) -> Tiles:
-    """Sorts the visible Gaussians by depth and lists them for every tile they may touch."""
+    """Sort the visible Gaussians by depth, and list them for every tile they may touch."""
     by_depth = torch.argsort(projected.depth, stable=True)
     drawn = by_depth[projected.visible[by_depth]]
     low = projected.mean2d[drawn] - projected.half_extent[drawn]
@@ -163,7 +163,7 @@ def bin_tiles(projected: Projected, camera: Camera) -> Tiles:
 
 
 def blend(projected: Projected, colour: Tensor, tiles: Tiles, camera: Camera) -> Rendered:
-    """Blends every tile's Gaussians front to back."""
+    """Blend every tile's Gaussians front to back."""
     features = torch.cat([colour, projected.depth[:, None], torch.ones_like(projected.depth)[:, None]], dim=1)
     splats = torch.cat([projected.mean2d, projected.conic, projected.opacity[:, None], features], dim=1)
     of_tile = torch.split(splats[tiles.gaussian], tiles.counts)  # one gather, so that its gradient is one scatter
@@ -179,7 +179,7 @@ def blend(projected: Projected, colour: Tensor, tiles: Tiles, camera: Camera) ->
 
 
 def _blend_tile(splats: Tensor, top: int, left: int, camera: Camera) -> Tensor:
-    """One tile's sum w f, f = (colour, z, 1), from its splats [*, 11] in blending order: [rows, columns, 5]."""
+    """[rows, columns, 5] sum w f of one tile, f = (colour, z, 1), from its splats [*, 11] in blending order."""
     rows, columns = min(TILE, camera.height - top), min(TILE, camera.width - left)
     i, j = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     pixel = torch.stack([left + j.flatten() + 0.5, top + i.flatten() + 0.5], dim=-1).to(splats)  # [P, 2]
@@ -197,7 +197,7 @@ def _blend_tile(splats: Tensor, top: int, left: int, camera: Camera) -> Tensor:
 
 
 def _alpha(pixel: Tensor, mean2d: Tensor, conic: Tensor, opacity: Tensor) -> Tensor:
-    """[P, Q] alpha of each Gaussian at each pixel centre, clamped and cut, before the rule of the full pixel."""
+    """[P, Q] alpha of each Gaussian at each pixel centre, clamped to MAX_ALPHA and 0 below MIN_ALPHA."""
     dx, dy = (pixel[:, None, :] - mean2d[None, :, :]).unbind(-1)
     a, b, c = conic.unbind(-1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
@@ -206,10 +206,10 @@ def _alpha(pixel: Tensor, mean2d: Tensor, conic: Tensor, opacity: Tensor) -> Ten
 
 
 def _exclusive_product(factors: Tensor) -> Tensor:
-    """[P, Q] -> [P, Q]: product of the factors before each column.
+    """[P, Q] product of the factors before each column.
 
-    Without the stop the products behind a full pixel only get smaller, so the first column below MIN_TRANSMITTANCE is
-    the same as with it, and every later one is below it too.
+    The products ignore that a full pixel stops. They never grow, so the first column below MIN_TRANSMITTANCE is the
+    same as with the stop, and every later one is below it too.
     """
     shifted = torch.cat([torch.ones_like(factors[:, :1]), factors[:, :-1]], dim=1)
     return torch.cumprod(shifted, dim=1)

@@ -1,4 +1,4 @@
-"""What a training step takes and returns, on every device.
+"""The inputs and results of a training step, for every device.
 
 Symbols: H W pixels; stride = W rounded up to whole vectors of the CPU's kernels.
 """
@@ -18,7 +18,7 @@ from intrasplat.splat.loss import LossSettings
 
 
 def camera_vector(camera: Camera) -> NDArray[np.float64]:
-    """[CAMERA] numbers of a camera as the kernels read it (intrasplat/splat/layout.py)."""
+    """[CAMERA] float64: the camera as the kernels read it (intrasplat/splat/layout.py)."""
     given = camera.camera_from_world
     matrix = given.detach().double().cpu().numpy() if isinstance(given, torch.Tensor) else given
     pose = np.asarray(matrix, np.float64)[:3].ravel()
@@ -32,14 +32,14 @@ def image_size(camera: NDArray[np.float64]) -> tuple[int, int]:
 
 
 def camera_centre(camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3] where the camera of a camera vector is in the world."""
+    """[3] world position of the camera of a camera vector, units."""
     pose = camera[POSE:].reshape(3, 4)
     return np.asarray(-pose[:, :3].T @ pose[:, 3])
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a rendered frame is compared with, its rows padded to the stride."""
+    """The frame that a render is compared with, its rows padded to the stride."""
 
     rgb: NDArray[np.uint8]  # [3 * H * stride]
     weight: NDArray[np.uint8]  # [H * stride], 255 = tissue
@@ -48,11 +48,11 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class TrainingFrame:
-    """One frame to train on. It is equal to itself alone, so a device may keep what it copied of it by the object.
+    """One frame to train on. It equals only itself, so a device may cache its copy of the target by the object.
 
     camera           camera_vector, in optimiser units
     t                model time
-    make_target      gives the target, on the host
+    make_target      computes the target, on the host
     tissue_pixels    how many pixels are tissue
     measured_pixels  how many of those have a depth
     """
@@ -65,11 +65,11 @@ class TrainingFrame:
 
     @property
     def target(self) -> Target:
-        """What the render is compared with, made anew."""
+        """The target, computed again at each access."""
         return self.make_target()
 
     def loss_settings(self, loss: LossSettings) -> NDArray[np.float32]:
-        """[5] as the blend applies them per pixel (cpu/blend.py): each loss is a mean over its valid pixels."""
+        """[5] the factors of the blend (cpu/blend.py, _loss): each loss is a mean over its valid pixels."""
         return np.array(
             [
                 loss.colour_weight / (3 * max(self.tissue_pixels, 1)),
@@ -84,9 +84,9 @@ class TrainingFrame:
 
 @dataclass(frozen=True)
 class StepSums:
-    """Sums over the tissue pixels, before the update, of the steps since the last answer; one step on the CPU.
+    """Sums over the tissue pixels, before the update, of the steps since the last StepSums; on the CPU of one step.
 
-    visible  Gaussians in view of any frame of a step; of several steps the least
+    visible  Gaussians in view of any frame of a step; the least of several steps
     """
 
     colour_l1: float

@@ -1,5 +1,5 @@
-"""A clip with depth in; a trained run out, and its scene in whole numbers.
+"""Training: a clip with depth becomes a trained run, and its model is quantised for storage.
 
-Verbs: prepare.prepare builds a run from a Setup, loop.train is the only training loop, resume.resume continues a
-stopped run, rate_distortion.round_model chooses how coarse a scene may be stored.
+Functions: prepare.prepare builds a run from a Setup, loop.train is the only training loop, resume.resume continues a
+stopped run, rate_distortion.round_model chooses the step of quantisation.
 """

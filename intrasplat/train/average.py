@@ -13,7 +13,7 @@ PREFIX = "average."
 
 
 class RunningMean:
-    """Sums of a model's parameters, under their names and on their device, or, where they are large, in files."""
+    """Sums of a model's parameters, by name. They lie on the parameters' device, or in files where they are large."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -39,11 +39,11 @@ class RunningMean:
         return {PREFIX + name: total.tensor() for name, total in self._total.items()}
 
     def let_go(self) -> None:
-        """Take sums that lie in files out of memory: call it while arrays() are read."""
+        """Release the memory of sums that lie in files; call it while arrays() are read."""
         for total in self._total.values():
             total.let_go()
 
     def load_arrays(self, arrays: Mapping[str, Tensor], count: int) -> None:
-        """Load what arrays() gave from a dict that may also hold other arrays."""
+        """Load what arrays() returned; `arrays` may hold other names too. count: models added so far."""
         self.count = count
         self._total = {name.removeprefix(PREFIX): Aside(a) for name, a in arrays.items() if name.startswith(PREFIX)}

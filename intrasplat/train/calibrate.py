@@ -1,4 +1,4 @@
-"""The first steps of a new model: to compile its kernels, and to time how many fit into a budget."""
+"""The first steps of a new model: they compile its kernels and measure how many steps fit into a budget."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from intrasplat.train.run import Run
 from intrasplat.train.schedule import Schedule
 
 UNTIMED_STEPS, TIMED_STEPS = 3, 12
-"""The median of the timed steps counts: the first steps fill caches, and other processes come and go. Where the device
-does not answer every step, so many times the steps from one answer to the next."""
+"""Steps before timing starts, which fill caches, and steps that are timed. Their median counts, because other processes
+disturb single steps. Where the device answers every k-th step only, both numbers count answers."""
 GROWTH_ALLOWANCE = 1.15
-"""Later steps are slower, because Gaussians grow. A judgement: it differs from clip to clip."""
+"""Later steps are slower, because Gaussians grow. The factor is an estimate: it differs from clip to clip."""
 
 
 @contextmanager
 def taken_back(model: Model, beta1: float) -> Iterator[None]:
-    """Steps of a model that has made none yet, with such a beta1: afterwards it is as it was."""
+    """Undo, at the end of the with statement, all steps that a new model made in it with this beta1."""
     stored = {name: values.clone() for name, values in model.parameters().items()}
 
     def restore() -> None:
@@ -36,15 +36,15 @@ def taken_back(model: Model, beta1: float) -> Iterator[None]:
             else:
                 values.zero_()
 
-    restore()  # touches the moments' memory once: the first touch of a page costs as much as a step
+    restore()  # touches the moments' memory before timing: the first access to a page costs as much as a step
     yield
     restore()
 
 
 def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
-    """Make each kind of step and render of a new run once, on a device whose kernels are compiled for the very model.
+    """Run each kind of step and render of a new run once, so that the device compiles its kernels for this model.
 
-    Returns seconds; on_progress receives the share done, in (0, 1].
+    Returns the seconds it took; on_progress receives the share done, in (0, 1].
     """
     start = time.perf_counter()
     model, preset = run.model, run.preset
@@ -69,14 +69,14 @@ def warm_up(run: Run, on_progress: Callable[[float], None]) -> float:
 
 
 def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = None) -> Schedule:
-    """The schedule of a new run that ends with its budget: iterations are as long as the first.
+    """The schedule of a new run whose iterations fit into its budget. Its first steps are timed to predict the others.
 
-    budget_s includes what the run's clock shows already. There are at least as many iterations as show every training
-    frame once. Where every step is answered the timed ones are the run's first iterations. A device that answers late
-    would have made hundreds of them, so there they are taken back.
+    budget_s includes what the run's clock shows already. The iterations show every training frame at least once. Where
+    the device answers every step, the timed steps are the run's first iterations. A device that answers late makes
+    hundreds of them, so there they are undone.
 
     Raises:
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop() returned True.
         TrainingDiverged: a loss is not finite, or no Gaussian is visible.
     """
     model, steps_an_answer = run.model, run.model.answers_every

@@ -1,4 +1,4 @@
-"""Adaptive density, as published: Gaussians whose projection the loss pulls hard are split, transparent ones dropped.
+"""Adaptive density control, as published: split Gaussians with a large image gradient, remove transparent ones.
 
 Symbols: N Gaussians. g_k = |dL/dmean2d| of step k in NDC, with the loss of intrasplat/splat/loss.py (tissue means).
 Source: Kerbl et al., 3D Gaussian Splatting (2023), section 5, with the settings Deform3DGS trains with.
@@ -28,7 +28,7 @@ SPLIT_SHRINK = 0.8
 
 
 class Densifier:
-    """Gathers every Gaussian's gradients on the model's device, and edits the model when the time has come."""
+    """Sums every Gaussian's gradients on the model's device, and splits and prunes the model when that is due."""
 
     def __init__(self, settings: DensifySettings, count: int) -> None:
         self.settings = settings
@@ -52,7 +52,7 @@ class Densifier:
         if model.count != len(self._steps_seen):
             raise ValueError(f"statistics are of {len(self._steps_seen)} Gaussians, the model has {model.count}")
         visible = model.visible
-        # New and stored statistics lie on the host.
+        # New statistics, and those of a resume file, lie on the host.
         self._gradient_sum, self._steps_seen = (
             each.to(visible.device) for each in (self._gradient_sum, self._steps_seen)
         )
@@ -83,7 +83,7 @@ class Densifier:
         return {"densify.gradient_sum": self._gradient_sum, "densify.steps_seen": self._steps_seen}
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Take back what arrays() gave; the number of Gaussians becomes the stored one.
+        """Load what arrays() returned; the number of Gaussians becomes the stored one.
 
         Raises:
             ValueError: the two arrays differ in length.
@@ -99,9 +99,9 @@ class Densifier:
 def successors(
     settings: DensifySettings, gradient: NDArray[np.floating], opacity_logit: NDArray[np.floating]
 ) -> tuple[NDArray[np.int64], int]:
-    """Which Gaussians [M] the next ones are made of, parents split_into times; and how many, the last, are children.
+    """The next Gaussians as indices [M] of those they copy, and how many of them are children.
 
-    The others keep their order. Empty if all are transparent.
+    Survivors come first, in their order. Then come the parents, split_into times. Empty if all are transparent.
 
     Args:
         gradient: [N], NDC; the mean gradient of each since the last densification.
@@ -118,15 +118,16 @@ def successors(
 
 
 def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.floating], room: int) -> NDArray[np.int64]:
-    """At most room of the candidates, those with the greatest gradients, ascending."""
+    """The indices of the `room` candidates with the greatest gradients, or of all if they are fewer; ascending."""
     order = np.argsort(-gradient[candidates], kind="stable")
     return np.sort(candidates[order[:room]])
 
 
 def _replace(model: Model, columns: NDArray[np.int64], born: int, children: int, random: np.random.Generator) -> None:
-    """Make the Gaussians of these columns, the last so many children: smaller, drawn from the parent's own density.
+    """Replace the model's Gaussians by those of these columns. The last `born` are children.
 
-    Everything else is the parent's: rotation, opacity, colour, motion. Adam's moments of the children start at 0.
+    A child is smaller than its parent, and its centre is drawn from the parent's own density. It keeps the parent's
+    rotation, opacity, colour and motion. Its moments of Adam start at 0.
     """
     survivors = len(columns) - born
     model.take(columns, np.arange(len(columns)) >= survivors)

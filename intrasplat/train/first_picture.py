@@ -1,4 +1,4 @@
-"""A scene of one moment: its tissue's points as Gaussians at rest, to be looked at until there is a model."""
+"""A scene of one moment: its tissue's points as Gaussians without motion, to show until there is a model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from intrasplat.train.targets import units_per_mm
 POINTS = 20_000
 OPACITY = 0.95
 WIDER = 0.8
-"""Standard deviation of a Gaussian over the distance to its neighbours: no gaps show from some degrees aside."""
+"""Standard deviation of a Gaussian over the distance to its neighbours: views from a few degrees aside show no gaps."""
 
 
 def first_picture(moment: DepthClip) -> TrainedScene:

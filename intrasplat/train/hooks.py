@@ -32,10 +32,10 @@ class RenderedFrame:
 class TrainingHooks(Hooks):
     """Hooks of a whole reconstruction. None of them changes the trained model.
 
-    wants_snapshot is asked between training steps; after a yes, on_snapshot receives the scene as it is then and the
-    number of iterations that made it. on_first_picture receives a scene of one moment while the clip is still being
-    prepared; None: nobody wants it. on_clip receives the clip once it is prepared. on_held_out receives each held-out
-    frame that is rendered for a score during training, with its index; training's clock is paused meanwhile.
+    wants_snapshot is called between training steps. If it returns True, on_snapshot receives the scene as it is then
+    and the number of iterations so far. on_first_picture receives a scene of one moment while the clip is still being
+    prepared; None skips it. on_clip receives the prepared clip. on_held_out receives the index and the render of each
+    held-out frame that is scored during training; the training clock is paused meanwhile.
     """
 
     wants_snapshot: Callable[[], bool] = never

@@ -1,7 +1,7 @@
 """The one training loop. prepare.py builds what it needs; Run holds all of its state.
 
-Nothing in a schedule reads the clock: on one device the same seed and iterations give the same bits, and a resumed run
-gives those of an uninterrupted one.
+No schedule reads the clock. So on one device the same seed and iterations give a bit-identical model, also if the run
+was interrupted and resumed.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from intrasplat.train.schedule import validation_frames
 from intrasplat.train.scoring import HeldOutScore
 
 CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600, 1200, 1800)
-"""Training times at which held-out frames are scored; the clock is paused meanwhile."""
+"""Seconds of training after which held-out frames are scored; the clock is paused meanwhile."""
 UNSCORED_S = 2.0
-"""After the first step: a score takes a third of a second of whoever waits, and would tell little so soon."""
+"""Seconds at the start without a score, which would delay the user by a third of a second and say little so early."""
 REPORT_EVERY_S = 0.25
 TOLD_AFTER_S = 1.0
-"""Of training: the first steps, beside which the state is kept, tell little of how long the others take."""
+"""Seconds of training after which the remaining time is reported. The run's state is written to disk during the first
+steps, so they do not show how long the others take."""
 
 
 def step(run: Run, iteration: int) -> None:
-    """One iteration of the model.
+    """Make one iteration of the model, and check its loss.
 
     Raises:
         TrainingDiverged: the loss is not finite, or no Gaussian is visible. A GPU model reports its losses some steps
@@ -47,7 +48,7 @@ def step(run: Run, iteration: int) -> None:
 
 
 def check_sums(sums: StepSums | None, iteration: int) -> None:
-    """Check the losses of the steps that the model has answered for, if any.
+    """Check the losses of the steps that the model has reported; None: it has reported none.
 
     Raises:
         TrainingDiverged: a loss is not finite, or no Gaussian is visible.
@@ -68,16 +69,16 @@ def train(
     copy_scene: Callable[[], TrainedScene] | None = None,
     keep: Callable[[Run], None] = ignore,
 ) -> None:
-    """Take run from its iteration to its last.
+    """Train run from its current iteration to its last.
 
     Args:
-        clock: t_train_s so far; paused while held-out frames are scored.
-        evaluate: the score of the held-out frames, NaN without any.
-        copy_scene: the scene as the model is now, for hooks.on_snapshot; None shows none.
-        keep: called before every step; may store the run, as it is after a full iteration.
+        clock: measures t_train_s; paused while held-out frames are scored.
+        evaluate: returns the score of the held-out frames, NaN without any.
+        copy_scene: returns the scene of the current model, for hooks.on_snapshot; None: there are no snapshots.
+        keep: called before every step, when run is between two iterations; may store it.
 
     Raises:
-        Cancelled: hooks.should_stop said so; run is as it was after its last full iteration and can be resumed.
+        Cancelled: hooks.should_stop() returned True; run is as after its last full iteration and can be resumed.
         TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
     """
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s + UNSCORED_S]
@@ -105,7 +106,7 @@ def train(
 
 
 def _advance(run: Run) -> int:
-    """The next iteration and what follows it, densification or the end of a cycle; returns its number."""
+    """Make the next iteration, then densify or end the cycle if that is due; returns the iteration's number."""
     iteration = run.iteration + 1
     step(run, iteration)
     run.iteration = iteration
@@ -118,7 +119,7 @@ def _advance(run: Run) -> int:
 
 
 def _end_cycle(run: Run, iteration: int) -> None:
-    """Average the last models of a cycle; their mean ends it, and is scored while early stopping may follow from it."""
+    """Average the last models of a cycle, and continue from their mean. Score it while early stopping is undecided."""
     if run.schedule.averages(iteration):
         run.average.add(run.model.parameters())
     if run.average.count and iteration in run.schedule.ends:
@@ -139,7 +140,7 @@ def _validation_psnr(run: Run) -> float:
 
 
 def _check_finite(run: Run) -> None:
-    """Check the parameters themselves: a Gaussian that is not a number is not drawn, so the loss does not show it."""
+    """Check the parameters themselves: a Gaussian with NaN is not drawn, so the loss does not show it."""
     arrays = state_of(run.model, run.preset.rates.beta1)
     broken = [name for name, values in arrays.items() if not is_finite(values)]
     if broken:
@@ -147,7 +148,7 @@ def _check_finite(run: Run) -> None:
 
 
 def _score(run: Run, clock: Stopwatch, evaluate: Callable[[], HeldOutScore]) -> None:
-    check_sums(run.model.wait(), run.iteration)  # steps that still run do not count as scoring
+    check_sums(run.model.wait(), run.iteration)  # the GPU's pending steps count as training, not as scoring
     t_train_s, t_post_s = clock.elapsed_s, time.time() - run.setup.accepted_at_s
     with clock.paused():
         score = evaluate()

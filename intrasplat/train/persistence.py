@@ -1,6 +1,6 @@
-"""Keep what a killed run goes on from: the clip with depth, and the run's state about every PERIOD_S.
+"""Store what a killed run resumes from: the clip with depth, and the run's state about every PERIOD_S.
 
-What lies in the folder is always whole. A disk without room costs what would have been kept, never the run.
+The files in the folder are always complete. If the disk is full, nothing is stored and the run goes on.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from intrasplat.train.resume import begin_save
 from intrasplat.train.run import Run
 
 PERIOD_S = 10.0
-"""Seconds of training between two states that are kept."""
+"""Seconds of training between two stored states."""
 MAX_SHARE = 0.05
-"""Of the time: where keeping a state takes long, as it does for a long clip, states are kept less often."""
+"""Largest share of the time spent on storing states. A long clip's state takes long, so it is stored less often."""
 NICENESS = 10
-"""Of the threads that write: copying a clip takes half a second of a core while the start of training needs both."""
+"""Niceness of the writing threads: copying a clip takes half a second of a core while training needs all cores."""
 SPARE_BYTES = 1 << 30
-"""Nothing is kept that would leave less room on the disk than this."""
+"""Nothing is stored that would leave less free disk space than this."""
 
 logger = logging.getLogger(__name__)
 
@@ -46,8 +46,8 @@ def keeping(folder: Path, *, forgets: bool) -> Iterator[Keeper]:
     """A keeper of one run; when the with statement ends, everything is on disk.
 
     Args:
-        forgets: whether nothing stays in the folder of a run that has ended well, and nothing of its own of one that
-            ended with an error. One that was cancelled can go on.
+        forgets: whether to remove the stored files at the end: all of them after success, and after an error those
+            that this keeper wrote. After Cancelled they stay, so that the run can be resumed.
     """
     keeper = Keeper(folder)
     try:
@@ -63,9 +63,9 @@ def keeping(folder: Path, *, forgets: bool) -> Iterator[Keeper]:
 
 
 class Keeper:
-    """Keeps one run in a folder. Threads write and wait for the disk: one for the clip, one for a state at a time.
+    """Stores one run in a folder. Two threads write and wait for the disk: one the clip, one a state at a time.
 
-    written: those of KEPT that this has written
+    written: names of KEPT that this keeper has written
     """
 
     def __init__(self, folder: Path) -> None:
@@ -77,19 +77,19 @@ class Keeper:
         self.written: set[str] = set()
 
     def close(self) -> None:
-        """Wait until everything is on disk, and give up a clip that is still being written."""
+        """Wait until everything is on disk. A clip that is still being written is abandoned."""
         self._ending.set()
         self._threads.shutdown()
 
     def forget(self, names: Collection[str]) -> None:
-        """Remove these of KEPT; call it after close()."""
+        """Remove the files of these names of KEPT; call it after close()."""
         if RESUME_FILE in names:
             (self.folder / RESUME_FILE).unlink(missing_ok=True)
         if PREPARED in names:
             shutil.rmtree(self.folder / PREPARED, ignore_errors=True)
 
     def clip(self, request: ReconstructionRequest, open_with_depth: Callable[[], DepthClip]) -> DepthClip:
-        """The kept clip of the request if there is one, else open_with_depth()'s, which is kept from now on."""
+        """The stored clip of the request if there is one, else that of open_with_depth(), which is then stored."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if isinstance(request.clip, DepthClip):
             return open_with_depth()
@@ -104,8 +104,8 @@ class Keeper:
         return clip
 
     def keep_if_due(self, run: Run) -> None:
-        """Keep the run's state at its start, unless that was a kept state, and after each PERIOD_S. Call it between two
-        steps."""
+        """Store the run's state if that is due. Call it between two steps: it is due at the first call, unless the run
+        was resumed, and then every PERIOD_S."""
         now_s = time.monotonic()
         if self._due_s is None:
             self._due_s = now_s + PERIOD_S if (self.folder / RESUME_FILE).exists() else now_s
@@ -115,7 +115,7 @@ class Keeper:
             self._due_s = now_s + max(PERIOD_S, took_s / MAX_SHARE)
 
     def keep(self, run: Run) -> None:
-        """Keep the run's state as it is now; close() waits for it. A clip that is still being written is given up."""
+        """Store the run's state as it is now; close() waits for it. A clip that is still being written is abandoned."""
         self._ending.set()
         if self._state is not None:
             self._state.exception()
@@ -151,13 +151,13 @@ class Keeper:
 
 
 def _give_way() -> None:
-    """Lower the priority of the calling thread; elsewhere than on Linux it would be the whole process's."""
+    """Lower the priority of the calling thread. Only on Linux: elsewhere nice() is for the whole process."""
     if sys.platform == "linux":
         os.nice(NICENESS)
 
 
 def _identity(request: ReconstructionRequest) -> str:
-    """What the clip is made of: name, size and time of change of every file, the options, and the program."""
+    """A hash that identifies the prepared clip: name, size and mtime of every file, the options, our version."""
     given = (request.clip, request.right, request.calibration, request.masks, request.segmenter)
     found = hashlib.sha256(f"{version('intrasplat')} {request.options.model_dump_json()}".encode())
     for place, path in enumerate((*given, *registered_files())):

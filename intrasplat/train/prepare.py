@@ -1,4 +1,4 @@
-"""A clip with depth becomes a run that can be trained: points, their motion, a model, its targets, its length."""
+"""Prepare a clip with depth for training: points, their motion, a model, its targets and its schedule."""
 
 from __future__ import annotations
 
@@ -24,12 +24,11 @@ from intrasplat.train.targets import TrainingFrames, units_per_mm
 
 
 def prepare(setup: Setup) -> Run:
-    """The run before its first step, or after those that tell its length. Compiling a GPU's kernels does not count as
-    training: the clock is paused.
+    """The run before its first step or, with a budget in seconds, after the first steps, which are timed.
 
     Raises:
         InputError: no training frame has valid depth.
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop() returned True.
     """
     clip, train, timings = setup.clip, setup.split.train, setup.timings
     scale = units_per_mm(clip, train)
@@ -64,7 +63,7 @@ def examine_device(setup: Setup) -> None:
 
 
 def frames_of(setup: Setup, scale: float) -> list[TrainingFrames]:
-    """The targets of each eye that teaches, left first. scale: optimiser units a millimetre."""
+    """The targets of each eye that is trained on, left first. scale: optimiser units per millimetre."""
     with setup.timings.measure("targets_s"):
         eyes = zip(setup.teaching_eyes, setup.sides, strict=False)
         return [TrainingFrames(eye, setup.split.train, scale, side) for eye, side in eyes]
@@ -73,11 +72,11 @@ def frames_of(setup: Setup, scale: float) -> list[TrainingFrames]:
 def begun(
     setup: Setup, frames: Sequence[TrainingFrames], model: Model, preset: Preset, chosen: tuple[Notice, ...], box: Box
 ) -> Run:
-    """The run of a model that has made no step, and no schedule yet. A GPU compiles what this very model needs.
+    """The run of a model that has made no step; it has no schedule yet. A GPU compiles the kernels of this model here.
 
     Args:
-        frames: of each eye that teaches.
-        preset: settled.
+        frames: the targets of each eye that is trained on.
+        preset: with all that it leaves to the scene filled in (start.settled).
     """
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
     run = Run(setup, model, frames[0], preset, Schedule(planned=0), box, densifier=densifier, chosen=chosen)
@@ -100,7 +99,7 @@ def _tracks(setup: Setup) -> list[Tracks]:
 
 
 def _schedule(run: Run) -> Schedule:
-    """How many iterations are made and how rates fall in them. Where a budget decides, the first are made here."""
+    """The number of iterations and how rates fall. With a budget in seconds, it makes and times the first steps."""
     setup, preset = run.setup, run.preset
     fixed = setup.fixed_iterations
     if fixed is not None:

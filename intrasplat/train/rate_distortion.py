@@ -29,30 +29,30 @@ from intrasplat.train.targets import TrainingFrames
 Picture = tuple[TrainingFrames, int]
 """An eye and one of its training frames."""
 TOLERANCE_DB = 0.1
-"""psnr_tissue that a stored scene may lose on its training frames. Held-out frames of a real clip lost 0.06 dB."""
+"""The most psnr_tissue that a stored scene may lose on training frames. Held-out frames of a real clip lost 0.06 dB."""
 SENSITIVITY_FRAMES = 12
 """Training frames in which the sensitivity to each number is measured."""
 SCORED_FRAMES = 8
 MAX_TRIALS = 6
 ENOUGH = 0.85
-"""A trial that uses this share of the tolerance is the last."""
+"""The trials end with one that uses at least this share of the tolerance."""
 MIN_STEP, MAX_FIRST_STEP = 1e-5, 4e-3
-"""Of white."""
+"""Colours; 1 is white."""
 FIRST_STEP = 0.36
-"""Of the picture's RMS error over the root of how many numbers a Gaussian has: what scenes of 29 to 40 dB took, give or
-take a sixth."""
+"""The first step tried, as a share of the picture's RMS error over the square root of the numbers per Gaussian. Scenes
+of 29 to 40 dB ended within a sixth of it."""
 NOISE_STEP = 4e-4
-"""Of white: the rounding for which depth is measured."""
+"""Colour, 1 is white: the step at which the sensitivity to depth is measured."""
 RATE_EXPONENT = 1.7
-"""The distortion grows about as this power of the step (1.2 to 2.2 were measured): as its square for fine steps, less
-where most numbers are 0 already."""
+"""The distortion grows about as this power of the step (1.2 to 2.2 were measured): as its square for fine steps, more
+slowly where most numbers are 0 already."""
 SAFETY = 0.95
-"""The step that should just keep the tolerance is multiplied by it, so that the next trial most likely does."""
+"""Factor on the predicted step, so that the next trial most likely stays within the tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
 class QuantizedScene:
-    """A scene as it will be read back, and the price.
+    """A scene as it will be read back, and what quantisation cost.
 
     scene        the model after rounding, its numbers in scene.stored
     step         mean change of the picture by one step of a number; 1 is from black to white
@@ -78,7 +78,7 @@ class QuantizedScene:
 
     @property
     def measurements(self) -> dict[str, float]:
-        """The same as numbers."""
+        """Step and loss for the report, by name."""
         return {"stored_step": self.step, "stored_loss_db": self.loss_db}
 
 
@@ -92,8 +92,7 @@ class RoundedModel:
     frames: int
 
     def stored(self, scene: TrainedScene) -> QuantizedScene:
-        """The model as it will be read back, and what else the scene holds. It uses the rounding up; the float model
-        is not needed any more."""
+        """The scene with the model as it will be read back. It consumes the rounding and needs no float model."""
         compact = self.rounding.compact()
         stored = compact.tensors()
         gaussians, deformation, seen = compact.model()
@@ -109,10 +108,12 @@ def round_model(
     device: Device = CPU,
     on_step: Callable[[], None] = lambda: None,
 ) -> RoundedModel | None:
-    """The model, of which the scene was made, in whole numbers. The scene's motion needs no weights. on_step is called
-    between two parts of the work.
+    """The model in whole numbers; None if it is stored as floats, or if no trial stayed within the tolerance.
 
-    None for a model that is stored as floats, or if no trial kept the tolerance.
+    Args:
+        scene: of this model; its motion needs no weights.
+        eyes: targets of the eyes that were trained on.
+        on_step: called between two parts of the work.
     """
     pictures = [(frames, index) for index in eyes[0].indices for frames in eyes if frames.eye.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
@@ -137,16 +138,16 @@ def round_model(
 
 
 def _first_step(prepared: Prepared, exact_db: float) -> float:
-    """The step to try first: each number adds an error in proportion to it, and those of the picture may grow alike."""
+    """The step to try first: in proportion to the picture's error, over the root of the numbers per Gaussian."""
     numbers = prepared.state.shape[1] + sum(motion.shape[1] for motion in prepared.motion)
     error = 10 ** (-exact_db / 20)
     return min(max(FIRST_STEP * error / math.sqrt(numbers), 2 * MIN_STEP), MAX_FIRST_STEP)
 
 
 def _coarsest(loss_of: Callable[[float], float], first: float, tolerance_db: float) -> tuple[float, float] | None:
-    """The coarsest step tried that kept the tolerance, and its loss in dB.
+    """The coarsest step tried that stayed within the tolerance, and its loss in dB; None if none did.
 
-    Each trial predicts the step that should just keep the tolerance.
+    Each trial predicts the step that just uses the tolerance.
     """
     step, good, bad, best = first, MIN_STEP, math.inf, None
     for _ in range(MAX_TRIALS):
@@ -172,7 +173,7 @@ def _added_error(loss_db: float) -> float:
 
 
 def _spread(pictures: Sequence[Picture], count: int) -> list[Picture]:
-    """At most count pictures, evenly spread over the clip; of two eyes in turn."""
+    """At most count pictures, evenly spread over the clip."""
     return [pictures[place] for place in spread(range(len(pictures)), count)]
 
 
@@ -218,11 +219,11 @@ def _sensitivity(model: Model, pictures: Sequence[Picture], bases: int) -> NDArr
 
 
 def _depth_over_place(model: Model, picture: Picture, across: float, bases: int) -> float:
-    """How much more an error along the first camera's axis changes a picture than one across it, squared.
+    """The squared change of a picture by an error along the first camera's axis, over that by one across the axis.
 
     `across` is the mean sensitivity to an error across the axis.
     """
-    size = NOISE_STEP * math.sqrt(bases / (12 * across))  # so many numbers of a channel add their errors at any time
+    size = NOISE_STEP * math.sqrt(bases / (12 * across))  # at any time a channel adds the errors of `bases` numbers
     noise = size * np.random.default_rng(0).standard_normal(model.count).astype(np.float32)
     depth = model.parameters()["canonical"][2]
     exact_depth = depth.clone()

@@ -1,4 +1,4 @@
-"""What to reconstruct, and how."""
+"""The request that intrasplat/pipeline.py takes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from intrasplat.options import ReconstructionOptions
 
 @dataclass(frozen=True)
 class ReconstructionRequest:
-    """What to reconstruct, and how.
+    """A clip to reconstruct, and all options of its reconstruction.
 
     clip           a path, or a clip with depth in memory, which is neither decoded nor matched
-    seconds        by stage, what was spent on such a clip, for the report
-    own_preset     trains in place of the preset that options name
+    seconds        seconds by stage already spent on such a clip, for the report
+    own_preset     used instead of the preset that options name
     accepted_at_s  Unix time at which the clip was accepted, for t_post_s; None means now
     segmenter      an ONNX file that finds the instruments of clips without masks (intrasplat/instruments/segmenter.py)
     limits         what this machine accepts; None means what its memory allows
@@ -38,5 +38,5 @@ class ReconstructionRequest:
 
     @property
     def preset(self) -> Preset:
-        """The preset that trains. Raises InputError if options name none that there is."""
+        """The preset to train with. Raises InputError if options name an unknown one."""
         return self.own_preset or preset_named(self.options.preset, self.options.budget_s)

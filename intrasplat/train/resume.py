@@ -1,6 +1,6 @@
-"""A stored run resumes: a stopped or killed one goes on from its last state to the bits of an uninterrupted run.
+"""Resume a stopped or killed run from its last stored state; the result is bit-identical to an uninterrupted run.
 
-The state names no device: a run may be resumed on another one, but then reaches other bits.
+The state names no device. A run may be resumed on another one, but is then not bit-identical.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from intrasplat.train.start import resting_model
 from intrasplat.train.targets import TrainingFrames
 
 MISFITS = (KeyError, SceneError, TypeError, ValueError)
-"""What reading a state raises that is damaged or of another run."""
+"""The errors raised by reading a state that is damaged or belongs to another run."""
 
 
 def resume(directory: Path, setup: Setup) -> Run | None:
     """The run that is stored in directory, with the setup's clock and timings as they were; None if there is none.
 
-    Points, tracks and the start are not made again: all that came of them is in the state.
+    Points, tracks and the initial model are not computed again: their results are in the state.
 
     Raises:
         ResumeMismatch: it was started with another preset, seed, length or clip, or cannot be read.
         UnavailableError: the GPU does not work.
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop() returned True.
     """
     if not (directory / RESUME_FILE).exists():
         return None
@@ -65,16 +65,16 @@ def resume(directory: Path, setup: Setup) -> Run | None:
 
 
 def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None]:
-    """Begin to write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
+    """Start to write what resume needs: parameters, moments, averages, densification statistics, schedule, curve.
 
-    When this returns, the run may go on. What it returns ends the writing, as that of begin_resume.
+    When this returns, the run may go on. Call what it returns to complete the writing, as with begin_resume.
 
     Raises:
-        OSError: the disk is full or refuses; what was stored before is as it was.
+        OSError: the disk is full or refuses; the state stored before is unchanged.
     """
     trains = 0 < run.iteration < run.iterations
     beta1 = run.preset.rates.beta1
-    arrays = state_of(run.model, beta1) if trains else run.model.parameters()  # else nobody asks for moments
+    arrays = state_of(run.model, beta1) if trains else run.model.parameters()  # else moments are not needed
     arrays |= {**run.average.arrays(), **(run.densifier.arrays() if run.densifier else {})}
     state = {
         "identity": _identity(run.setup, run.preset, run.eyes),
@@ -97,13 +97,13 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
 
 
 def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
-    """The preset with what the scene settled when the run began."""
+    """The preset with the bases and the stride that were chosen for the scene when the run started."""
     fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
     return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)
 
 
 def _load_parameters(model: Model, tensors: dict[str, Tensor]) -> None:
-    """Load the stored parameters into a model of as many Gaussians."""
+    """Load the stored parameters into a model of the same number of Gaussians."""
     names = model.parameters().keys()
     lacking = names - tensors.keys()
     if lacking:
@@ -112,7 +112,7 @@ def _load_parameters(model: Model, tensors: dict[str, Tensor]) -> None:
 
 
 def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None:
-    """Put the stored state into a run that has made no step."""
+    """Load the stored state into a run that has made no step."""
     run.model.load_arrays(tensors)
     run.average.load_arrays(tensors, state["averaged"])
     if run.densifier is not None:
@@ -123,7 +123,7 @@ def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None
 
 
 def _check(state: Mapping[str, Any], setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> None:
-    """ValueError if a run with this state was started as something else."""
+    """Raise ValueError if this state belongs to another preset, seed, length or clip."""
     stored = state.get("identity", {})
     own = _identity(setup, preset, eyes)
     differing = [f"another {name}" for name, value in own.items() if stored.get(name) != value]
@@ -132,7 +132,7 @@ def _check(state: Mapping[str, Any], setup: Setup, preset: Preset, eyes: Sequenc
 
 
 def _identity(setup: Setup, preset: Preset, eyes: Sequence[TrainingFrames]) -> dict[str, str]:
-    """What a stored run must share with the one that resumes it, by the words of the error."""
+    """What a stored run must share with the one that resumes it, by its name in the error message."""
     fixed = setup.fixed_iterations
     return {
         "preset": preset.name,

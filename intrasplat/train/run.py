@@ -1,4 +1,4 @@
-"""The state of a training run: what is trained, on what, and how far it has come."""
+"""The state of a training run: the model, its targets, and the progress so far."""
 
 from __future__ import annotations
 
@@ -43,13 +43,14 @@ class Run:
     setup        clip, split, request, device, hooks, clocks
     model        Gaussians, deformation, Adam's moments
     frames       targets and cameras of the left eye
-    right        those of the right eye; None where the left eye alone teaches
-    preset       rates, loss, order, densification; nothing is left to the scene any more
-    schedule     how many iterations, and how the rates fall; iteration: those done
-    box          corners of the box of the Gaussians' centres before the first step, units
+    right        those of the right eye; None where only the left eye is trained on
+    preset       rates, loss, order, densification; all that it left to the scene is filled in
+    schedule     how many iterations, and how the rates fall
+    box          bounding box of the Gaussians' centres before the first step, units
+    iteration    iterations done
     average      mean of the last models of a cycle
     densifier    its statistics; None where the preset has no densification
-    chosen       what the preset left to the scene, its value and the reason, in words
+    chosen       what the preset left to the scene: the value chosen and the reason
     curve        scores of held-out frames so far
     """
 
@@ -68,32 +69,32 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """Of everything random; with the iteration it draws what that iteration needs."""
+        """The seed of all random numbers. Seed and iteration together decide what an iteration draws."""
         return self.setup.options.seed
 
     @property
     def device(self) -> Device:
-        """Where the model lies."""
+        """The device that holds the model."""
         return self.setup.device
 
     @property
     def eyes(self) -> tuple[TrainingFrames, ...]:
-        """The eyes that teach, left first."""
+        """The targets of the eyes that are trained on, left first."""
         return (self.frames,) if self.right is None else (self.frames, self.right)
 
     @property
     def taught_by(self) -> Eyes:
-        """The eyes that teach, by their name."""
+        """The name of the eyes that are trained on."""
         return "left" if self.right is None else "both"
 
     @property
     def iterations(self) -> int:
-        """Of the whole run, as far as is known."""
+        """Iterations of the whole run; early stopping may still reduce them."""
         return self.schedule.iterations
 
     @property
     def frames_seen(self) -> int:
-        """Frames trained on so far, each counted once for every step that had it."""
+        """Frames trained on so far, each counted once per step."""
         return self.iteration * self.preset.frames_a_step
 
     @property
@@ -110,8 +111,8 @@ class Run:
 
 
 def frames_at(run: Run, iteration: int) -> list[int]:
-    """The training frames of an iteration (from 1): a function of preset, seed, schedule and iteration, so that a run
-    can be resumed. Epochs follow each other without a gap: a step may end one epoch and begin the next."""
+    """The training frames of an iteration, counted from 1. They depend on preset, seed, schedule and iteration alone,
+    so that a run can be resumed. Epochs have no gap between them: a step may end one and start the next."""
     indices, count = run.frames.indices, run.preset.frames_a_step
     if run.schedule.withholds_validation(iteration):
         withheld = validation_frames(indices)
@@ -126,7 +127,7 @@ def frames_at(run: Run, iteration: int) -> list[int]:
 
 
 def write_curve(path: Path, run: Run) -> None:
-    """curve.csv: seconds by both clocks, iteration, scores of the held-out frames in training, training frames seen.
+    """Write curve.csv: seconds by both clocks, iteration, scores of held-out frames, training frames seen.
 
     psnr_right_db is empty for a clip of one eye.
     """

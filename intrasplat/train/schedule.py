@@ -1,9 +1,9 @@
 """How rates fall and rise again in the iterations of a run, and when early stopping ends it.
 
-A run is a row of cycles, each as long as all before it together: warm restarts, after Loshchilov and Hutter (2017).
-Rates fall within a cycle, and its last models are averaged (Polyak and Juditsky 1992), so the model at its end is a
-finished one. Validation frames, a few of the training frames, tell what the last doubling of the iterations gained;
-they are trained on once that is decided. The clock has no say: the same seed and iterations do the same.
+A run is a sequence of cycles, each as long as all before it together: warm restarts, after Loshchilov and Hutter
+(2017). Rates fall within a cycle, and its last models are averaged (Polyak and Juditsky 1992), so the model at its end
+is a finished one. Validation frames, a few of the training frames, show what the last doubling of the iterations
+gained. Once early stopping is decided they are trained on too. Nothing here reads the clock.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import Any
 from intrasplat.notices import Notice, NoticeCode
 
 MIN_CYCLE_ITERATIONS, MIN_CYCLE_EPOCHS = 250, 3
-"""Of a cycle, the larger of the two."""
+"""The shortest cycle: the longer of the two."""
 RESTART = 0.6
-"""How far rates have fallen already where every cycle but the first begins."""
+"""The progress at which every cycle but the first starts; rates fall from progress 0 to 1."""
 AVERAGED_SHARE, AVERAGED = 1 / 8, 6
 """The last share of a cycle from which models are averaged, and how many of them."""
 CLOSING_SHARE, MIN_CLOSING_EPOCHS = 0.25, 2
 """Iterations after early stopping, which train on the validation frames too: their share of those before, and the
-fewest epochs. Wherever in an epoch they begin, a whole one follows."""
+fewest epochs. With two epochs a whole one is among them, wherever in an epoch they start."""
 VALIDATION_EVERY = 14
-"""Of so many training frames one is a validation frame."""
+"""One training frame in 14 is a validation frame."""
 MIN_FRAMES_FOR_VALIDATION = 28
 """With fewer training frames there are no validation frames, and a run uses its whole budget."""
 
@@ -35,12 +35,12 @@ class Schedule:
     """The cycles of a run; iterations count from 1.
 
     planned        iterations without early stopping
-    warm_restarts  whether there are several cycles, if planned is long enough for two, and averages end them
-    min_gain_db    early stopping ends the run where doubling the iterations gains less on the validation frames; None:
+    warm_restarts  whether there are several cycles, if planned is long enough for two, and each ends in an average
+    min_gain_db    early stopping: the run ends if doubling the iterations gains less on the validation frames; None:
                    there are no validation frames and no early stopping
     epoch          iterations that show every training frame once; a long clip needs long cycles
     scores         psnr_tissue of the validation frames, dB, at the ends of the cycles so far
-    opening        first iterations, made before `planned` was known: at full rates, and on no validation frame
+    opening        first iterations, made before `planned` was known: at full rates, without validation frames
     """
 
     planned: int
@@ -60,7 +60,7 @@ class Schedule:
 
     @property
     def stopped_at(self) -> int | None:
-        """The end of the cycle that gained too little; None as long as there is none."""
+        """The last iteration of the cycle that gained too little; None if there is none so far."""
         if self.min_gain_db is None or len(self.scores) < 2:
             return None
         too_little = self.scores[-1] - self.scores[-2] < self.min_gain_db  # False if one is NaN
@@ -77,11 +77,11 @@ class Schedule:
 
     @property
     def iterations(self) -> int:
-        """Of the whole run, as far as is known."""
+        """Iterations of the whole run; early stopping may still reduce them."""
         return self.ends[-1]
 
     def cycle(self, iteration: int) -> tuple[int, int]:
-        """The iterations after which its cycle begins and ends."""
+        """The iterations after which the cycle of this iteration starts and ends."""
         end = next(end for end in self.ends if iteration <= end)
         return max((each for each in self.ends if each < end), default=0), end
 
@@ -94,13 +94,13 @@ class Schedule:
         return fallen + (1 - fallen) * (iteration - begun) / (end - begun)
 
     def averages(self, iteration: int) -> bool:
-        """Whether the model after an iteration is one of those whose mean ends the cycle."""
+        """Whether the model after an iteration is one of those that are averaged at the end of the cycle."""
         begun, end = self.cycle(iteration)
         apart = max(1, int((end - begun) * AVERAGED_SHARE / AVERAGED))
         return self.warm_restarts and (end - iteration) % apart == 0 and (end - iteration) // apart < AVERAGED
 
     def withholds_validation(self, iteration: int) -> bool:
-        """Whether an iteration trains on no validation frame: early stopping is still undecided."""
+        """Whether an iteration trains on no validation frame, because early stopping is still undecided."""
         if iteration <= self.opening:
             return self.min_gain_db is not None
         may_stop = self.min_gain_db is not None and len(self._planned_ends) > 2  # two scores, and a cycle to be spared
@@ -116,12 +116,12 @@ class Schedule:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Its fields as JSON; a score of NaN is null."""
+        """The fields as JSON values; a score of NaN is None."""
         return asdict(self) | {"scores": [None if math.isnan(score) else score for score in self.scores]}
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Schedule:
-        """The schedule with these settings. With all scores of a run, it repeats that run without any validation."""
+        """The schedule with these settings. With all scores of a run, it repeats that run without scoring again."""
         scores = tuple(math.nan if score is None else float(score) for score in settings["scores"])
         return cls(**{**settings, "scores": scores})
 

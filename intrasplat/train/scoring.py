@@ -1,4 +1,4 @@
-"""A run's frames rendered from the endoscope's own eyes, and the score of held-out ones during training.
+"""Render a run's frames from the endoscope's own poses, and score held-out frames during training.
 
 Symbols: H W pixels.
 """
@@ -24,21 +24,21 @@ from intrasplat.train.run import Run
 from intrasplat.train.targets import camera_in_units, solid_depth_mm
 
 SAMPLED_FRAMES = 8
-"""Training frames that are scored, spread over the clip: enough to compare, cheap to render."""
+"""Training frames that are scored, spread over the clip: enough to compare, and quick to render."""
 MAX_SCORED_FRAMES = 16
-"""Held-out frames of one score during training."""
+"""The most held-out frames in one score during training."""
 
 
 CLOSED_SHARE = 0.03
-"""Of the width: gaps of the right eye's depth up to this size are places where stereo failed, not places hidden from
-the left eye."""
+"""Share of the image's width. A gap in the right eye's depth up to this size is a failure of stereo; a larger one is
+tissue that the left eye does not see."""
 
 FrameRenderer = Callable[[int], RenderedFrame]
 """Renders the frame of this index from an eye's own pose."""
 PoseRenderer = Callable[[float, NDArray[np.float64], Intrinsics], RenderedFrame]
 """Renders model time t from world_from_camera [4, 4] in mm with a camera."""
 Mapping = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
-"""As map(): what a function gives for each frame, in their order."""
+"""A function like map(): applies a function to each frame and gives the results in order."""
 
 
 def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[int]:
@@ -47,8 +47,8 @@ def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[in
 
 
 def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None) -> FrameRenderer:
-    """Renders frames of the run in mm, from the left eye or from `eye`, the clip's right one; with `model`, by that
-    instead of the run's."""
+    """A function that renders frames of the run, depth in mm, from the left eye or from `eye`, the clip's right one.
+    `model` renders instead of the run's."""
     seen_by, scale = eye or run.setup.clip, run.frames.scale
     side = run.setup.sides[0 if eye is None else 1]
 
@@ -70,7 +70,7 @@ class HeldOutScore:
 
 
 def held_out_score(run: Run, model: Model | None = None) -> HeldOutScore:
-    """As score_held_out, of the run; with `model`, of that instead of the run's."""
+    """The score of the run's model, or of `model`, on held-out frames; see score_held_out."""
     setup = run.setup
 
     def render_as(eye: Eye | None) -> FrameRenderer:
@@ -88,8 +88,8 @@ def score_held_out(
     """The score over at most MAX_SCORED_FRAMES of the held-out frames, evenly spread.
 
     Args:
-        render_as: renders from the left eye for None, else from the clip's right eye.
-        hooks: see the left eye's renders.
+        render_as: gives a renderer for the left eye (None) or for the clip's right eye.
+        hooks: on_held_out receives the left eye's renders.
     """
     scores, frames, render = [], sample_frames(held_out, MAX_SCORED_FRAMES), render_as(None)
     for index in frames:
@@ -103,13 +103,13 @@ def score_held_out(
 
 
 def _right_scores(right: Eye, frames: Sequence[int], render: FrameRenderer) -> list[float]:
-    """psnr_tissue in dB of the right eye's frames that show tissue which the left eye sees."""
+    """psnr_tissue in dB of the right eye's frames, on tissue that the left eye sees too."""
     judged = ((index, judged_pixels(right, index)) for index in right.one_by_one(frames))
     return [psnr_tissue(render(index).rgb, right.rgb[index], pixels) for index, pixels in judged if pixels.any()]
 
 
 def judged_pixels(right: Eye, index: int) -> NDArray[np.bool_]:
-    """Tissue [H, W] of the right eye that the left eye sees, too."""
+    """[H, W] tissue of the right eye that the left eye sees too."""
     side = 2 * round(CLOSED_SHARE * right.intrinsics.width / 2) + 1
     matched = (right.depth_mm[index] > 0).astype(np.uint8)
     seen = cv2.morphologyEx(matched, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0

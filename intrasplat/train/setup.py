@@ -1,4 +1,4 @@
-"""What a run is set up with: the clip with depth, its split, the request, the caller's hooks, the clocks."""
+"""What is fixed before a run: the clip with depth, its split, the options, the caller's hooks, the clocks."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from intrasplat.train.hooks import TrainingHooks
 class Setup:
     """Everything that is fixed before training, and the clocks.
 
-    clip           left frames with depth
+    clip           frames with depth, of the right eye too if there is one
     split          the frames to train on, and the held-out ones
-    preset         as requested: prepare() settles what it leaves to the scene
-    options        for their seed and length
-    clock          t_train_s, which begins with the setup
-    accepted_at_s  Unix time, from which t_post_s counts
+    preset         as requested; prepare() fills in what it leaves to the scene
+    options        seed, length and eyes are read from them
+    clock          t_train_s, which starts with the setup
+    accepted_at_s  Unix time from which t_post_s counts
     gpu_is_idle    whether there is a GPU that the preset's motion cannot use
     """
 
@@ -45,9 +45,9 @@ class Setup:
 
     @property
     def sides(self) -> tuple[float, float]:
-        """Of the left and the right eye's cameras, for the gloss; 0 where there is none.
+        """Camera.side of the left and the right eye, for the gloss; 0 where gloss is not modelled.
 
-        One eye alone cannot tell it, and harmonics stand in for it.
+        Gloss needs two eyes to be measured; with spherical harmonics it is not modelled.
         """
         return (-0.5, 0.5) if len(self.teaching_eyes) > 1 and self.preset.sh_degree == 0 else (0.0, 0.0)
 
@@ -58,7 +58,7 @@ class Setup:
 
     @property
     def budget_s(self) -> float:
-        """The seconds of training that were asked for, where fixed_iterations is None."""
+        """The seconds of training, requested or the preset's; only where fixed_iterations is None."""
         _, budget_s = length_of(self.options, self.preset)
         assert budget_s is not None
         return budget_s

@@ -1,4 +1,4 @@
-"""The model before its first step: points become Gaussians; motion starts from the tracks, or at rest."""
+"""The model before its first step: Gaussians at the points, whose motion starts from the tracks, or at rest."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from intrasplat.train.run import Box
 from intrasplat.train.setup import Setup
 
 SHARE_PX = 4
-"""Points within such a square start with one motion. Tracks are smooth over more, and there is less to solve."""
+"""Side of a square in which all points start with one motion: tracks are smooth enough, and there is less to solve."""
 BETWEEN_KEYFRAMES_MM = 1e4
-"""Farther than any neighbours are apart."""
+"""Added between the points of different keyframes, so that none is a neighbour of another keyframe's."""
 MIN_STRIDE = 2
-"""Pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
+"""Least pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
 
 
 def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
@@ -43,16 +43,15 @@ def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
 
 
 def stride_for(points: int, intrinsics: Intrinsics) -> int:
+    """The stride in pixels of a grid of about `points` points per image."""
     return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 
 def settled(
     preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[Notice, ...]]:
-    """The preset with what it leaves to the scene settled, and why, in words for the report.
-
-    tracks: of each keyframe, if there are any.
-    """
+    """The preset with the stride of the points' grid and the number of bases chosen for the scene, where it leaves them
+    open, and notices with the reasons for the report. tracks: of each keyframe, if there are any."""
     notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = BasisTrials({})
@@ -90,7 +89,7 @@ def settled(
 
 
 def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:
-    """The settled preset with so few bases that a scene of so many Gaussians can be stored, and the notice of it."""
+    """The preset of settled() with no more bases than a scene of so many Gaussians can store, and a notice if fewer."""
     most = MAX_WEIGHTS // (ROWS * points)
     if preset.deformation != SharedBasis.kind or preset.bases is None or preset.bases <= most:
         return preset, ()
@@ -99,7 +98,7 @@ def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:
 
 
 def basis_values(bases: int, trained_times: Sequence[float], times: Sequence[float]) -> NDArray[np.float64]:
-    """[T, B] values at the times of the bases that a shared motion trained on trained_times starts with."""
+    """[T, B] values, at `times`, of the bases that a shared motion trained on trained_times starts with."""
     return values_at(SharedBasis.initial(1, bases=bases, times=trained_times), times)
 
 
@@ -120,13 +119,13 @@ def start_model(
     *,
     gloss: bool = False,
 ) -> Model:
-    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the (settled) preset.
+    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the preset of settled().
 
     A "shared" motion starts from the tracks of the keyframes, if there are any. Every other motion starts at rest.
-    gloss: whether two eyes teach.
+    gloss: whether two eyes are trained on.
     """
     gaussians = initial_gaussians(
-        _apart_by_keyframe_mm(cloud) * np.float32(scale),  # widths are by neighbours of one time
+        _apart_by_keyframe_mm(cloud) * np.float32(scale),  # a width depends on neighbours of the same keyframe only
         cloud.rgb,
         sh_degree=preset.sh_degree,
         opacity=preset.opacity,
@@ -144,20 +143,20 @@ def start_model(
 
 
 def _apart_by_keyframe_mm(cloud: PointCloud) -> NDArray[np.float32]:
-    """[N, 3] where the points lay in their keyframes, so that each has its neighbours in its own one."""
+    """[N, 3] points in their keyframes, each keyframe moved far from the others; a keyframe of few points is not."""
     alone = np.bincount(cloud.key)[cloud.key] <= NEIGHBOURS
     apart_mm = (BETWEEN_KEYFRAMES_MM * np.where(alone, 0, cloud.key)).astype(np.float32)
     return cloud.reference_mm + apart_mm[:, None]
 
 
 def box_of(model: Model) -> Box:
-    """The corners of the box of the model's centres, units."""
+    """The bounding box of the model's centres, units."""
     centres = model.parameters()["canonical"][MEAN].cpu()
     return tuple(centres.amin(1).tolist()), tuple(centres.amax(1).tolist())
 
 
 def resting_model(count: int, box: Box, setup: Setup, preset: Preset) -> Model:
-    """As start_model's for as many Gaussians in such a box, whose arrays are still to be loaded."""
+    """A model like start_model's, of `count` Gaussians in a bounding box, into which arrays can be loaded."""
     gaussians = Gaussians(
         mean=torch.tensor(box)[torch.arange(count) % 2],
         quaternion=torch.zeros(count, 4),
@@ -180,8 +179,8 @@ def _follow_tracks(
     train: Sequence[int],
     scale: float,
 ) -> Gaussians:
-    """Fill motion's weights from optical-flow tracks; returns the Gaussians with each canonical mean and colour shifted
-    so that they pass through their point and its colour at the time of the frame it was taken from."""
+    """Fill motion's weights from optical-flow tracks; returns the Gaussians with canonical mean and colour shifted so
+    that each has the position and colour of its point at the time of the frame it was taken from."""
     basis = values_at(motion, [float(clip.t[i]) for i in range(clip.frame_count)])
     weights = np.zeros((len(cloud), basis.shape[1], 6), np.float32)
     for key, each in enumerate(tracks):

@@ -1,4 +1,4 @@
-"""The training frames as the rasteriser compares with them: padded to whole tiles, in optimiser units.
+"""The training frames as targets of the loss: rows padded to whole vectors, depth in optimiser units.
 
 Symbols: T frames, H W pixels; stride = W rounded up to whole vectors.
 """
@@ -24,11 +24,11 @@ from intrasplat.splat.metrics import COVERED_ALPHA, psnr_tissue
 from intrasplat.splat.step import Target, TrainingFrame, camera_vector
 
 MEDIAN_DEPTH_UNITS = 60.0
-"""The median valid depth of the training frames in optimiser units; Adam's rates are stated in this unit."""
+"""The median valid depth of the training frames in optimiser units; the learning rates refer to this unit."""
 
 
 def units_per_mm(clip: DepthClip, train: Sequence[int]) -> float:
-    """Optimiser units a millimetre, from the training frames' valid tissue depths.
+    """Optimiser units per millimetre, from the training frames' valid tissue depths.
 
     Raises:
         InputError: no training frame has valid depth on tissue.
@@ -51,7 +51,7 @@ def camera_in_units(
 ) -> Camera:
     """The rasteriser's camera: the pose inverted and its translation in optimiser units.
 
-    side and dim say what it sees of the gloss (intrasplat/splat/camera.py).
+    side and dim are its factors of the gloss (intrasplat/splat/camera.py).
     """
     camera_from_world: NDArray[np.float64] = np.linalg.inv(world_from_camera).astype(np.float64)
     camera_from_world[:3, 3] *= scale
@@ -60,7 +60,7 @@ def camera_in_units(
 
 
 def solid_depth_mm(depth: NDArray[np.float32], alpha: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
-    """[H, W] camera z in mm of a render: sum(w z) / sum(w) out of optimiser units, 0 where the alpha is too thin."""
+    """[H, W] camera z in mm of a render: sum(w z) / sum(w) / scale, 0 where alpha < COVERED_ALPHA."""
     solid = alpha >= COVERED_ALPHA
     return np.where(solid, depth / np.where(solid, alpha, 1) / scale, 0).astype(np.float32)
 
@@ -70,18 +70,18 @@ MIN_DEPTH_MM = np.float32(1e-3)
 
 
 MAX_HELD_BYTES = 512 << 20
-"""Of an eye's pixels: if they are more, who has used a frame lets go of it. That takes half a millisecond an eye."""
+"""An eye whose frames take more memory releases each frame after use, which takes half a millisecond."""
 
 
 class TrainingFrames:
     """Colour, tissue, inverse depth and camera of every training frame of one eye.
 
-    A frame's target is made anew for every step that asks for it: that takes a few hundredths of the step, and keeping
-    all of them would take as much memory as the clip.
+    A frame's target is computed again for every step that uses it. That takes a few hundredths of the step; storing all
+    targets would take as much memory as the clip.
     """
 
     def __init__(self, eye: Eye, train: Sequence[int], scale: float, side: float = 0.0) -> None:
-        """side: of the eye's cameras, for the gloss."""
+        """scale: optimiser units per millimetre; side: Camera.side of the eye's cameras, for the gloss."""
         self.eye, self.indices, self.scale, self.t = eye, list(train), scale, eye.t
         self.cameras = {
             index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale, side))
@@ -94,7 +94,7 @@ class TrainingFrames:
     def _frame(self, index: int) -> TrainingFrame:
         counts = int(self.eye.tissue[index].sum()), int(_measured(self.eye, index).sum())
         self.eye.let_go(index)
-        # no method of its own: in a cycle with its frames, the eye's files on disk would outlive the job
+        # A partial instead of a bound method: a reference cycle would keep the eye's files on disk after the job.
         make_target = partial(_target, self.eye, index, self.scale, self._lets_go)
         return TrainingFrame(self.cameras[index], float(self.t[index]), make_target, *counts)
 
@@ -109,7 +109,7 @@ class TrainingFrames:
         return self.eye.rgb[index], self.eye.tissue[index]
 
     def psnr_tissue_db(self, index: int, image: NDArray[np.float32]) -> float:
-        """Of a model's render [5, H, W] against frame `index`; NaN without tissue."""
+        """psnr_tissue in dB of a model's render [5, H, W] against frame `index`; NaN without tissue."""
         found = psnr_tissue(image[:3].transpose(1, 2, 0), *self.picture(index))
         if self._lets_go:
             self.eye.let_go(index)
@@ -142,7 +142,7 @@ def _target(eye: Eye, index: int, scale: float, lets_go: bool) -> Target:
     for plane, channel in zip(rgb, cv2.split(eye.rgb[index]), strict=True):
         plane[:, :width] = channel
     np.multiply(eye.tissue[index].view(np.uint8), np.uint8(255), out=weight[:, :width])
-    inside = inverse_depth[:, :width]  # a division everywhere, then a mask: faster than one where it is asked for
+    inside = inverse_depth[:, :width]  # dividing everywhere and masking afterwards is faster than a masked division
     np.divide(np.float32(1 / scale), np.maximum(eye.depth_mm[index], MIN_DEPTH_MM), out=inside)
     inside *= _measured(eye, index)
     if lets_go:

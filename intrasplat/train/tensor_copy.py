@@ -1,4 +1,4 @@
-"""A copy of a tensor beside the model's: in memory, or where that is large, in a file, a row at a time in memory."""
+"""A copy of one of the model's tensors: in memory, or if it is large in a file that is loaded row by row."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 from intrasplat.machine.mapped import let_go, mapped_zeros
 
 LARGE_BYTES = 192 << 20
-"""Of the weights of a long clip; those of a usual one, of up to 33 bases, are not worth the disk's time."""
+"""Only the weights of a long clip are larger. Those of a usual clip, of up to 33 bases, stay in memory."""
 
 
 class Aside:
-    """A float32 tensor's copy, on its device where that is no CPU."""
+    """A copy of a float32 tensor. That of a GPU's tensor lies on the GPU."""
 
     def __init__(self, values: Tensor) -> None:
         """Raises StoreFullError if the disk is full."""
@@ -28,13 +28,13 @@ class Aside:
             self._copy = values.clone()
 
     def tensor(self) -> Tensor:
-        """The copy; what reads it brings it into memory, until let_go()."""
+        """The copy; reading it loads it into memory, until let_go()."""
         return self._copy
 
     def each(self, values: Tensor, change: Callable[[Tensor, Tensor], object]) -> None:
-        """change(copy, values), of all or row by row."""
+        """Call change(copy, values), for all at once or row by row."""
         if self._file is None:
-            self._copy = self._copy.to(values.device)  # stored ones come from the host
+            self._copy = self._copy.to(values.device)  # a copy from a resume file lies on the host
             change(self._copy, values)
             return
         for row, copy, value in zip(self._file, self._copy, values, strict=True):
@@ -42,6 +42,6 @@ class Aside:
             let_go(row)
 
     def let_go(self) -> None:
-        """Take what lies in a file out of memory."""
+        """Release the memory of a copy that lies in a file."""
         if self._file is not None:
             let_go(self._file)

@@ -1,4 +1,4 @@
-"""The CPU backend: Numba kernels on explicit vectors, one thread a core; obeys the contract of intrasplat/splat.
+"""The CPU backend: Numba kernels on explicit vectors, one thread per core. splat/camera.py is its contract.
 
 vectors -> simd -> bins -> project -> blend -> rasterizer (buffers and calls) -> autograd (rasterize);
 update, harmonics -> motion -> model (the fused training step) -> compilation.

@@ -1,4 +1,4 @@
-"""rasterize() with gradients by torch: what EndoGaussian (lab/rivals) and the tests use."""
+"""The CPU's rasterize(), with gradients by torch.autograd."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _rows(tensor: Tensor, count: int, fill: float = 0.0) -> Floats:
 def rasterize(
     mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, colour: Tensor, camera: Camera
 ) -> Rendered:
-    """See intrasplat/splat/camera.py float32 on the CPU; gradients by torch.autograd.
+    """rasterize() of intrasplat/splat/camera.py in float32 on the CPU; gradients by torch.autograd.
 
     Raises:
         ValueError: shapes that do not belong together.

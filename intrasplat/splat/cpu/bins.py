@@ -1,23 +1,23 @@
-"""Which splats touch which tile, in depth order, and where the gradients of a splat are summed.
+"""Lists the splats of each tile in depth order, and assigns the accumulators in which a splat's gradients are summed.
 
-A tile is LANES pixels wide and TILE_ROWS tall: as narrow as a vector, tall to keep the number of tiles a splat touches
-low. A slot is one (splat, tile) pair with its range of rows.
+Symbols: N splats (index g), M slots. splats[g, k] is number k of the record of splat g (table in project.py).
+A tile is LANES pixels wide, as a vector, and TILE_ROWS tall, so that a splat touches few tiles. A band is a row of
+tiles. A slot is one (splat, tile) pair with its range of rows.
 
     slot_start, slot_count [N]   slots of splat g: slot_count[g] from slot_start[g];  slot_info [M]: tile and rows
     tile_start [tiles + 1], entries [M]   the slots of a tile, nearest splat first: splat and rows
 
-Rows [top, end) inside the tile are exact for the ellipse within the tile's columns; (top, end - 1) are the low
-2 x ROW_BITS bits of slot_info and entries, and the rest is the tile or the splat: with half the memory, sorting takes
-half the time.
+Rows [top, end) inside the tile are exact for the ellipse within the tile's columns. The low 2 x ROW_BITS bits of
+slot_info and entries are (top, end - 1), the others the tile or the splat. Packing halves memory and sorting time.
 
-A block is BLOCK_TILES tiles side by side, blended one after the other by one thread. A splat has a home, GRADIENT
-floats, for each block it may touch, and each of its tiles adds its gradients there: few places, still in the cache when
-the next tile comes; no atomics; and always the same order of addition, whichever thread took the block.
+A block is BLOCK_TILES tiles of one band, blended one after the other by one thread. A splat has a home, an accumulator
+of GRADIENT floats, for each block that it may touch, to which each of its tiles adds its gradients. So homes are few
+and stay in the cache, there are no atomics, and the order of addition does not depend on the threads.
 
-    homes [N, 4]   first home, number of homes, offset and step: the home in a block is
-                   offset + step x (the block's row) + (the block's column)
+    homes [N, 4]   first home, number of homes, offset, step. The home of splat g in column block_x of the blocks of a
+                   band is number homes[g, 2] + homes[g, 3] * band + block_x
 
-Each thread has a region of the M slots and one of the homes for its splats, so one pass over the splats is enough.
+Each thread has its own region of the slots and of the homes, so one pass over the splats is enough.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ BLOCK_TILES = 16
 GRADIENT = 12
 """Floats of a home: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
 EXTENT = 6
-"""What project tells of the ellipse of a splat, a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx where it
-is lowest, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
+"""Numbers that project computes of a splat's ellipse a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx of
+its lowest point, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
 MAX_GAUSSIANS = 1 << (32 - 2 * ROW_BITS)
-"""A million: more would not fit beside the rows in an entry. As many tiles are an image of 23000 x 23000."""
+"""A million: an entry has no bits for more beside the rows. As many tiles are an image of 23000 x 23000."""
 ROUNDING = np.float32(2e-3)
-"""Pixels by which row bounds are widened, against rounding; the exact test is made on every pixel anyway."""
+"""Pixels by which row bounds are widened, against rounding; every pixel is tested exactly anyway."""
 _ZERO, _HALF, _WIDTH = np.float32(0.0), np.float32(0.5), np.float32(LANES)
 _RADIX_BITS = 11
 _INFO_SHIFT = np.uint32(2 * ROW_BITS)
@@ -51,10 +51,11 @@ _ROWS_MASK = np.uint32((1 << 2 * ROW_BITS) - 1)
 
 @kernel(inline="always")
 def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
-    """Image rows [top, end) that the ellipse covers in LANES columns of tiles from this one on: bounds [2 * LANES].
+    """Write the image rows [top, end) that the ellipse covers in LANES columns of tiles, from `column` on, into bounds.
 
-    The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in dx, so its maximum over a column's
-    pixel centres is at the ellipse's own extreme point clamped to them; the upper one is its mirror image.
+    bounds [2 * LANES]: top, then end. The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in
+    dx, so its maximum over a column's pixel centres is at the ellipse's extreme point clamped to them. The upper branch
+    is its mirror image. lean = -b / c, height2 = r / c, fall = (ac - b^2) / c^2.
     """
     zero, width, extreme = splat(_ZERO), splat(extent[g, 0]), splat(extent[g, 1])
     lean, height2, fall = splat(extent[g, 2]), splat(extent[g, 3]), splat(extent[g, 4])
@@ -70,7 +71,8 @@ def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
-    """Homes of splat g for tiles in columns first to last and bands highest to lowest, from this one on; the next."""
+    """Number the homes of splat g from `home` on, for tile columns first to last and bands highest to lowest; returns
+    the next free number."""
     first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
     step = last_block - first_block + 1
     homes[g, 1] = step * (lowest - highest + 1)
@@ -83,9 +85,10 @@ def fill_slots(  # type: ignore[no-untyped-def]
     thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
     slot_start, slot_count, slot_info, homes, region_end,
 ):  # fmt: skip
-    """Write the slots of the thread's share of splats into its region, an equal share of slot_info; number its homes.
+    """Write the slots of the thread's share of splats into its region, an equal share of slot_info; assign their homes.
 
-    home_capacity: of all threads. region_end [threads, 2]: where both end; past the region's end they are only counted.
+    home_capacity: homes of all threads. region_end [threads, 2]: where the thread's slots and homes end. Slots beyond
+    the region are counted but not written.
     """
     region = slot_info.shape[0] // threads
     slot, full = thread * region, (thread + 1) * region
@@ -123,10 +126,10 @@ def fill_slots(  # type: ignore[no-untyped-def]
 
 @kernel
 def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type: ignore[no-untyped-def]
-    """Sort the visible splats, nearest first, ties by index; return how many there are and whether they are in order.
+    """Sort the visible splats, nearest first, ties by index; order, keys, other_* are scratch [N].
 
-    (Else they are in other_order.) Radix sort on the float's own bits above the nearest one's (depths are positive):
-    as many passes as the range of depths has digits. order, keys, other_* are scratch [N].
+    Returns how many there are, and whether the result is in `order`; otherwise it is in other_order. A radix sort on
+    the float's bits minus those of the nearest (depths are positive), with as many passes as their range has digits.
     """
     visible, nearest, farthest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
     depth = splats[:, 9].copy().view(np.uint32)
@@ -158,7 +161,7 @@ def depth_order(splats, radius2, order, keys, other_order, other_keys):  # type:
 def sort_into_tiles(  # type: ignore[no-untyped-def]
     order, visible, slot_start, slot_count, slot_info, region_end, tile_start, entries
 ):
-    """Counting sort of the slots by tile, splats taken in depth order."""
+    """Counting sort of the slots by tile, with splats in depth order; fills tile_start and entries."""
     tile_start[:] = 0
     region = slot_info.shape[0] // region_end.shape[0]
     for thread in range(region_end.shape[0]):

@@ -1,4 +1,4 @@
-"""The blend: front-to-back compositing of a tile, the loss on it, and the gradients of its splats, in one visit.
+"""The blend: front-to-back compositing of a tile, its loss, and the gradients of its splats, in one pass over tiles.
 
 Symbols, for one pixel and its splats i = 0, 1, ... nearest first:
     alpha_i = min(MAX_ALPHA, 2**power2_i), 0 below MIN_ALPHA or once T < MIN_TRANSMITTANCE
@@ -6,17 +6,17 @@ Symbols, for one pixel and its splats i = 0, 1, ... nearest first:
     C       = sum w_i c_i,  Z = sum w_i z_i,  A = sum w_i = 1 - T_end
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
     dL/dalpha_i = T_i (s_i - B_i),  B_{i-1} = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0
-so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass leaves alpha and w of
-every row it visited in ``trail``; the loss needs only the pixel's own colour, so no gradient image ever exists.
-Down a column of pixels power2 is quadratic, so alpha goes from row to row by a ratio, and the ratio by a constant: two
-products instead of an exponential. Derivations: docs/rasterizer.md.
+so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass stores alpha and w of
+every row it visits in ``trail``, for the backward pass. The loss needs only the pixel's own colour, so there is no
+gradient image. Down a column of pixels power2 is quadratic. So alpha is multiplied by a ratio from row to row, and the
+ratio by a constant: two products instead of an exponential. Derivations: docs/rasterizer.md.
 
-A tile is done in four steps. Its entries (bins.py) are gathered as records, one after the other in memory; they are
-blended; the loss is taken; and they are walked back. A record is RECORD floats: alpha and ratio of its first row (one
-per lane), then BEND (the ratio's change per row), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the first
-row) and VALUE.
-Its rows [top, end) and the home of its splat are in ``spans``. The planes lie in ``planes``, PLANE floats apart: T
-(later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only where no gradient is asked for.
+A tile takes four steps. _gather copies its entries (bins.py) into consecutive records, _forward blends them, _loss
+computes the loss, and _backward visits the records in reverse. A record is RECORD floats: alpha and ratio of its first
+row (one per lane), then BEND (the ratio's factor per row), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the
+first row) and VALUE (splat number 11 in project.py).
+spans[i] is first row, end row and home (bins.py) of record i. The arrays of a tile lie in ``planes``, PLANE floats
+apart: T (later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only if no gradient is computed.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ from intrasplat.splat.cpu.simd import (
 from intrasplat.splat.cpu.vectors import LANES
 
 PLANE = TILE_ROWS * LANES + 16
-"""Not a power of two: otherwise the same pixel of two planes falls into the same cache set (4K aliasing)."""
+"""Not a power of two: otherwise the same pixel of two planes would fall into the same cache set (4K aliasing)."""
 PLANES = 6
 BEND, COLOUR, PLACE, VALUE = 2 * LANES, 2 * LANES + 1, 2 * LANES + 5, 2 * LANES + 7
 RECORD = 2 * LANES + 8
 MAX_ROWS = 16
-"""Rows of a record: the products' rounding grows with their square, to 1e-5 of alpha after sixteen."""
+"""The most rows of a record: the rounding error of the products grows with their square, to 1e-5 of alpha after 16."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
 """Modes. RENDER writes images. LOSS computes gradients of the built-in loss and writes no image. COTANGENT computes
 gradients from given image gradients."""
 STATISTICS = 4
-"""Sums that a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
+"""Sums of a tile over tissue: colour L1, depth L1, squared error of the colour channels, 1 - A."""
 
 _CUT = np.float32(MIN_ALPHA)
 _CAP = np.float32(MAX_ALPHA)
-_DEEP = np.float32(-60.0)  # below this power2, products may leave float32's range: such rows are single records
+_DEEP = np.float32(-60.0)  # below this power2 products may leave float32's range, so each row becomes a record
 _STOP = np.float32(MIN_TRANSMITTANCE)
 _MIN_COVERAGE = np.float32(MIN_COVERAGE)
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
-_CHECK_EVERY = 32  # records between two looks at whether the whole tile is opaque
+_CHECK_EVERY = 32  # records between two tests of whether the whole tile is opaque
 
 
 @kernel
@@ -74,7 +74,7 @@ def blend(  # type: ignore[no-untyped-def]
     thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, homes,
     records, spans, trail, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
 ):  # fmt: skip
-    """Composite every tile. Threads take blocks as they come: a block's result is the same whichever thread takes it.
+    """Composite every tile. Each thread takes the next block; the result does not depend on which thread takes it.
 
     next_block int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
     sums [homes * GRADIENT] (bins.py): added to in modes LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
@@ -116,7 +116,11 @@ def blend(  # type: ignore[no-untyped-def]
 def _gather(  # type: ignore[no-untyped-def]
     first, end, row0, column0, band, block_x, splats, entries, homes, records, spans
 ):
-    """Write the entries [first, end) of a tile as records; return how many records."""
+    """Write the entries [first, end) of a tile as records; return how many records.
+
+    splats[g]: 0 1 mean2d; 2 3 4 k_xx, k_xy, k_yy; 5 log2 opacity; 6-8 colour; 9 z; 10 BEND; 11 VALUE (project.py).
+    An entry with many rows becomes several records of at most MAX_ROWS rows.
+    """
     lanes = iota()
     at = count = 0
     for i in range(first, end):
@@ -128,12 +132,12 @@ def _gather(  # type: ignore[no-untyped-def]
         k_xx, k_xy, k_yy = splats[g, 2], splats[g, 3], splats[g, 4]
         dx = lanes + splat(x)
         along = fma(dx, splat(k_xx) * dx, splat(splats[g, 5]))
-        lean = splat(k_xy) * dx
+        lean = splat(k_xy) * dx  # power2 = along + lean dy + k_yy dy^2
         dy, end_dy = y + np.float32(top), y + np.float32(bottom - 1)
         head = fma(lean, splat(dy), along) + splat(k_yy * dy * dy)
         foot = fma(lean, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
         stretch = MAX_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
-        home = homes[g, 2] + homes[g, 3] * band + block_x
+        home = homes[g, 2] + homes[g, 3] * band + block_x  # the splat's accumulator in this block (bins.py)
         while top < bottom:
             dy = y + np.float32(top)
             store(records, at, exp2(fma(lean, splat(dy), along) + splat(k_yy * dy * dy)))
@@ -152,7 +156,7 @@ def _gather(  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
-    """Nothing blended yet: T = 1 inside the image, 0 beside it."""
+    """Reset the planes: T = 1 inside the image and 0 outside, the others 0."""
     zero = splat(_ZERO)
     inside = where_less(iota() + splat(np.float32(column0)), splat(np.float32(width)), splat(_ONE), zero)
     for row in range(rows):
@@ -164,7 +168,7 @@ def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
 
 @kernel
 def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[no-untyped-def]
-    """Blend the records into planes; return how many were visited before the tile was opaque."""
+    """Blend the records into planes; return how many were blended before the tile was opaque."""
     zero, cut, cap, stop = splat(_ZERO), splat(_CUT), splat(_CAP), splat(_STOP)
     at = 0
     for i in range(count):
@@ -204,9 +208,9 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
 
 @kernel
 def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-untyped-def]
-    """Gradients of the first count records, back to front; planes hold B - g_A, then g_R g_G g_B g_Z.
+    """Add the gradients of the first count records to their homes, back to front.
 
-    One long function, because ten running sums go from row to row and record to record and have to stay in registers.
+    planes: B - g_A, then g_R g_G g_B g_Z. One long function, so that ten running sums stay in registers.
     """
     zero, cap = splat(_ZERO), splat(_CAP)
     lanes = iota()
@@ -238,13 +242,13 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
             sum_1 = sum_1 + v_power
             sum_2 = sum_2 + sum_1
             sum_3 = sum_3 + sum_2
-        # k rows from the record's end, sum_2 = sum k v and sum_3 = sum k (k + 1) / 2 v; dy = end_dy - k.
+        # With k rows to the record's end: sum_2 = sum k v, sum_3 = sum k (k + 1) / 2 v, dy = end_dy - k.
         end_dy = spread(records, record + PLACE + 1) + splat(np.float32(bottom - top))
         lowered = end_dy * sum_1 - sum_2
         moment, moment_y = moment + sum_1, moment_y + lowered
         moment_yy = moment_yy + fma(end_dy, lowered - sum_2, sum_3 + sum_3 - sum_2)
         if i > 0 and spans[i - 1, 2] == spans[i, 2]:
-            continue  # the record before belongs to the same slot
+            continue  # the record before is of the same splat
         dx = lanes + spread(records, record + PLACE)
         moment_x = moment * dx
         home = np.int64(spans[i, 2]) * GRADIENT
@@ -257,7 +261,7 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
 
 @kernel
 def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
-    """R G B Z A and the value of the tile into the image."""
+    """Copy R G B Z A and the value of the tile into the image."""
     one = splat(_ONE)
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
@@ -269,7 +273,7 @@ def _write(planes, image, origin, stride, size, rows):  # type: ignore[no-untype
 
 @kernel
 def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore[no-untyped-def]
-    """The image's cotangents into the planes' places for g; B starts at 0."""
+    """Copy the image's cotangents into the planes of g; B starts at 0."""
     for row in range(rows):
         p, q = row * LANES, origin + row * stride
         for k in range(4):
@@ -279,7 +283,7 @@ def _read_cotangents(planes, image, origin, stride, size, rows):  # type: ignore
 
 @kernel(inline="always")
 def _clip_unit(x):  # type: ignore[no-untyped-def]
-    """x held within [-1, 1]: the derivative of the Huber loss with delta 1."""
+    """x clamped to [-1, 1]: the derivative of the Huber loss with delta 1."""
     one, minus = splat(_ONE), splat(-_ONE)
     x = where_less(x, minus, minus, x)
     return where_less(one, x, one, x)
@@ -287,10 +291,10 @@ def _clip_unit(x):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):  # type: ignore[no-untyped-def]
-    """The depth's share of _loss at the LANES pixels from p: its L1, and its gradient into the planes Z and T."""
+    """Return the L1 of the depth at the LANES pixels from p, and write its gradient into the planes Z and T."""
     zero, one = splat(_ZERO), splat(_ONE)
     coverage = one - load(planes, p)
-    # Where nothing was blended there is no depth to correct; the bound keeps the divisions finite.
+    # Pixels that are hardly covered have no depth loss; the bound keeps the divisions finite.
     solid = where_less(splat(_MIN_COVERAGE), coverage, one, zero)
     usable = where_less(zero, wanted, tissue * solid, zero)
     divisor = where_less(zero, usable, load(planes, p + 4 * PLANE), one)
@@ -299,7 +303,7 @@ def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):
         inverse = inverse * coverage
     error = inverse - wanted
     slope = _clip_unit(error * sharpness) * usable * depth_weight
-    # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
+    # The inverse depth is 1 / Z (paper) or A / Z (normalised); its derivative to A is 1 / Z in the second case.
     store(planes, p + 4 * PLANE, (zero - slope) * inverse / divisor)
     if normalised:
         store(planes, p, zero - slope / divisor)
@@ -312,7 +316,7 @@ def _depth_loss(planes, p, tissue, wanted, normalised, sharpness, depth_weight):
 def _loss(  # type: ignore[no-untyped-def]
     planes, statistics, target, weight, inverse_depth, loss_settings, origin, stride, size, rows
 ):
-    """Loss of the tile into statistics, its gradient into the planes (intrasplat/splat/loss.py: the same in torch).
+    """Write the loss of the tile into statistics and its gradient into the planes (in torch: intrasplat/splat/loss.py).
 
     target [3, H, stride] uint8, weight [H, stride] uint8 (255 = tissue), inverse_depth [H, stride] float32 (0 = none),
     flattened. loss_settings float32 [5]: colour weight per channel, depth weight, 1 / Huber delta of the

@@ -1,4 +1,4 @@
-"""Compile every kernel ahead of the first clip, so that no job pays for it."""
+"""Compile every kernel before the first clip, so that no job waits for it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _RATES = StepRates(*[1e-3] * 13)
 def compile_kernels(on_progress: Callable[[float], None] = lambda share: None) -> float:
     """Compile the kernels of every preset for this processor, or load them from the cache; returns seconds.
 
-    Takes tiny fused steps with every kind of motion and colour, and the unfused gradients, so whatever training,
-    rendering and the rivals call is compiled for the arrays they call it with. Cheap when called again.
+    It makes tiny steps and renders with every kind of motion and colour, and the unfused gradients. So every kernel is
+    compiled for the types of arrays that it is called with. A second call takes little time.
 
     Args:
-        on_progress: called with the share done, in (0, 1], after each of a few parts of unlike length.
+        on_progress: called with the share done, in (0, 1], after each of a few parts of different length.
     """
     start = time.perf_counter()
     camera = camera_vector(Camera(20.0, 20.0, 8.0, 8.0, _WIDTH, _HEIGHT, np.eye(4)))

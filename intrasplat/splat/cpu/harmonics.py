@@ -1,6 +1,4 @@
-"""The colour of a state and its gradient (intrasplat/splat/gaussians.py: the same in torch).
-
-With gloss alone, or with spherical harmonics, for scenes whose camera moves.
+"""The colour of a state and its gradient, with gloss or with spherical harmonics (in torch: splat/gaussians.py).
 
 N Gaussians, K = (degree + 1)^2 coefficients per channel: the constant one in state[COLOUR], the others in
 rest [K - 1, 3, N]; colour [3, N], mean in state[MEAN].
@@ -46,7 +44,7 @@ def colour_from_gloss(thread, threads, camera, state, colour):  # type: ignore[n
 def colour_from_gloss_backward(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, colour, v_colour, adds, v_state
 ):
-    """Write v_state[COLOUR] and v_state[GLOSS], or add to them. A colour that was held at 0 gives nothing."""
+    """Write v_state[COLOUR] and v_state[GLOSS], or add to them. A colour that was clamped at 0 has no gradient."""
     zero, one = splat(_ZERO), splat(_ONE)
     side, dim = splat(np.float32(camera[SIDE])), splat(np.float32(camera[DIM]))
     vectors = state.shape[1] // LANES
@@ -66,7 +64,7 @@ def colour_from_gloss_backward(  # type: ignore[no-untyped-def]
 
 @kernel
 def _terms(degree, x, y, z, value, slope):  # type: ignore[no-untyped-def]
-    """Real harmonics at the unit direction (x, y, z) into value [K]; as polynomials, their slopes into [K, 3]."""
+    """Write the real harmonics at the unit direction (x, y, z) into value [K], their derivatives into slope [K, 3]."""
     value[0] = SH_C0
     slope[:, :] = 0.0
     if degree >= 1:

@@ -43,9 +43,9 @@ from intrasplat.splat.optimize import StepRates, adam_step
 from intrasplat.splat.step import StepSums, TrainingFrame, camera_centre, image_size
 
 PAD_LOGIT = -30.0
-"""Opacity logit of the columns that only fill the last vector: never drawn."""
+"""Opacity logit of the padding columns, which are never drawn."""
 SIZES_KEPT = 3
-"""Image sizes, of those used last, whose buffers are kept."""
+"""Buffers are kept for so many image sizes, those used last."""
 
 
 class CpuModel:
@@ -74,7 +74,7 @@ class CpuModel:
         self.opacity_logit[: self.count] = gaussians.opacity_logit.numpy()
         self.sh_rest = np.zeros((gaussians.sh.shape[1] - 1, 3, columns), np.float32)
         self.sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0).numpy()
-        self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
+        self.sh_degree = gaussians.sh_degree  # the stored degree; a step may use a lower one
         self.motion = make_motion(deformation, self.count, columns)
         self._rasterizers: OrderedDict[tuple[int, int], Rasterizer] = OrderedDict()
         self.rasterizer = self._rasterizer(width, height)
@@ -85,14 +85,14 @@ class CpuModel:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
     def _allocate(self, moments: int = 1) -> None:
-        """Room for the Gaussians at one time, and for their gradients at so many moments per step."""
+        """Allocate the Gaussians at one time, and their gradients at so many moments per step."""
         columns = self.canonical.shape[1]
         self.state = np.zeros((ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
         self._v_state = np.zeros((moments, ROWS, columns), np.float32)
         self._v_rest = np.zeros(self.sh_rest.shape, np.float32)
         total = Gradients.room(self._v_state[0])
-        self._gradients = [replace(total, state=v_state) for v_state in self._v_state]  # only the states are apart
+        self._gradients = [replace(total, state=v_state) for v_state in self._v_state]  # they differ only in the state
         self._seen = np.zeros(columns, np.bool_)
 
     def _rasterizer(self, width: int, height: int) -> Rasterizer:
@@ -100,7 +100,7 @@ class CpuModel:
         return self._kept(self._rasterizers.get((width, height)) or Rasterizer(width, height))
 
     def _kept(self, rasterizer: Rasterizer) -> Rasterizer:
-        """Keep these buffers, and of other sizes the few used last."""
+        """Keep these buffers, and those of the few other sizes used last."""
         size = rasterizer.width, rasterizer.height
         self._rasterizers[size] = rasterizer
         self._rasterizers.move_to_end(size)
@@ -119,17 +119,17 @@ class CpuModel:
         return torch.from_numpy(self._seen[: self.count].copy())
 
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
-        """The Gaussians at time t on this camera's image."""
+        """Project the Gaussians at time t onto this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
         self._project_state(camera, sh_degree, self._rasterizer(*image_size(camera)))
 
     def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
-        """The Gaussians of the state on this camera's image."""
+        """Project the Gaussians of the state onto this camera's image."""
         self._place_state(camera, sh_degree, rasterizer)
         rasterizer.sort()
 
     def _place_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
-        """First half of that, after which the state is not needed any more."""
+        """First half of _project_state, after which the state may be overwritten."""
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
@@ -143,7 +143,7 @@ class CpuModel:
         return self.rasterizer.render(values)
 
     def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
-        """The same picture, to be blended in bands. Until it is closed, others of its size take other buffers."""
+        """The picture of render(), to be blended in bands. Until it is closed, others of its size use other buffers."""
         size = image_size(camera)
         rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)
         self.motion.deform(self.canonical, t, self.state)
@@ -166,7 +166,7 @@ class CpuModel:
         return np.concatenate(rows)[:, : self.count]
 
     def _shine(self, camera: NDArray[np.float64]) -> Floats:
-        """[N] derivative of the colour, of each of its channels, to the gloss."""
+        """[N] derivative of each colour channel by the gloss."""
         gloss: Floats = self.state[GLOSS_ROW]
         return np.float32(camera[SIDE]) - np.float32(camera[DIM]) * np.sign(gloss)
 
@@ -196,9 +196,9 @@ class CpuModel:
     def _backward(
         self, place: int, t: float, frames: Sequence[TrainingFrame], loss: LossSettings, sh_degree: int
     ) -> list[NDArray[np.float64]]:
-        """Add the gradients of the losses of all frames of a moment to those of the step; the losses' sums (StepSums).
+        """Compute the gradients of the losses of all frames at time t, which share one state; returns the losses' sums.
 
-        place: of the moment among those of the step. They share its state.
+        place: index of the moment in the step. All moments add to the same gradients but those of the state.
         """
         gradients, sums = self._gradients[place], []
         self.motion.deform(self.canonical, t, self.state, trains=True)
@@ -224,10 +224,10 @@ class CpuModel:
         return sums
 
     def wait(self) -> None:
-        """Every step has been waited for, and answered."""
+        """None: step() waits for the step and returns its sums."""
 
     def update_canonical(self, gradients: Gradients, rates: StepRates, iteration: int, sh_degree: int) -> None:
-        """One Adam step of everything but the motion, given dL/dcanonical."""
+        """One Adam step of all parameters but the motion's, given dL/dcanonical."""
         canonical, moments = self.canonical, self._moments["canonical"]
         groups = (
             (MEAN, rates.mean),
@@ -259,11 +259,11 @@ class CpuModel:
         self._allocate()
 
     def parameters(self) -> dict[str, Tensor]:
-        """What is trained, by name; views of the live arrays."""
+        """The trained arrays by name; views."""
         return {**self._views(self._parameters()), **self.motion.parameters(self.count)}
 
     def arrays(self) -> dict[str, Tensor]:
-        """Everything a resumed run needs, by name; views of the live arrays."""
+        """All arrays that a resumed run needs, by name; views."""
         moments = {f"moments.{name}": values for name, values in self._moments.items()}
         return {**self._views(self._parameters() | moments), **self.motion.arrays(self.count)}
 
@@ -271,7 +271,7 @@ class CpuModel:
         return {name: torch.from_numpy(values)[..., : self.count] for name, values in padded_arrays.items()}
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave, or some of it, into a model of the same size."""
+        """Load what arrays() returned, or some of it, into a model of the same size."""
         put_back(self.arrays(), stored)
 
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
@@ -320,7 +320,7 @@ def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: 
 
 
 def _flat(array: Floats) -> Floats:
-    """A view; reshape alone would hand the kernel a copy of a strided array, and its update would be lost."""
+    """A flat view. reshape alone would copy a strided array, and the kernel's update would be lost."""
     if not array.flags.c_contiguous:
         raise ValueError(f"an array of shape {array.shape} and strides {array.strides} has no flat view")
     return array.reshape(-1)

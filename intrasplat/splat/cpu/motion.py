@@ -1,4 +1,4 @@
-"""The motion in a training step, with Adam's moments: linear, FDM, or any other through autograd (unfused.py).
+"""A deformation in the form that a training step uses, with Adam's moments: linear, FDM, or by autograd (unfused.py).
 
 N Gaussians (padded), F frames per step, B bases, C channels (10, 13 or 14), rows of N floats.
 """
@@ -28,22 +28,22 @@ class Motion(Protocol):
     """A deformation that a step can evaluate and train."""
 
     def deform(self, canonical: Floats, t: float, state: Floats, *, trains: bool = False) -> None:
-        """state [ROWS, N] = canonical + psi(t). Where trains, update follows."""
+        """state [ROWS, N] = canonical + psi(t). trains: whether update() follows."""
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
         """One Adam step, iteration counted from 1, given dL/dstate [F, ROWS, N] at the F times of the last deforms.
 
-        Turns v_state into dL/dcanonical, frame by frame. A motion may train only the weights that reach these times.
+        Replaces v_state by dL/dcanonical, frame by frame. A motion may train only the weights in use at these times.
         """
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         """Keep these columns, in this order; moments start at 0 where fresh."""
 
     def parameters(self, count: int) -> dict[str, Tensor]:
-        """What is trained, of the first count Gaussians, by name; views."""
+        """The trained tensors of the first count Gaussians, by name; views."""
 
     def arrays(self, count: int) -> dict[str, Tensor]:
-        """Everything that must be stored to resume, likewise."""
+        """All tensors that must be stored to resume, of the first count Gaussians, by name; views."""
 
     def export(self, count: int, *, as_it_lies: bool = False) -> Deformation:
         """The first count Gaussians' deformation as torch tensors (copies); as_it_lies as in Model.export."""
@@ -51,7 +51,7 @@ class Motion(Protocol):
 
 def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
     """These columns of Adam's moments, 0 where fresh. Contiguous by rows, which indexing alone is not."""
-    if fresh.all():  # zeros that nothing reads take no memory
+    if fresh.all():  # zeros that are never written take no memory
         return np.zeros((*moments.shape[:-1], len(columns)), np.float32)
     kept = np.take(moments, columns, axis=-1)
     kept[..., fresh] = 0
@@ -77,11 +77,11 @@ class LinearMotion:
 
     def __init__(self, deformation: LinearDeformation, columns: int) -> None:
         count, channels, bases = deformation.weight.shape
-        # for its bases, not its weights
+        # used for its bases; it has no weights
         self._form = dataclasses.replace(deformation, weight=torch.zeros(0, channels, bases))
         self.weight = np.zeros((bases, channels, columns), np.float32)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).numpy()
-        # zeros, not zeros_like: a model that is only rendered never touches these, and so they take no memory
+        # zeros, not zeros_like: in a model that is only rendered these are never written, so they take no memory
         self.first, self.second = (np.zeros(self.weight.shape, np.float32) for _ in range(2))
         self.steps = np.zeros(bases, np.int64)
 
@@ -113,7 +113,7 @@ class LinearMotion:
         )  # fmt: skip
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
-        # one after the other, so that the old ones do not all wait for the new ones
+        # one after the other, so that old and new arrays are in memory for one of the three at a time
         self.first = kept_where_old(self.first, columns, fresh)
         self.second = kept_where_old(self.second, columns, fresh)
         self.weight = np.take(self.weight, columns, axis=-1)
@@ -174,12 +174,12 @@ class FdmMotion:
 
 
 def _views(motion: LinearMotion | FdmMotion, names: Sequence[str], count: int) -> dict[str, Tensor]:
-    """Arrays of a motion by name, the columns that only fill the last vector left out."""
+    """Arrays of a motion by name, without the padding columns."""
     return {f"motion.{name}": torch.from_numpy(getattr(motion, name))[..., :count] for name in names}
 
 
 def _copied(values: Floats, axes: tuple[int, int, int], *, as_it_lies: bool) -> Tensor:
-    """A copy with its axes in another order, contiguous, or in memory as values are, which is fast."""
+    """A copy with its axes permuted: contiguous, or with as_it_lies a view of a plain copy, which is faster."""
     if as_it_lies:
         return torch.from_numpy(values.copy()).permute(axes)
     return torch.from_numpy(np.ascontiguousarray(values.transpose(axes)))

@@ -1,4 +1,4 @@
-"""Gaussians to the image and back: the per-Gaussian half of the rasteriser.
+"""The per-Gaussian half of the rasteriser: projection onto the image, and its gradients.
 
 N Gaussians, stored as rows of N: state [10 or more, N] (intrasplat/splat/layout.py) deformed to the frame's time,
 opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPLAT floats:
@@ -7,10 +7,10 @@ opacity_logit [N], colour [3, N]. A splat is a Gaussian on the image, SPLAT floa
     5     lo = log2(opacity), so that alpha = 2**power2
     6 7 8 colour
     9     camera z
-    10    2**(2 k_yy): by this factor the ratio of alpha from row to row changes from row to row
+    10    2**(2 k_yy): the factor, per row, of the ratio of alpha between neighbouring rows (BEND of blend.py)
     11    a value of the caller's that is blended as colour is, at first 0
-Arithmetic is float64 on LANES Gaussians at once, storage float32; exponentials have float32's precision and end at
-2**MAX_LOG2_EXP, so no log-scale or logit, however far out, leaves the numbers.
+Arithmetic is float64 on LANES Gaussians at once, storage float32. Exponentials have float32's precision and are limited
+to 2**MAX_LOG2_EXP, so that results stay finite for any log-scale and logit.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 @kernel
 def _each(a, b):  # type: ignore[no-untyped-def]
-    """Product entry by entry."""
+    """Elementwise product."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
@@ -146,7 +146,7 @@ def _pose(camera):  # type: ignore[no-untyped-def]
 
 @kernel
 def _limits(camera):  # type: ignore[no-untyped-def]
-    """Least and greatest x / z and y / z at which J is taken (Camera.ratio_limits)."""
+    """Least and greatest x / z and y / z to which u and v are clamped (Camera.ratio_limits)."""
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
     width, height = camera[WIDTH], camera[HEIGHT]
     return (
@@ -159,7 +159,7 @@ def _limits(camera):  # type: ignore[no-untyped-def]
 
 @kernel
 def _low_pass(camera, mean, inverse_z):  # type: ignore[no-untyped-def]
-    """What is added to the variances along x and y."""
+    """The terms added to the variances along x and y, EPS2D m_x^2 and EPS2D m_y^2 (intrasplat/splat/camera.py)."""
     row = (camera[RECORDED], camera[RECORDED + 1], camera[RECORDED + 2])
     nearer = (_dot(row, mean) + camera[RECORDED + 3]) * inverse_z
     one = widen(splat(np.float32(1.0)))
@@ -169,13 +169,13 @@ def _low_pass(camera, mean, inverse_z):  # type: ignore[no-untyped-def]
 
 @kernel
 def _held(ratio, low, high):  # type: ignore[no-untyped-def]
-    """ratio within [low, high]."""
+    """ratio clamped to [low, high]."""
     return minimum(maximum(ratio, low), high)
 
 
 @kernel
 def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: ignore[no-untyped-def]
-    """extent2; -1 where there is no ellipse, or no pixel centre of the image within its reach."""
+    """extent2, or -1 where there is no ellipse, or no pixel centre of the image in its bounding box."""
     zero = widen(splat(np.float32(0.0)))
     culled = zero - 1.0
     visible = where_less(zero, det, extent2, culled)
@@ -189,7 +189,7 @@ def _unless_culled(extent2, z, det, centre, reach, width, height):  # type: igno
 
 @kernel
 def _store_splats(splats, at, centre, covariance, inverse_det, log2_opacity, z):  # type: ignore[no-untyped-def]
-    """All of LANES splats but their colour, from splats[at]."""
+    """Write LANES splats without their colour, from splats[at] on."""
     cxx, cxy, cyy = covariance
     k_yy = -0.5 * LOG2E * cxx * inverse_det
     store_strided(splats, at, SPLAT, narrow(centre[0]))
@@ -205,7 +205,7 @@ def _store_splats(splats, at, centre, covariance, inverse_det, log2_opacity, z):
 
 @kernel
 def _store_extents(extent, at, covariance, det, extent2, reach):  # type: ignore[no-untyped-def]
-    """What bins.EXTENT lists; the conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det."""
+    """Write the numbers of bins.EXTENT. The conic's a, b, c are cyy, -cxy, cxx over det, and ac - b^2 is 1 / det."""
     cxx, cxy, cyy = covariance
     inverse_cxx = 1.0 / cxx
     store_strided(extent, at, EXTENT, narrow(reach[0]))
@@ -220,10 +220,10 @@ def _store_extents(extent, at, covariance, det, extent2, reach):  # type: ignore
 def project(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, opacity_logit, colour, splats, radius2, extent
 ):
-    """Fill splats [N * SPLAT], extent [N * EXTENT] (bins.py) and radius2 [N]: 2 ln(opacity / MIN_ALPHA), the squared
-    Mahalanobis radius; -1 if culled, and then the others hold nothing of use.
+    """Fill splats [N * SPLAT], extent [N * EXTENT] (bins.py) and radius2 [N].
 
-    camera: float64 [CAMERA] (intrasplat/splat/layout.py).
+    radius2 is 2 ln(opacity / MIN_ALPHA), the squared Mahalanobis radius, or -1 for a culled Gaussian, whose other
+    numbers are meaningless. camera: float64 [CAMERA] (intrasplat/splat/layout.py).
     """
     fx, fy, cx, cy = camera[FX], camera[FY], camera[CX], camera[CY]
     width, height = camera[WIDTH], camera[HEIGHT]
@@ -286,7 +286,7 @@ def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _put(row, i, value, adds):  # type: ignore[no-untyped-def]
-    """LANES numbers into row[i], added to what is there if asked."""
+    """Write LANES numbers into row[i]; add them where adds is true."""
     if adds:
         value = load(row, i) + value
     store(row, i, value)
@@ -297,10 +297,10 @@ def project_backward(  # type: ignore[no-untyped-def]
     thread, threads, camera, state, opacity_logit, radius2, homes, sums, adds, adds_state,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
-    """Sum the blend's gradients of each Gaussian over its homes (bins.py) and carry them back to its parameters.
+    """Sum the blend's gradients of each Gaussian over its homes (bins.py), and compute those of its parameters.
 
-    sums [homes * GRADIENT]. Every v_* row is written (zeros for culled Gaussians). Where adds_state, v_state is added
-    to, and where adds, v_opacity_logit; v_mean2d_norm then keeps what is larger. v_mean2d_norm [N]: |dL/dmean2d| in
+    sums [homes * GRADIENT]. Every v_* row is written (zeros for culled Gaussians). adds_state adds to v_state; adds
+    adds to v_opacity_logit, and v_mean2d_norm becomes the larger of old and new. v_mean2d_norm [N]: |dL/dmean2d| in
     normalised device coordinates (x times W / 2, y times H / 2), the unit in which densification thresholds are
     published. v_pose [threads, 12]: the thread's share of dL/d camera_from_world.
 
@@ -323,11 +323,10 @@ def project_backward(  # type: ignore[no-untyped-def]
         store(v_colour[1], i, load_strided(totals, 1, GRADIENT))
         store(v_colour[2], i, load_strided(totals, 2, GRADIENT))
         odds = _exp(zero - widen(load(opacity_logit, i)))
-        # times 1 - opacity, exact also where opacity rounds to 1
+        # odds / (1 + odds) = 1 - opacity, exact also where opacity rounds to 1
         _put(v_opacity_logit, i, narrow(widen(load_strided(totals, 4, GRADIENT)) * odds / (1.0 + odds)), adds)
 
-        # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + the
-        # low-pass.
+        # Repeats the parts of the forward pass that are needed: B = A R, cov2d = B S^2 B^T + the low-pass.
         mean = _rows_of(state, MEAN_ROW, i)
         x, y, z = _dot(w[0], mean) + shift[0], _dot(w[1], mean) + shift[1], _dot(w[2], mean) + shift[2]
         inverse_z = 1.0 / z

@@ -1,4 +1,4 @@
-"""One image size, one set of buffers: project, bin, blend and their gradients by the kernels of this folder.
+"""The buffers of one image size, and the calls of the kernels: project, bin, blend and their gradients.
 
 N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays are NumPy, rows of N (project.py).
 """
@@ -22,7 +22,7 @@ _NO_LOSS = np.zeros(5, np.float32)
 
 
 def _aligned(rows: int, columns: int) -> Floats:
-    """Zeros whose rows begin where cache lines begin, if columns is a multiple of 16: no vector straddles two."""
+    """Zeros whose rows are aligned to cache lines if columns is a multiple of 16, so that no vector straddles two."""
     raw = np.zeros(rows * columns + 16, np.float32)
     start = -(raw.ctypes.data // 4) % 16
     return raw[start : start + rows * columns].reshape(rows, columns)
@@ -37,7 +37,7 @@ def padded(count: int) -> int:
 class Gradients:
     """dL/d of every Gaussian's deformed state, opacity logit and colour, and of camera_from_world; |dL/dmean2d|.
 
-    Of several frames, those of the state, of the opacity and the norm are of all; the others of the last.
+    With several frames per step, colour and pose are those of the last frame, the others those of all frames.
     """
 
     state: Floats  # [ROWS, N]; COLOUR and GLOSS are the caller's to fill
@@ -48,7 +48,7 @@ class Gradients:
 
     @classmethod
     def room(cls, state: Floats) -> Gradients:
-        """Zeros for as many Gaussians as state has, [ROWS, N], which becomes a part of them."""
+        """Gradients of zeros for N Gaussians that use `state` [ROWS, N] as their array of the state."""
         count = state.shape[1]
         logit, norm = np.zeros((2, count), np.float32)
         return cls(state, logit, np.zeros((3, count), np.float32), norm, np.zeros((thread_count(), 12)))
@@ -88,17 +88,17 @@ class Rasterizer:
         self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
 
     def _allocate_slots(self, slots: int, homes: int) -> None:
-        """Room for so many per thread."""
+        """Allocate so many slots and homes per thread."""
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
+        """Project and list each tile's splats. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         self.place(camera, state, opacity_logit, colour)
         self.sort()
 
     def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """First half of project: the splats on the image."""
+        """First half of project: compute the splats on the image."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
@@ -109,7 +109,7 @@ class Rasterizer:
         )  # fmt: skip
 
     def sort(self) -> None:
-        """Second half of project: the slots and homes of every splat, and the slots of every tile, nearest first."""
+        """Second half of project: the slots and homes of every splat, and the entries of every tile, nearest first."""
         if not self._filled():
             self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
@@ -121,7 +121,7 @@ class Rasterizer:
         )  # fmt: skip
 
     def _filled(self) -> bool:
-        """Write the slots; False where a thread's region is too small for its own."""
+        """Write the slots; False if a thread's region is too small for them."""
         run(
             bins.fill_slots, self.splats, self.radius2, self._extent, self.height, self.tiles_x,
             len(self._sums) // bins.GRADIENT, self.slot_start, self._slot_count, self._slot_info, self._homes,
@@ -130,15 +130,15 @@ class Rasterizer:
         return bool((self._needed() <= self._regions()).all())
 
     def _regions(self) -> NDArray[np.int64]:
-        """Slots and homes that a thread has room for."""
+        """Capacity of a thread's region: slots and homes."""
         return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // self.threads
 
     def _needed(self) -> NDArray[np.int64]:
-        """Slots and homes of the thread that has most."""
+        """The most slots, and the most homes, that a thread needs."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
     def _reserve(self) -> None:
-        """Room for what a thread keeps of the fullest tile; untouched memory costs nothing."""
+        """Allocate a thread's scratch for the fullest tile; pages that are never written take no memory."""
         most = int(np.diff(self._tile_start).max()) * bins.TILE_ROWS
         if self._spans.shape[1] < most:
             most = most * 5 // 4
@@ -147,7 +147,7 @@ class Rasterizer:
             self._trail = _aligned(self.threads, most * 2 * LANES)
 
     def _empty_homes(self) -> None:
-        """Zeros in what the gradients are added to."""
+        """Set the homes to 0."""
         _, region = self._regions()
         for thread, (_, end) in enumerate(self._region_end):
             self._sums[thread * region * bins.GRADIENT : end * bins.GRADIENT] = 0
@@ -155,7 +155,7 @@ class Rasterizer:
     def blend(
         self, mode: int, target: Target, loss_settings: Floats, image: Floats, bands: tuple[int, int] | None = None
     ) -> None:
-        """The kernel in one of its modes (blend.py). bands: first and end of the rows of tiles; None: all."""
+        """Run the kernel in one of its modes (blend.py). bands: first and end of the rows of tiles; None: all."""
         self._reserve()
         if mode != RENDER:
             self._empty_homes()
@@ -184,7 +184,7 @@ class Rasterizer:
     def render_rows(self, first: int, end: int) -> Floats:
         """Rows of tiles [first, end) of the projected splats: R G B Z A and the values that are set, [6, h, W].
 
-        A view of these rows of a buffer. Rows rendered apart have the same bits as in one call.
+        A view of these rows of a buffer, bit-identical to those of a render of all rows.
         """
         self.blend(RENDER, self._no_target, _NO_LOSS, self.image, (first, end))
         rows = slice(first * bins.TILE_ROWS, min(end * bins.TILE_ROWS, self.height))
@@ -201,8 +201,8 @@ class Rasterizer:
     ) -> Gradients:
         """Gradients of the built-in loss (blend.py, _loss) against target; statistics holds its sums per tile.
 
-        out: where they are written; None: where the next ones will be, too. adds: out holds those of other frames,
-        which these are added to; adds_state: those of the state, too.
+        out: where they are written; None: a buffer that the next call overwrites. adds, adds_state: whether to add to
+        out instead, as project_backward of project.py describes.
         """
         self.blend(LOSS, target, loss_settings, self.image)
         return self.carry_back(out, adds=adds, adds_state=adds_state)
@@ -215,7 +215,7 @@ class Rasterizer:
         return self.carry_back()
 
     def carry_back(self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False) -> Gradients:
-        """The slots' gradients, left by blend, to the parameters of their Gaussians."""
+        """Gradients of the Gaussians' parameters from those in the homes, which blend has summed."""
         out = out or self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,

@@ -1,4 +1,4 @@
-"""What kernels do with explicit vectors (vectors.py):
+"""Operations on explicit vectors (vectors.py), for kernels:
 
     a + b, a - b, a * b, a / b  of equal types, or one of them a plain number
     load(row, i)                LANES floats from row[i:]              load_bytes(row, i)   uint8 as floats
@@ -14,8 +14,8 @@
     add_sums(row, i, a, b, c, d)     the four lane sums added to row[i : i + 4]
     claim(counter)              counter[0]++, for threads that share work
 
-Arrays are 1-D, C-contiguous and of float32 (load_bytes: uint8; claim: int64); a kernel with any other is refused when
-it is compiled: the address arithmetic would read other memory. So would an index from the end, which nothing notices.
+Arrays are 1-D, C-contiguous and of float32 (load_bytes: uint8; claim: int64). Compiling a kernel with any other fails,
+because the address arithmetic would read other memory. So would a negative index, which is not checked.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ def _whole(value: int) -> ir.Constant:
 
 
 def _call(builder: Any, kind: VectorType, name: str, *args: Any) -> Any:
-    """An LLVM intrinsic on vectors; llvmlite cannot derive the suffix of a vector type, so it is spelt out."""
+    """An LLVM intrinsic on vectors, with the suffix of the vector type, which llvmlite cannot derive."""
     function = ir.FunctionType(kind.llvm, [kind.llvm] * len(args))
     return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.{kind.suffix}", fnty=function), args)
 
 
 def _check_dense(array: Any, element: Any = types.float32) -> None:
-    """Addresses are computed from the first element alone: a strided array would be read at the wrong place."""
+    """Refuse a strided array: addresses are computed from the first element, so it would be read at wrong places."""
     if not isinstance(array, types.Array) or (array.ndim, array.layout, array.dtype) != (1, "C", element):
         raise TypingError(f"vectors read and write 1-D C-contiguous arrays of {element}, not {array}")
 
@@ -381,7 +381,7 @@ def add_sums(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any
 
 @intrinsic
 def claim(typing: Any, counter: Any) -> Any:
-    """counter[0], which is then one more: no two threads get the same number."""
+    """counter[0], which is then incremented atomically: no two threads get the same number."""
     _check_dense(counter, types.int64)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -1,10 +1,10 @@
-"""Run a kernel on every core. Kernels hold no GIL and take (thread, threads, ...) as their first arguments.
+"""Run a kernel on every core. Kernels release the GIL and take (thread, threads, ...) as their first arguments.
 
 Plain threads instead of Numba's ``prange``: half the compilation time, no shared threading layer (a render may run
-beside training), and a fixed share for each thread, so that the same machine gives the same bits.
+beside training), and a fixed share for each thread, so that results on one machine are bit-identical.
 
-Callers may come from several threads at once: all share one pool, and none waits for another, because a kernel never
-starts a kernel; each caller works on its own first share meanwhile.
+Several threads may call run() at once and share one pool. They cannot deadlock, because a kernel never starts a kernel.
+Each caller computes its own first share.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from intrasplat.machine.parts import Parts
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
 
 WAKE_S = 0.002
-"""A part of beside(): what comes meanwhile waits no longer."""
+"""Longest part of beside(): work that arrives meanwhile waits at most so long."""
 
 T = TypeVar("T")
 
 _own = threading.local()
-"""Of each calling thread: elsewhere_s, CPU seconds that its kernels used on other threads; is_alone."""
+"""Per calling thread: elsewhere_s, the CPU seconds that its kernels used on other threads; is_alone, see alone()."""
 
 
 def _available_cores() -> int:
@@ -56,7 +56,7 @@ def thread_count() -> int:
 
 @cache
 def _pool(process_id: int) -> ThreadPoolExecutor:
-    del process_id  # a forked process inherits the pool's object but none of its threads: it needs one of its own
+    del process_id  # the key of the cache: a forked process inherits the pool without its threads, so needs its own
     return ThreadPoolExecutor(max_workers=max(1, thread_count() - 1), thread_name_prefix="raster")
 
 
@@ -67,9 +67,9 @@ def _beside(process_id: int) -> ThreadPoolExecutor:
 
 
 def run(kernel: Callable[..., object], *args: object) -> None:
-    """Call kernel(thread, threads, *args) for each share, each on a thread of its own unless alone(), and wait for all.
+    """Call kernel(thread, threads, *args) for each share and wait for all; an error in any of them is raised here.
 
-    An error in any is raised here.
+    Each share runs on a thread of its own, or within alone() all on this one.
     """
     threads = thread_count()
     if getattr(_own, "is_alone", False):
@@ -85,9 +85,9 @@ def run(kernel: Callable[..., object], *args: object) -> None:
 
 
 def flushing(kernel: Callable[..., object]) -> Callable[..., None]:
-    """The kernel, in which subnormal numbers count as 0, on whatever thread it runs.
+    """The kernel with subnormal numbers flushed to 0, on any thread.
 
-    Adam's moments fade through them, and an Intel core takes a hundred cycles and more for each.
+    Decaying moments of Adam become subnormal, and an Intel core takes a hundred cycles and more for each.
     """
 
     def flushed(*args: object) -> None:
@@ -102,9 +102,9 @@ def flushing(kernel: Callable[..., object]) -> Callable[..., None]:
 
 @contextmanager
 def alone(*, is_alone: bool = True) -> Iterator[None]:
-    """Kernels that this thread runs meanwhile use no other thread, and come to the same bits.
+    """Within the with statement this thread's kernels use no other thread; results are bit-identical.
 
-    Shares of a render in the pool would keep those of a training step waiting.
+    Otherwise shares of a render in the pool would delay those of a training step.
     """
     before, _own.is_alone = getattr(_own, "is_alone", False), is_alone
     try:
@@ -114,9 +114,9 @@ def alone(*, is_alone: bool = True) -> Iterator[None]:
 
 
 def beside(work: Callable[[], T]) -> Parts[T]:
-    """What work() returns. Another thread does it, and this one waits for it, WAKE_S in each part.
+    """The result of work(), which runs on another thread while this one waits in parts of WAKE_S.
 
-    Its CPU seconds count as this thread's. If the parts are closed, the work ends by itself.
+    Its CPU seconds count as this thread's. If the parts are closed, the work still runs to its end.
     """
     spent_s = 0.0
 
@@ -136,12 +136,12 @@ def beside(work: Callable[[], T]) -> Parts[T]:
 
 
 def cpu_time_s() -> float:
-    """CPU seconds that this thread has used so far, with what its kernels used on other threads."""
+    """CPU seconds that this thread, and its kernels on other threads, have used so far."""
     return time.thread_time() + float(getattr(_own, "elsewhere_s", 0.0))
 
 
 def _timed(kernel: Callable[..., object], *args: object) -> float:
-    """Call the kernel; the CPU seconds that it took."""
+    """Call the kernel; return its CPU seconds."""
     start_s = time.thread_time()
     kernel(*args)
     return time.thread_time() - start_s

@@ -1,7 +1,7 @@
-"""The motion of a deformation without kernels of its own: torch moves the Gaussians and differentiates.
+"""The motion of a deformation without kernels: torch evaluates and differentiates it.
 
-The rest of a step is that of every motion, so two deformations compared with each other differ in nothing else. Only
-the time of a step is not comparable: tables of speed must say so.
+The rest of a step is the same for every motion, so deformations can be compared. Only the time of a step is not
+comparable, and tables of speed must say so.
 
 Symbols: N Gaussians (padded to whole vectors), rows of N floats, F frames per step; canonical and state [ROWS, N].
 """
@@ -23,16 +23,16 @@ from intrasplat.splat.optimize import AdamStep, StepRates, adam_step
 
 
 class AutogradMotion:
-    """Any deformation as a Motion: its offsets by torch, its gradients by autograd, dense Adam on all its parameters.
+    """Any deformation as a Motion: offsets by torch, gradients by autograd, dense Adam on all its parameters.
 
-    Every parameter has the rate motion_mean: a network's weights belong to no kind of channel.
+    Every parameter has the rate motion_mean, because a network's weights belong to no kind of channel.
     """
 
     def __init__(self, deformation: Deformation, count: int, columns: int) -> None:
         padding = torch.zeros(columns - count, dtype=torch.int64)  # copies of the first Gaussian; never drawn
         self._adopt(deformation.select(torch.cat([torch.arange(count), padding])))
         self._moments = {name: torch.zeros(2, *each.shape) for name, each in self._parameters.items()}
-        self._graphs: list[tuple[Tensor, Tensor]] = []  # a step's canonical states, and what became of each
+        self._graphs: list[tuple[Tensor, Tensor]] = []  # a step's canonical states, and each one's deformed state
 
     def _adopt(self, deformation: Deformation) -> None:
         """Train copies of this deformation's parameters from here on."""
@@ -45,7 +45,7 @@ class AutogradMotion:
         """state = canonical + offsets at t; where trains, keeps the graph for update.
 
         Raises:
-            TrainingDiverged: a mean is not finite. Torch would look it up outside the planes' memory and crash.
+            TrainingDiverged: a mean is not finite. A deformation that samples planes at it would crash.
         """
         if not np.isfinite(canonical[MEAN]).all():
             raise TrainingDiverged("A Gaussian's place is no longer a number.")
@@ -57,10 +57,10 @@ class AutogradMotion:
         state[:] = moved.detach().T.numpy()
 
     def update(self, v_state: Floats, times: Sequence[float], rates: StepRates, iteration: int) -> None:
-        """One Adam step, given dL/dstate [F, ROWS, N] at the times deformed to since the last; turns it into
-        dL/dcanonical.
+        """One Adam step, given dL/dstate [F, ROWS, N] at the times of the deforms since the last update.
 
-        The two differ where offsets depend on the canonical state: a field of offsets is sampled at the mean.
+        Replaces v_state by dL/dcanonical. The two differ if offsets depend on the canonical state, for instance if a
+        field of offsets is sampled at the mean.
         """
         starts, moved = zip(*self._graphs, strict=True)
         self._graphs.clear()
@@ -86,7 +86,7 @@ class AutogradMotion:
         self._adopt(taken)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
-        """What is trained, by name; views. The Gaussians that only fill the last vector are among them, if any are."""
+        """The trained tensors by name; views. Per-Gaussian ones include the padding columns."""
         return {f"motion.{name}": each.detach() for name, each in self._parameters.items()}
 
     def arrays(self, count: int) -> dict[str, Tensor]:
@@ -102,7 +102,7 @@ class AutogradMotion:
 
 
 def _deformed(deformation: Deformation, canonical: Tensor, t: float) -> Tensor:
-    """Canonical rows [N, ROWS] at time t. Opacity and the other harmonics do not move and are not asked for."""
+    """Canonical rows [N, ROWS] deformed to time t. Opacity and the higher harmonics do not move."""
     gaussians = Gaussians(
         mean=canonical[:, MEAN],
         quaternion=canonical[:, QUATERNION],

@@ -1,10 +1,10 @@
 """Deformation and Adam: the per-parameter half of a training step.
 
 N Gaussians padded to a multiple of LANES, B bases, F frames per step. The canonical state has the ROWS of
-intrasplat/splat/layout.py; FDM moves the first CHANNELS of them, shared bases those or all. Rows of N floats
-everywhere, so that a vector is LANES Gaussians; a gradient is a sum over the frames, in their order. Adam (Kingma and
-Ba 2015) with bias correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and eps scaled by the
-same square root.
+intrasplat/splat/layout.py. FDM moves the first CHANNELS of them, shared bases those, those and the colour, or all.
+Arrays are rows of N floats, so that a vector is LANES Gaussians. A gradient is a sum over the frames, in their order.
+Adam (Kingma and Ba 2015) has its bias correction folded into the step: rate = lr sqrt(1 - beta2^k) / (1 - beta1^k), and
+eps is scaled by the same square root.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _adam(value, first, second, i, gradient, rate, eps, beta1, beta2):  # type: 
 
 @kernel(inline="always")
 def _scaled_step(value, second, i, gradient, rate, eps, beta2):  # type: ignore[no-untyped-def]
-    """_adam with beta1 = 0. The first moment would be the gradient: it is neither read nor written."""
+    """_adam with beta1 = 0: the first moment would be the gradient, so it is neither read nor written."""
     v = fma(splat(beta2), load(second, i), splat(_ONE - beta2) * gradient * gradient)
     store(second, i, v)
     store(value, i, load(value, i) - rate * gradient / (sqrt(v) + eps))
@@ -53,7 +53,7 @@ def adam(thread, threads, value, gradient, first, second, rate, eps, beta1, beta
 def deform_shared(thread, threads, canonical, weight, basis, first, last, state):  # type: ignore[no-untyped-def]
     """state [ROWS, N] = canonical + sum over j in [first, last) of basis[j] weight[j]; weight [B, C, N], C <= ROWS."""
     vectors = canonical.shape[1] // LANES
-    for c in range(ROWS):  # outermost, for a processor follows a few streams of memory, not a hundred
+    for c in range(ROWS):  # outermost, because a processor prefetches a few streams of memory, not a hundred
         for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
             i = k * LANES
             total = load(canonical[c], i)
@@ -123,7 +123,7 @@ def deform_fdm(thread, threads, canonical, weight, centre, width, t, quartic, st
         for k in range(first, last):
             store(state[c], k * LANES, load(canonical[c], k * LANES))
     for c in range(CHANNELS):
-        for start in range(first, last, _STRETCH):  # the sums stay in the cache, and few streams of memory are followed
+        for start in range(first, last, _STRETCH):  # the sums stay in the cache, and few streams of memory are read
             end = min(start + _STRETCH, last)
             for k in range(start, end):
                 store(state[c], k * LANES, load(canonical[c], k * LANES))
@@ -166,7 +166,7 @@ def update_fdm(  # type: ignore[no-untyped-def]
             w, o, s = weight[c, j], centre[c, j], width[c, j]
             m = first_moment[0, c, j], first_moment[1, c, j], first_moment[2, c, j]
             v = second_moment[0, c, j], second_moment[1, c, j], second_moment[2, c, j]
-            if frames == 1:  # apart, for the loop within the other one makes it slower by a tenth
+            if frames == 1:  # a loop of its own, because the loop over frames makes it slower by a tenth
                 for k in range(begin, end):
                     gradients = _through_fdm(v_state[0, c], w, o, s, k * LANES, time, quartic)
                     _adam_fdm(w, o, s, m, v, k * LANES, gradients, step, floor, beta1, beta2)

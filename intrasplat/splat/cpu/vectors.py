@@ -1,9 +1,8 @@
 """Vector types for Numba kernels: LANES pixels of one row, or LANES Gaussians, in one register.
 
-Numba's automatic vectoriser gives up on the blend loop (too many arrays to prove disjoint) and keeps the per-Gaussian
-sums in memory. A type of its own removes both: what is written as ``a * b + c`` on vectors is one instruction on LANES
-numbers, on any processor LLVM knows (AVX2 and AVX-512 on x86, NEON registers on Arm). What else can be done with them
-is in simd.py.
+Numba's automatic vectoriser fails on the blend loop, because it cannot prove so many arrays disjoint, and it keeps the
+per-Gaussian sums in memory. With a type of our own, ``a * b + c`` on vectors compiles to vector instructions on LANES
+numbers, on any processor that LLVM supports (AVX2 and AVX-512 on x86, NEON on Arm). simd.py has the other operations.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import lower_builtin, models, register_model
 
 LANES = 8
-"""Numbers in a vector. Eight beats sixteen on Zen 4: a tile strip this narrow wastes fewer pixels beside a splat."""
+"""Numbers in a vector. Eight is faster than sixteen on Zen 4: a narrower tile has fewer pixels that a splat misses."""
 
 
 class VectorType(types.Type):

@@ -2,7 +2,7 @@
 
 bins, geometry -> project -> project_backward -> blend -> rasterizer (buffers and launches) -> autograd (rasterize).
 
-Importing it needs Triton, which comes with torch's CUDA wheels; nothing outside imports it unless a GPU was asked for.
+Importing it needs Triton, which comes with torch's CUDA wheels. Other packages import it only if a GPU is requested.
 The interpreter is chosen when Triton is first imported, by TRITON_INTERPRET=1 in the environment.
 """
 

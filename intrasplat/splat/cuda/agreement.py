@@ -1,7 +1,7 @@
-"""Check once a process, before the first job, that the device splats as the reference does.
+"""Check once per process, before the first job, that the device's images and gradients match the reference.
 
-Any GPU, driver or version of Triton may be wrong. So a small fixed scene is rendered and differentiated on the device,
-and by intrasplat/splat/reference.py in float64.
+Any GPU, driver or version of Triton may have errors. So a small fixed scene is rendered and differentiated on the
+device, and by intrasplat/splat/reference.py in float64.
 
 Symbols: N Gaussians, H W pixels.
 """
@@ -21,20 +21,20 @@ from intrasplat.splat.cuda.autograd import rasterize
 from intrasplat.splat.cuda.captured import one_at_a_time
 
 LIMIT = 1e-2
-"""Norm of a difference over the norm of what is right. Rounding gives 1e-5; a pixel where it decides about a faint
-Gaussian may give a hundred times that; what is wrong gives 1."""
+"""Largest norm of a difference over the norm of the reference. Rounding gives 1e-5; at a pixel where it decides whether
+a faint Gaussian is drawn, up to a hundred times that. An error gives 1."""
 COUNT, WIDTH, HEIGHT = 32, 20, 13
 _PARTS = ("mean", "quaternion", "scale", "opacity", "colour")
 
 
 @cache
 def check(memory: str, name: str) -> None:
-    """Compare both once; memory: the device as torch calls it, name: the GPU's own.
+    """Compare both once. memory: torch's name of the device; name: the GPU's product name.
 
     Raises:
         UnavailableError: they differ by more than LIMIT, so nothing that this device computes can be trusted.
     """
-    with one_at_a_time:  # the first scene may be rendered while the first job begins
+    with one_at_a_time:  # the first render may run while the first job starts
         worst, part = disagreement(torch.device(memory))
     if not worst <= LIMIT:  # so that NaN is wrong, too
         raise UnavailableError(
@@ -44,7 +44,7 @@ def check(memory: str, name: str) -> None:
 
 
 def disagreement(device: torch.device) -> tuple[float, str]:
-    """The largest relative difference, NaN if there is one, and of what: the image, or a gradient."""
+    """The largest relative difference, or NaN if one is NaN, and the name of the image or gradient that has it."""
     right = _splatted(reference.rasterize, torch.device("cpu"), torch.float64)
     found = _splatted(rasterize, device, torch.float32)
     differences = {

@@ -1,4 +1,4 @@
-"""rasterize() with gradients by torch on the device."""
+"""The GPU's rasterize(), with gradients by torch.autograd."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class _Rasterize(torch.autograd.Function):
 def rasterize(
     mean: Tensor, quaternion: Tensor, scale: Tensor, opacity: Tensor, colour: Tensor, camera: Camera
 ) -> Rendered:
-    """See intrasplat/splat/camera.py float32 on the device of mean; gradients by torch.autograd.
+    """rasterize() of intrasplat/splat/camera.py in float32 on the device of mean; gradients by torch.autograd.
 
     Raises:
         ValueError: shapes that do not belong together.

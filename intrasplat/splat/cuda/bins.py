@@ -1,18 +1,18 @@
-"""Which splats touch which tile, on the device and without asking it how many: everything is padded to a capacity.
+"""Lists the splats of each tile on the device. Arrays are padded to a capacity, so the host never reads their length.
 
 Symbols: N Gaussians, F frames, M slots (the capacity). A slot is one (splat, tile) pair, an instance.
 
-A splat's slots are consecutive, splats nearest first; sorting the slots by tile, stably, gives every tile its
-instances, nearest first. So two sorts do (torch.sort): the F N depths as one 32-bit key each, and the M tiles, whose
-keys are 16 bits wide wherever that many tiles fit: half the passes of 32.
+A splat's slots are consecutive, splats nearest first. A stable sort of the slots by tile then gives every tile its
+instances, nearest first. So there are two sorts (torch.sort): of the F N depths, with 32-bit keys, and of the M tiles,
+with 16-bit keys if so many tiles fit: half the passes of 32.
 
     count [F N]   how many tiles the splat touches (written by project.py)
     ends [F N]    running sum of count in depth order: the slots of rank r are ends[r] - count ... ends[r] - 1
     key, owner [M]  tile and splat of a slot; NO_TILE = F tiles beyond the last, so that sorting moves it to the end
 
-Tiles are exact: of each row of tiles, those columns are taken that the ellipse alpha = MIN_ALPHA reaches at one of the
-row's pixel centres. fill_slots does not hand its work out by splat but by slot, so a splat that covers the image is as
-much work as others, not the time of the whole kernel.
+Tiles are exact: in each row of tiles, a splat touches the columns that the ellipse alpha = MIN_ALPHA reaches at one of
+the row's pixel centres. fill_slots gives each thread a slot, not a splat, so that a splat that covers the image does
+not delay the whole kernel.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ import triton
 import triton.language as tl
 
 TILE_WIDTH, TILE_HEIGHT = 8, 8
-"""Pixels. A smaller tile evaluates fewer pixels beside a splat and has more instances to sort: 8 x 8 halves the pixels
-of 16 x 16, 8 x 4 would save another fifth and have 1.6 times the instances."""
+"""Pixels. A smaller tile evaluates fewer pixels that a splat misses, but gives more instances to sort: 8 x 8 halves the
+pixels of 16 x 16; 8 x 4 would save another fifth, with 1.6 times the instances."""
 EXTENT = 8
-"""Floats that tell which tiles a splat touches: its centre, the half-height of the ellipse, the dy at which it reaches
-furthest to the right; the middle of its chord at dy, over dy; and the square of half a chord at dy = 0, and how much
-that loses with dy^2. One spare."""
+"""Floats that decide which tiles a splat touches: its centre; the half-height of the ellipse; the dy of its rightmost
+point; the middle of its chord at dy, over dy; the square of half a chord at dy = 0; and the decrease of that square
+with dy^2. One is spare."""
 SLOT = 16
 """Floats of an instance's gradient (blend.py): the moments 1, x, y, xx, xy, yy of dL/dpower about the tile's middle, x
 and y of that middle, and dL/d(r, g, b, z) as 8:12 plus 12:16."""
 FILL_BLOCK = 256
 MAX_FRAMES = 16
-"""Frames whose depths can be sorted as one: 4 bits of a depth key."""
+"""Frames whose depths can be sorted together: their number has 4 bits of a depth key."""
 DEPTH_BITS = 28
-"""Bits of a depth's key, a float32 above NEAR: 32 powers of two, exactly; farther is all the same."""
+"""Bits of a depth in its key: exact for 32 powers of two above NEAR; all greater depths have one key."""
 
 _EXTENT = tl.constexpr(EXTENT)
 _SLACK = tl.constexpr(2e-3)  # pixels by which bounds are widened, against rounding; every pixel is tested anyway
@@ -42,7 +42,7 @@ _SLACK = tl.constexpr(2e-3)  # pixels by which bounds are widened, against round
 
 @triton.jit
 def rows_of(mean_y, reach, rows, TILE_H: tl.constexpr):  # type: ignore[no-untyped-def]
-    """First and last row of tiles that a splat's ellipse may touch; last < first where none."""
+    """First and last row of tiles that a splat's ellipse may touch; last < first if there is none."""
     half = 0.5 + _SLACK
     first = tl.floor((mean_y - reach - half) * (1.0 / TILE_H))
     last = tl.floor((mean_y + reach - 0.5 + _SLACK) * (1.0 / TILE_H))
@@ -59,8 +59,8 @@ def columns_of(  # type: ignore[no-untyped-def]
     """First tile and number of tiles in a row of tiles that the splat's ellipse touches.
 
     The right branch lean dy + sqrt(square - fall dy^2) is concave in dy, so its maximum over the row's pixel centres is
-    at the ellipse's own extreme point clamped to them; the left one is its mirror image. Called by two kernels, which
-    must agree to the last bit: so products that are added are fused here, and never by the compiler's choice.
+    at the ellipse's own extreme point clamped to them; the left one is its mirror image. Two kernels call this and must
+    get bit-identical results, so multiply-adds are fused explicitly, not by the compiler.
     """
     top = (row * TILE_H).to(tl.float32) + 0.5 - mean_y
     bottom = tl.minimum(row * TILE_H + (TILE_H - 1), height - 1).to(tl.float32) + 0.5 - mean_y
@@ -82,7 +82,7 @@ def count_tiles(  # type: ignore[no-untyped-def]
     mean_x, mean_y, reach, turn, lean, square, fall, drawn, width, height, rows,
     TILE_W: tl.constexpr, TILE_H: tl.constexpr,
 ):  # fmt: skip
-    """Tiles that each splat touches; 0 where it is not drawn."""
+    """The number of tiles that each splat touches; 0 if it is not drawn."""
     row, last = rows_of(mean_y, reach, rows, TILE_H)
     last = tl.where(drawn, last, -1)
     total = tl.zeros_like(row)
@@ -101,7 +101,7 @@ def fill_slots(  # type: ignore[no-untyped-def]
     capacity, splats, gaussians, width, height, tiles_x, rows, no_tile, stride,
     TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """key and owner of every slot, slot_start [F N] of every splat that has one; needed and ok (rasterizer.py).
+    """Write key and owner of every slot, slot_start [F N] of every splat with a slot, needed and ok (rasterizer.py).
 
     ends int64 [F N], order int64 [F N]: the splats, nearest first, frame after frame. splats = F N, gaussians = N;
     stride: the largest power of two up to F N.

@@ -1,22 +1,21 @@
-"""The blend on the device: compositing, the loss, and the gradients of every splat, a tile per program.
+"""The blend on the device: compositing, the loss, and the gradients of every splat; one program per tile.
 
 Symbols: K splats of a chunk (axis 0), P pixels of a tile (axis 1); for one pixel and its splats i, nearest first,
     alpha_i = min(MAX_ALPHA, 2**power2_i), 0 below MIN_ALPHA or once T < MIN_TRANSMITTANCE
     T_i     = product over j < i of (1 - alpha_j);  w_i = alpha_i T_i
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
-    B_(i-1) = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0: what lies behind splat i - 1, as if it were alone
-    dL/dpower_i = w_i (s_i - B_i), 0 where alpha was capped
-as in intrasplat/splat/cpu/blend.py. The forward pass leaves T before each chunk in memory, and the backward pass
-computes a chunk's alphas again. Derivations: docs/rasterizer.md; the loss: intrasplat/splat/loss.py.
+    B_(i-1) = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0: the blend of s of the splats behind splat i - 1
+    dL/dpower_i = w_i (s_i - B_i), 0 where alpha was clamped to MAX_ALPHA
+as in intrasplat/splat/cpu/blend.py. The forward pass stores T before each chunk, and the backward pass computes a
+chunk's alphas again. Derivations: docs/rasterizer.md; the loss: intrasplat/splat/loss.py.
 
-Layout. Pixels lie along the lanes and all K splats of a pixel in one thread: products, sums and steps from splat to
-splat need no shuffle. A program is one warp, so its barriers cost nothing; what keeps the processor busy is the
-K P / 32 independent numbers that a thread works on. Sums over pixels are matrix products on the tensor cores: dL/dpower
-times the monomials 1 x y xx xy yy of the pixel (relative to the tile's middle), and w times g. One operand is split
-into two parts of 11 bits, hence exact to 2^-22; the monomials have few enough bits to be exact, and g is split too,
-into 8 columns.
+Layout. Pixels lie along the lanes, and one thread has all K splats of a pixel: products, sums and steps from splat to
+splat need no shuffle. A program is one warp, so its barriers cost nothing. The K P / 32 independent numbers of a thread
+hide latency. Sums over pixels are matrix products on the tensor cores: dL/dpower times the monomials 1 x y xx xy yy of
+the pixel (relative to the tile's middle), and w times g. One operand is split into two parts of 11 bits, hence exact to
+2^-22. The monomials have few enough bits to be exact, and g is split too, into 8 columns.
 
-Each instance's gradient goes to its own slot (bins.py). No atomics, so the same inputs give the same bits.
+Each instance's gradient is written to its own slot (bins.py). There are no atomics, so results are bit-identical.
 """
 
 from __future__ import annotations
@@ -29,12 +28,13 @@ from intrasplat.splat.cuda.bins import SLOT
 from intrasplat.splat.cuda.project import RECORD
 
 CHUNK = 16
-"""Splats per chunk: the least a matrix product takes, and K P / 32 = 32 registers per intermediate."""
+"""Splats per chunk: the smallest size of a matrix product; an intermediate has K P / 32 = 32 registers."""
 WARPS = 1
 STATISTICS = 4
-"""Sums that a tile reports: colour loss, depth loss, squared colour error (of channels), |1 - A| over tissue."""
+"""Sums of a tile over tissue: colour L1, depth L1, squared error of the colour channels, 1 - A."""
 RENDER, LOSS, COTANGENT = 0, 1, 2
-"""Modes: images only; images never, gradients of the built-in loss; gradients of given image cotangents."""
+"""Modes. RENDER writes images. LOSS computes gradients of the built-in loss and writes no image. COTANGENT computes
+gradients from given image gradients."""
 
 _RECORD = tl.constexpr(RECORD)
 _SLOT = tl.constexpr(SLOT)
@@ -50,9 +50,9 @@ _NOWHERE = tl.constexpr(-1000.0)  # log2 of an opacity that is never drawn
 
 @triton.jit
 def _rows(owner, i, first, end, in_chunk):  # type: ignore[no-untyped-def]
-    """Records of the instances i + in_chunk; beyond the tile's own [first, end), of its last.
+    """Record numbers of the instances i + in_chunk; beyond the tile's own [first, end) that of its last.
 
-    Read a chunk ahead, so that no load waits for another that says where to read.
+    They are read a chunk ahead, so that the load of a record does not wait for its number.
     """
     at = tl.minimum(tl.maximum(i, first) + in_chunk, end - 1)
     return tl.load(owner + at, mask=at >= first, other=0)
@@ -73,7 +73,7 @@ def _two(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _four(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Floats 2 part to 2 part + 3 of K records, each [K, 1]: two lanes read a record, every thread gets all."""
+    """Floats 2 part to 2 part + 3 of K records, each [K, 1]: two lanes read a record, and every thread gets all."""
     columns = tl.arange(0, 2)[None, :] + part
     low, high = tl.split(tl.load(records + row[:, None] * (_RECORD // 2) + columns))
     first, second = _both(low)
@@ -83,18 +83,17 @@ def _four(records, row, part: tl.constexpr):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _row(values, k, which: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Row which of values [K, P]: [P]. Compiles to no instructions: each thread's k is known, so the integer sum
-    reduces to a register.
-    """
+    """[P] row `which` of values [K, P]. It compiles to no instructions: each thread's k is known, so the integer sum is
+    one register."""
     return tl.sum(tl.where(k == which, values.to(tl.int32, bitcast=True), 0), 0).to(tl.float32, bitcast=True)
 
 
 @triton.jit
 def _one_later(values, first, k, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
-    """values [K, P] moved on by one row, first [P] in row 0. Other names for the same registers, too.
+    """values [K, P] shifted by one row, with first [P] in row 0. It only renames registers, too.
 
-    Row k - 1 is row k with its lowest set bit and all below it turned over; two rows are exchanged as (a + b) - a = b,
-    in integers, where that is exact and the compiler sees through it.
+    k - 1 is k with its lowest set bit and all bits below it inverted. Two rows are exchanged as (a + b) - a = b, in
+    integers, where that is exact and the compiler removes it.
     """
     bits = values.to(tl.int32, bitcast=True)
     moved = tl.where(k == 0, first[None, :].to(tl.int32, bitcast=True), bits)
@@ -107,7 +106,7 @@ def _one_later(values, first, k, K: tl.constexpr, P: tl.constexpr):  # type: ign
 
 @triton.jit
 def _alphas(records, row, there, x, y):  # type: ignore[no-untyped-def]
-    """2^power2 and alpha [K, P] of a chunk, before the rule of the full pixel."""
+    """2^power2 and alpha [K, P] of a chunk, before alpha is set to 0 at full pixels."""
     mean_x, mean_y, k_xx, k_xy = _four(records, row, 0)
     k_yy, lo = _two(records, row, 2)
     lo = tl.where(there[:, None], lo, _NOWHERE)
@@ -118,7 +117,7 @@ def _alphas(records, row, there, x, y):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _blended(alpha, before, k, K: tl.constexpr, P: tl.constexpr):  # type: ignore[no-untyped-def]
-    """alpha where the pixel is not full yet, the weights, and T behind the chunk, in front of which T is before [P]."""
+    """alpha, 0 at full pixels; the weights; and T after the chunk. before [P]: T before the chunk."""
     after = tl.cumprod((1.0 - alpha) * tl.where(k == 0, before[None, :], 1.0), 0)
     here = _one_later(after, before, k, K, P)
     # Beyond a full pixel T only gets smaller, so the products may go on (intrasplat/splat/reference.py).
@@ -142,7 +141,7 @@ def _sum_split(values, columns):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _split_columns(red, green, blue, depth):  # type: ignore[no-untyped-def]
-    """[P, 8]: the upper bits of four numbers per pixel, then what is left of them."""
+    """[P, 8]: the upper bits of four numbers per pixel, then their remainders."""
     column = tl.arange(0, 8)[None, :]
     which = column % 4
     value = tl.where(which < 2, tl.where(which == 0, red[:, None], green[:, None]), blue[:, None])
@@ -152,7 +151,7 @@ def _split_columns(red, green, blue, depth):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _clip_unit(value):  # type: ignore[no-untyped-def]
-    """value held within [-1, 1]: the derivative of the Huber loss with delta 1."""
+    """value clamped to [-1, 1]: the derivative of the Huber loss with delta 1."""
     return tl.minimum(tl.maximum(value, -1.0), 1.0)
 
 
@@ -176,14 +175,14 @@ def _colour_loss(colour, target, q, inside, tissue, sharpness, weight):  # type:
 @triton.jit
 def _depth_loss(depth, cover, wanted, tissue, normalised, sharpness, weight):  # type: ignore[no-untyped-def]
     """L1 of the inverse depth, and its gradients to sum w z and sum w."""
-    # Where nothing was blended there is no depth to correct; _MIN_COVERAGE keeps the divisions finite.
+    # Pixels that are hardly covered have no depth loss; _MIN_COVERAGE keeps the divisions finite.
     usable = (wanted > 0.0) & (cover > _MIN_COVERAGE)
     inverse = 1.0 / tl.where(usable & (tissue > 0.0), depth, 1.0)
     rendered = tl.where(normalised, cover * inverse, inverse)
     error = rendered - wanted
     share = tl.where(usable, tissue, 0.0)
     slope = _clip_unit(error * sharpness) * share * weight
-    # d(1/D)/dZ with D = Z (paper) or Z / A; d(1/D)/dA = 1 / Z in the second case.
+    # The inverse depth is 1 / Z (paper) or A / Z (normalised); its derivative to A is 1 / Z in the second case.
     return tl.sum(share * tl.abs(error)), -slope * rendered * inverse, tl.where(normalised, slope * inverse, 0.0)
 
 
@@ -205,7 +204,7 @@ def blend(  # type: ignore[no-untyped-def]
     tile's frame is frame[f]; loss_settings float32 [F, 5]: colour weight per channel, depth weight, 1 / Huber delta of
     the colour and of the depth loss, 1 for normalised depth else 0.
 
-    One long function, because the pixels' sums have to stay in registers from the first chunk to the last.
+    One long function, so that the pixels' sums stay in registers from the first chunk to the last.
     """
     P: tl.constexpr = TILE_W * TILE_H
     program = tl.program_id(0)
@@ -292,7 +291,7 @@ def blend(  # type: ignore[no-untyped-def]
         middle = tl.where(part == 6, (tile % tiles_x * TILE_W + 0.5 * TILE_W), 0.0)
         middle = tl.where(part == 7, (tile // tiles_x * TILE_H + 0.5 * TILE_H), middle)
         behind = tl.zeros((P,), tl.float32)
-        tl.debug_barrier()  # scratch was perhaps written by another thread of the warp than the one that reads it
+        tl.debug_barrier()  # another thread of the warp may have written the scratch that this one reads
         j = i
         row = _rows(owner, j - K, first, end, in_chunk)
         while j > first:
@@ -316,7 +315,7 @@ def blend(  # type: ignore[no-untyped-def]
             v_power = tl.where(raw < _MAX_ALPHA, w * v_power, 0.0)
             tl.store(out, _sum_split(v_power, monomials) + middle, mask=there[:, None])
             row = next_row
-        while i < end:  # what lies behind a full tile
+        while i < end:  # instances behind a full tile
             there = i + in_chunk < end
             place = tl.load(slot + i + in_chunk, mask=there, other=0)
             out = slots + place.to(tl.int64)[:, None] * _SLOT + part

@@ -1,4 +1,4 @@
-"""Buffers of one image size: the rasteriser's, the Gaussians at the frames' times, and the control block.
+"""The buffers of one image size: the rasteriser's, the Gaussians at the frames' times, and the control block.
 
 N Gaussians (padded), F frames at once.
 """
@@ -21,11 +21,11 @@ from intrasplat.splat.step import camera_centre
 
 
 class FrameBuffers:
-    """What a step or a render of so many frames of one size needs; it is kept from one to the next.
+    """The buffers of a step or a render of F frames of one size; the next one uses them again.
 
-    launches  captured steps and renders; to be forgotten when a buffer moves
+    launches  captured steps and renders; call forget() when a buffer moves
     values    [N], a number per Gaussian, blended as colour is
-    images    the last render, by whether values were blended in it
+    images    the last render with values (True) and without (False)
     """
 
     def __init__(
@@ -45,14 +45,14 @@ class FrameBuffers:
         self.fit(0)
 
     def fit(self, columns: int) -> None:
-        """Buffers for so many Gaussians."""
+        """Allocate the buffers for so many Gaussians."""
         self.launches.forget()
         self.state = torch.zeros(self.frames, ROWS, columns, device=self._device)
         self.colour = torch.zeros(self.frames, 3, columns, device=self._device)
         self.values = torch.zeros(columns, device=self._device)
 
     def write_cameras(self, row: int, cameras: Sequence[NDArray[np.float64]]) -> None:
-        """Fill a row's cameras."""
+        """Write the cameras into a row of the control block."""
         written = self.control.rows[row]
         for frame, camera in enumerate(cameras):
             written["camera"][frame], written["centre"][frame] = camera, camera_centre(camera)

@@ -1,4 +1,4 @@
-"""CUDA graphs of what a step or a picture launches: replayed, two dozen launches cost the host one call."""
+"""CUDA graphs of the launches of a step or a picture: a replay of two dozen launches costs the host one call."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from threading import Lock
 import torch
 
 one_at_a_time = Lock()
-"""Held while kernels may be launched for the first time, and while launches are captured: scenes are rendered while
-another is trained. Triton would hand one thread a kernel that another has not yet loaded onto the device, and torch
-captures on one stream for the whole process."""
+"""Lock for first launches of kernels and for captures, because scenes are rendered while another is trained. Without it
+Triton would give a thread a kernel that another has not yet loaded onto the device, and torch captures on one stream
+for the whole process."""
 
 
 def can_capture(device: torch.device) -> bool:
-    """Whether there are CUDA graphs there."""
+    """Whether the device has CUDA graphs."""
     return device.type == "cuda"
 
 
 class Captured:
-    """Routines that only launch, by a key: run as they are at first, captured at the second run, replayed from then on.
+    """Routines that only launch kernels, by key: the first run is direct, the second is captured, others are replayed.
 
-    The first run compiles the kernels, which a capture must not. What a routine's launches depend on, beside the
-    contents of memory on the device, is in the key, or is followed by forget(). Where there is no GPU a routine is just
-    run. Only a replay does not wait for other threads' first runs and captures.
+    The first run compiles the kernels, which a capture must not do. A routine's launches may depend on its key and on
+    memory on the device; if anything else changes, call forget(). Without a GPU every run is direct. Only a replay does
+    not wait for other threads' first runs and captures.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -43,7 +43,7 @@ class Captured:
         self._graphs[key].replay()
 
     def forget(self) -> None:
-        """Addresses or sizes have changed. Waits: a graph must not be destroyed while it runs."""
+        """Drop all graphs after addresses or sizes have changed. It waits: a running graph must not be destroyed."""
         if self._graphs:
             torch.cuda.current_stream(self._device).synchronize()
         self._graphs.clear()
@@ -51,7 +51,7 @@ class Captured:
 
 
 def _capture(routine: Callable[[], None]) -> torch.cuda.CUDAGraph:
-    """The launches, recorded and not made. Other threads may use the device meanwhile."""
+    """Record the launches without running them. Other threads may use the device meanwhile."""
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         routine()

@@ -1,8 +1,7 @@
-"""What changes from step to step, in one small block of memory on the device: the launches of a step never change.
+"""All numbers that change from step to step, in one block of memory on the device; the launches of a step never change.
 
-The host writes a step's numbers into a row of page-locked memory and has the row copied to the block, in order with the
-launches and without waiting. Rows are kept until the host knows that their steps were made: a step that found no room
-is sent again as it was.
+The host writes a step's numbers into a row of page-locked memory, which is copied to the block in order with the
+launches, without waiting. A row is kept until its step is known to be made; one that exceeded the capacity is resent.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from intrasplat.splat.layout import COLOUR, GLOSS, LOG_SCALE, MEAN, OPACITY_ROW,
 from intrasplat.splat.optimize import StepRates, adam_step
 
 ALIGNMENT = 16
-"""Bytes: a field begins at a multiple of so many, as kernels are compiled for."""
+"""Bytes: a field starts at a multiple of so many, because kernels are compiled for that."""
 ADAM = ("slot", "size", "floor", "betas")
-"""Of adam_fields, those that the update of everything but the harmonics reads, in the order of its arguments."""
+"""The adam_fields that the update of everything but the harmonics reads, in the order of its arguments."""
 _TYPES = {"float": torch.float32, "int": torch.int32, "double": torch.float64}
 
 
 @dataclass(frozen=True)
 class ControlField:
-    """A part of the block."""
+    """The shape and the type of one part of the block."""
 
     shape: tuple[int, ...]
     kind: Literal["float", "int", "double"] = "float"
@@ -41,8 +40,8 @@ class ControlField:
 class Control:
     """The block and its rows on the host.
 
-    values  every field by its name, on the device: views of the block
-    rows    likewise, as NumPy views of each row; to be written before the row is sent
+    values  every field by name, on the device: views of the block
+    rows    the fields of each row by name: NumPy views, to be written before the row is sent
     """
 
     def __init__(self, fields: Mapping[str, ControlField], rows: int, device: torch.device) -> None:
@@ -61,13 +60,13 @@ class Control:
                 row[name] = self._ring[k, part].view(kind).view(field.shape).numpy()
 
     def send(self, row: int) -> None:
-        """Make a row the block's, for the launches that follow."""
+        """Copy a row to the block, for the launches that follow."""
         self._block.copy_(self._ring[row], non_blocking=True)
 
 
 def adam_fields() -> dict[str, ControlField]:
-    """What Adam needs of a step, of everything but the motion: the step's place in the report; sizes of the state's
-    rows and the opacity, and of the other harmonics; the floor they share; the decays of the moments."""
+    """Adam's numbers of a step for all parameters but the motion's: the step's place in the report; step sizes of the
+    state's rows and the opacity, and of the higher harmonics; the floor they share; the decays of the moments."""
     return {
         "slot": ControlField((1,), "int"),
         "size": ControlField((VALUES,)),

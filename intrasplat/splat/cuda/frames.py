@@ -1,4 +1,4 @@
-"""The training frames on the device, each copied at its first use: nothing of them crosses the bus again.
+"""The training frames on the device. Each is copied at its first use and then stays there.
 
 Symbols: T frames kept, H W pixels.
 """
@@ -11,11 +11,11 @@ from torch import Tensor
 from intrasplat.splat.step import TrainingFrame, image_size
 
 FIRST_ROOM = 32
-"""Room in frames at first. When it is used up it doubles, and everything that holds addresses is made again."""
+"""Initial capacity in frames. It doubles when it is full; whatever stores addresses must then be created again."""
 
 
 class FrameStore:
-    """What training compares with, as the rasteriser reads it.
+    """The targets of training, as the rasteriser reads them.
 
     rgb            [T, 3, H, W] uint8
     weight         [T, H, W] uint8, 255 = tissue
@@ -31,11 +31,11 @@ class FrameStore:
 
     @property
     def room(self) -> int:
-        """Frames there is room for. When it changes, all are at other addresses."""
+        """Capacity in frames. When it changes, all frames have other addresses."""
         return int(self.rgb.shape[0])
 
     def row(self, frame: TrainingFrame) -> int:
-        """Where a frame lies along T.
+        """The index of a frame along T; copies the frame if it is new.
 
         Raises:
             ValueError: it has another size.
@@ -59,5 +59,5 @@ class FrameStore:
         return row
 
     def _cropped(self, padded: Tensor) -> Tensor:
-        """Without what only fills the rows, on the device."""
+        """The rows without their padding, on the device."""
         return padded[..., : self._width].contiguous().to(self.rgb.device)

@@ -1,8 +1,8 @@
-"""What project.py and project_backward.py both compute of a Gaussian and its camera; device functions.
+"""Device functions of a Gaussian and its camera that project.py and project_backward.py share.
 
 N Gaussians; state: one frame's rows of N floats, as in project.py; camera: its CAMERA numbers. Arithmetic is float64 as
-on the CPU; exponentials have float32's precision and end at 2**20, so no log-scale or logit, however far out, leaves
-the numbers.
+on the CPU. Exponentials have float32's precision and are limited to 2**20, so results are finite for any log-scale and
+logit.
 """
 
 from __future__ import annotations
@@ -78,21 +78,21 @@ def seen(camera, a, b, c):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def nearness(camera, a, b, c, inverse_z):  # type: ignore[no-untyped-def]
-    """How often the depth before the camera goes into that before the recording's, of world points."""
+    """z_r / z of world points: depth in the recording's camera over depth in this one (intrasplat/splat/camera.py)."""
     row = camera + _RECORDED
     return (dot(tl.load(row), tl.load(row + 1), tl.load(row + 2), a, b, c) + tl.load(row + 3)) * inverse_z
 
 
 @triton.jit
 def low_pass(camera, first: tl.constexpr, nearer):  # type: ignore[no-untyped-def]
-    """What is added to the variance along x (first 0) or y (first 1)."""
+    """The term added to the variance along x (first 0) or y (first 1)."""
     m = tl.maximum(tl.load(camera + _ENLARGED + first) * nearer, 1.0)
     return _EPS2D * m * m
 
 
 @triton.jit
 def limits(camera, first: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Least and greatest x / z (first 0) or y / z (first 1) at which J is taken (Camera.ratio_limits)."""
+    """Least and greatest x / z (first 0) or y / z (first 1) to which u or v is clamped (Camera.ratio_limits)."""
     focal, centre = tl.load(camera + _FOCAL + first), tl.load(camera + _CENTRE + first)
     size = tl.load(camera + _SIZE + first)
     return (-centre - size * _MARGIN) / focal, (size - centre + size * _MARGIN) / focal

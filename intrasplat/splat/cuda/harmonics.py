@@ -2,7 +2,7 @@
 
 N Gaussians in rows of `columns` floats, F frames, K = (degree + 1)^2 coefficients per channel: the constant one in rows
 10:13 of the state, the others in rest [K - 1, 3, columns]; colour [F, 3, columns], mean in rows 0:3 of the state
-[F, 13, columns]; centre [F, 3] of the cameras. The equations are those of raster/cpu/harmonics.py.
+[F, 13, columns]; centre [F, 3] of the cameras. The equations are those of intrasplat/splat/cpu/harmonics.py.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ C3_YYY, C3_XYZ, C3_YZZ, C3_ZZZ, C3_XXZ = (tl.constexpr(each) for each in SH_C3)
 
 @triton.jit
 def _term(K: tl.constexpr, x, y, z):  # type: ignore[no-untyped-def]
-    """The K-th real harmonic (from 1; 0 is constant) at the unit direction (x, y, z); as a polynomial, its slopes."""
+    """The K-th real harmonic (from 1; 0 is constant) at the unit direction (x, y, z), and its polynomial's slopes."""
     none = tl.zeros_like(x)
     if K == 1:
         value, by_x, by_y, by_z = -C1 * y, none, none - C1, none
@@ -82,7 +82,7 @@ def _term(K: tl.constexpr, x, y, z):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _term_number(k, x, y, z, TERMS: tl.constexpr):  # type: ignore[no-untyped-def]
-    """The value of _term where the program has to tell which."""
+    """The value of _term for a k that is known only at run time."""
     value = tl.zeros_like(x)
     for K in tl.static_range(1, TERMS):
         if k == K:
@@ -109,7 +109,7 @@ def _direction(state, centre, frame, at, inside, columns):  # type: ignore[no-un
 
 @triton.jit
 def _colour_gradient(v_colour, colour, frame, channel, at, inside, columns):  # type: ignore[no-untyped-def]
-    """dL/d of a colour before it was held above 0."""
+    """dL/d of a colour before it was clamped at 0."""
     place = (frame * 3 + channel) * columns + at
     shown = tl.load(colour + place, mask=inside, other=0.0) > 0.0
     return tl.load(v_colour + place, mask=inside & shown, other=0.0)
@@ -209,7 +209,7 @@ def _grid(columns: int, *beside: int) -> tuple[int, ...]:
 
 
 def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
-    """Write the colour seen from the cameras, by the harmonics up to a degree of at least 1."""
+    """Write the colour seen from the cameras, with harmonics up to `degree`, at least 1."""
     frames, _, columns = state.shape
     colour_from_sh[_grid(columns, frames)](rest, state, centre, colour, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK)
 
@@ -217,7 +217,7 @@ def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: in
 def carry_back(
     rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, v_colour: Tensor, v_state: Tensor, degree: int
 ) -> None:
-    """Add to rows 0:3 of v_state [F, 10, columns] what dL/dcolour [F, 3, columns] says through the directions."""
+    """Add dL/dmean through the directions, from dL/dcolour [F, 3, columns], to rows 0:3 of v_state [F, 10, columns]."""
     frames, _, columns = state.shape
     colour_from_sh_backward[_grid(columns, frames)](
         rest, state, centre, colour, v_colour, v_state, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK
@@ -235,7 +235,7 @@ def update(
     control: Mapping[str, Tensor],
     degree: int,
 ) -> None:
-    """One step of Adam on the harmonics up to a degree, after carry_back; control has adam_fields (control.py)."""
+    """One step of Adam on the harmonics up to `degree`, after carry_back. control: adam_fields (control.py)."""
     frames, _, columns = state.shape
     terms = (degree + 1) ** 2
     update_rest[_grid(columns, terms - 1)](

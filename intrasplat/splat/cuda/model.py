@@ -2,16 +2,16 @@
 
 N Gaussians (padded to COLUMNS), rows of N floats; F frames per step; values [VALUES, N] as in update.py; H W pixels.
 
-step() returns before its step is made. What changes from step to step goes to the device as one row of the control
-block (control.py); everything else lies there already, so a step is a copy of some hundred floats and a replay.
+step() returns before the device has made its step. What changes from step to step goes to the device as one row of the
+control block (control.py). Everything else is there already, so a step is a copy of some hundred floats and a replay.
 
-Room. The rasteriser's buffers hold so many instances. A step that needs more changes nothing, nor do those after it.
-Every CHECK_EVERY steps, and before anything else is done with the model, the host reads the report. It makes room and
-sends the steps that were not made once more, from the rows that it kept. So a model with little room ends as one with
-ample room does.
+Capacity. The rasteriser's buffers have space for a number of instances. A step that needs more changes nothing, nor do
+the steps after it. Every CHECK_EVERY steps, and before any other use of the model, the host reads the report, enlarges
+the buffers, and sends the missing steps again from the rows that it kept. So the initial capacity does not change the
+result.
 
-Where the host waits for the device: every CHECK_EVERY-th step; wait, and every method and property but step; a render,
-for its picture; the first use of a frame, for its copy; when buffers grow.
+The host waits for the device: at every CHECK_EVERY-th step; in wait, and in every method and property but step; for
+the picture of a render; for the copy of a frame at its first use; and when buffers grow.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ from intrasplat.splat.step import StepSums, TrainingFrame, image_size
 
 Floats = NDArray[np.float32]
 PAD_LOGIT = -30.0
-"""Opacity logit of the columns that only fill the rows: never drawn."""
+"""Opacity logit of the padding columns, which are never drawn."""
 CHECK_EVERY = 32
-"""Steps from one read of the device's report to the next. The device idles during a read; after a step without room, at
-most so many are made again."""
+"""Steps from one read of the device's report to the next. The device idles during a read. After a step that exceeded
+the capacity, at most so many are made again."""
 SIZES_KEPT = 3
-"""Image sizes, of those rendered last, whose buffers are kept."""
+"""Buffers are kept for so many image sizes, those rendered last."""
 
 
 class CudaModel:
@@ -85,7 +85,7 @@ class CudaModel:
         values[:, : self.count] = torch.cat(parts, 1).T
         sh_rest = torch.zeros(gaussians.sh.shape[1] - 1, 3, columns)
         sh_rest[:, :, : self.count] = gaussians.sh[:, 1:].permute(1, 2, 0)
-        self.sh_degree = gaussians.sh_degree  # of those stored; a schedule may use fewer
+        self.sh_degree = gaussians.sh_degree  # the stored degree; a step may use a lower one
         self._values, self._sh_rest = values.to(self.device), sh_rest.to(self.device)
         self._moments, self._rest_moments = (
             torch.zeros(2, *each.shape, device=self.device) for each in (self._values, self._sh_rest)
@@ -109,7 +109,7 @@ class CudaModel:
         """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it.
 
         Returns:
-            The sums of the steps since the last answer, where the host has read the report.
+            The sums of the steps since the last StepSums, if this call read the report.
 
         Raises:
             ValueError: no frame, or more than the rasteriser draws at once (bins.MAX_FRAMES).
@@ -135,24 +135,24 @@ class CudaModel:
         return self._answer()
 
     def _training_view(self, frames: int) -> FrameBuffers:
-        """What steps on so many frames need."""
+        """The buffers of steps on so many frames."""
         view = FrameBuffers(*self._size, frames, self.motion, self.device, rows=CHECK_EVERY)
         view.fit(self._values.shape[1])
         return view
 
     def wait(self) -> StepSums | None:
-        """Return when every step is made: their sums, or None if there was none since the last answer."""
+        """Wait until every step is made; the sums of the steps since the last StepSums, or None without any."""
         self._settle()
         return self._answer()
 
     def _send(self, slot: int) -> None:
-        """Have the device make the step of a row."""
+        """Send the row of a step, and launch the step."""
         sh_degree = self._sent[slot]
         self._training.control.send(slot)
         self._training.launches.run(("step", sh_degree), lambda: self._launch(sh_degree))
 
     def _launch(self, sh_degree: int) -> None:
-        """Everything that a step launches, in order."""
+        """Launch the kernels of a step, in order."""
         view = self._training
         self._project(view, sh_degree)
         control, rasterizer = view.control.values, view.rasterizer
@@ -174,7 +174,7 @@ class CudaModel:
         self._gradients = gradients
 
     def _project(self, view: FrameBuffers, sh_degree: int) -> None:
-        """The Gaussians, at the times and on the images that the view's control block says."""
+        """Project the Gaussians, at the times and with the cameras of the view's control block."""
         control = view.control.values
         self.motion.deform(self._values, control, view.state, view.colour)
         if sh_degree > 0:
@@ -182,7 +182,7 @@ class CudaModel:
         view.rasterizer.project(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
 
     def _settle(self) -> None:
-        """Wait for the steps sent, and send those again that found no room."""
+        """Wait for the steps sent, and send those again that exceeded the capacity."""
         first = 0
         while first < len(self._sent):
             grown = self._training.rasterizer.grown()
@@ -195,7 +195,7 @@ class CudaModel:
         self._sent.clear()
 
     def _learn(self, first: int) -> int:
-        """Read the report of the steps made from `first` on; the place of the first that was not made."""
+        """Read the report of the steps made from `first` on; returns the place of the first that was not made."""
         report = self._report.to("cpu", copy=True)
         self._report.zero_()
         last = first + int(report[MADE])
@@ -214,7 +214,7 @@ class CudaModel:
         return last
 
     def _answer(self) -> StepSums | None:
-        """What was learnt since the last answer."""
+        """The sums read since the last call."""
         learnt, self._learnt = self._learnt, None
         return learnt
 
@@ -235,7 +235,7 @@ class CudaModel:
     # Pictures
 
     def _view(self, width: int, height: int, frames: int) -> FrameBuffers:
-        """The buffers for so many images of a size; those of the sizes used last are kept."""
+        """The buffers for so many images of this size; those of the sizes used last are kept."""
         if (width, height) == self._size and frames == self._training.frames:
             return self._training
         size = width, height, frames
@@ -248,7 +248,7 @@ class CudaModel:
         return self._views[size]
 
     def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> FrameBuffers:
-        """Settle, and have a view that sees these times through this camera."""
+        """Wait for all steps; the buffers, with these times and this camera in their control block."""
         self._settle()
         view = self._view(*image_size(camera), len(times))
         view.write_cameras(0, [camera] * len(times))
@@ -257,7 +257,7 @@ class CudaModel:
         return view
 
     def _fitted(self, view: FrameBuffers) -> bool:
-        """Wait; whether the last projection had room. If not, there is room now."""
+        """Wait; whether the capacity was enough for the last projection. If not, it is enlarged."""
         grown = view.rasterizer.grown()
         if grown:
             view.launches.forget()
@@ -281,7 +281,7 @@ class CudaModel:
                 return view.images[with_values]
 
     def _draw(self, view: FrameBuffers, with_values: bool) -> None:
-        """Everything that a picture launches."""
+        """Launch the kernels of a picture."""
         self._project(view, self.sh_degree)
         view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
 
@@ -291,7 +291,7 @@ class CudaModel:
         return image
 
     def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> ProjectedPicture:
-        """The same picture, which a GPU blends in one part."""
+        """The picture of render(), already blended: a GPU does not divide it into bands."""
         return Blended(self.render_times(camera, [t], values)[0].to("cpu", copy=True).numpy())
 
     def blend_values(self, values: Floats) -> Floats:
@@ -350,23 +350,23 @@ class CudaModel:
         self._gradients = self._shown = None
 
     def parameters(self) -> dict[str, Tensor]:
-        """What is trained, by name; views of the live tensors."""
+        """The trained tensors by name; views."""
         self._settle()
         return self._own(self._values, self._sh_rest) | self.motion.parameters(self.count)
 
     def _own(self, values: Tensor, sh_rest: Tensor, prefix: str = "") -> dict[str, Tensor]:
-        """By their names, without the columns that only fill the rows; [..., VALUES, N] and [..., K - 1, 3, N]."""
+        """values [..., VALUES, N] and sh_rest [..., K - 1, 3, N] by their names, without the padding columns."""
         named = {"canonical": values[..., :ROWS, :], "opacity_logit": values[..., OPACITY_ROW, :], "sh_rest": sh_rest}
         return {prefix + name: each[..., : self.count] for name, each in named.items()}
 
     def arrays(self) -> dict[str, Tensor]:
-        """Everything a resumed run needs, by name; views of the live tensors, motion.steps on the host."""
+        """All tensors that a resumed run needs, by name; views, motion.steps on the host."""
         self._settle()
         moments = self._own(self._moments, self._rest_moments, "moments.")
         return self._own(self._values, self._sh_rest) | moments | self.motion.arrays(self.count)
 
     def load_arrays(self, stored: dict[str, Tensor]) -> None:
-        """Put back what arrays() gave, on any device, into a model of the same size; ValueError if the sizes differ."""
+        """Load what arrays() returned, on any device, into a model of the same size; ValueError if the sizes differ."""
         put_back(self.arrays(), stored)
 
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:

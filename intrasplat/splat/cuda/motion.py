@@ -1,7 +1,7 @@
-"""The motion on the device, with Adam's moments. Two kinds: linear in bases common to all Gaussians, and FDM.
+"""The motion on the device, with Adam's moments. Two kinds: linear in bases that all Gaussians share, and FDM.
 
 N Gaussians (padded), F frames per step, B bases, C channels (10, or 13 where colour moves too); rows of N floats.
-What is alive, negligible and counted is as in raster/cpu/motion.py.
+Which bases are in use at a time, and their step counts, are as in intrasplat/splat/cpu/motion.py.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from intrasplat.splat.optimize import StepRates, adam_step
 
 @dataclass(frozen=True)
 class TrainedValues:
-    """What a step's last kernel changes apart from the motion, and the gradients it reads; update.py has the shapes."""
+    """The tensors that a step's last kernel changes beside the motion, and the gradients it reads (see update.py)."""
 
     values: Tensor
     moments: Tensor
@@ -52,11 +52,11 @@ class TrainedValues:
 
     @property
     def tiles(self) -> int:
-        """Of all frames."""
+        """The number of tiles of all frames."""
         return self.statistics[..., 0].numel()
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """In the order in which the kernels take them, without those of the motion, which come after the second."""
+        """The tensors in the order of the kernels' arguments; those of the motion come after the second."""
         return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
 
 
@@ -64,13 +64,13 @@ class Motion(Protocol):
     """A deformation the step can evaluate and train; `control` is the block's fields on the device (control.py)."""
 
     def fields(self, frames: int) -> dict[str, ControlField]:
-        """What it needs in the control block."""
+        """The fields that it needs in the control block."""
 
     def write_times(self, row: Mapping[str, np.ndarray], times: Sequence[float]) -> None:
-        """Fill what deform reads."""
+        """Fill the fields that deform reads."""
 
     def write_rates(self, row: Mapping[str, np.ndarray], times: Sequence[float], rates: StepRates, step: int) -> None:
-        """Fill what else update reads, and count the step from 1."""
+        """Fill the other fields that update reads, and count the step. step: counted from 1."""
 
     def deform(self, values: Tensor, control: Mapping[str, Tensor], state: Tensor, colour: Tensor) -> None:
         """state [F, ROWS, N] = values [VALUES, N] + psi(t) at the times, colour [F, 3, N] without other harmonics."""
@@ -82,17 +82,17 @@ class Motion(Protocol):
         """Keep these columns, in this order; moments start at 0 where fresh."""
 
     def parameters(self, count: int) -> dict[str, Tensor]:
-        """What is trained, of the first count Gaussians, by name; views."""
+        """The trained tensors of the first count Gaussians, by name; views."""
 
     def arrays(self, count: int) -> dict[str, Tensor]:
-        """Everything that must be stored to resume, likewise. motion.steps lies on the host."""
+        """All tensors that must be stored to resume, likewise. motion.steps lies on the host."""
 
     def export(self, count: int) -> Deformation:
         """The first count Gaussians' deformation as tensors on the CPU (copies)."""
 
 
 TIMES_KEPT = 4096
-"""Times whose bases are cached: more than a clip has frames, yet bounded for a scene that is rendered for days."""
+"""Bases are cached for so many times: more than a clip has frames, but bounded for a scene rendered for days."""
 
 
 def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def _grid(columns: int, *frames: int) -> tuple[int, ...]:
 
 
 class Moments:
-    """Adam's two moments of a motion's weights, [2, ...]: memory that a scene which is only rendered does without."""
+    """Adam's two moments of a motion's weights, [2, ...], allocated at first use: a render does not need them."""
 
     def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
         self._shape, self._device = shape, device
@@ -119,7 +119,7 @@ class Moments:
         return self._tensor[0], self._tensor[1]
 
     def arrays(self, count: int) -> dict[str, Tensor]:
-        """Of the first count Gaussians, by name; views."""
+        """Both moments of the first count Gaussians, by name; views."""
         first, second = self.both
         return {"motion.first": first[..., :count], "motion.second": second[..., :count]}
 
@@ -138,7 +138,7 @@ class LinearMotion:
 
     def __init__(self, deformation: LinearDeformation, columns: int, device: torch.device) -> None:
         count, self._channels, self._bases = deformation.weight.shape
-        # for its bases, not its weights, which a view would keep in memory
+        # used for its bases; it has no weights, because a view would keep them in memory
         self._form = dataclasses.replace(deformation, weight=torch.zeros(0, self._channels, self._bases))
         self.weight = torch.zeros(self._bases, self._channels, columns, device=device)
         self.weight[:, :, :count] = deformation.weight.permute(2, 1, 0).to(device)
@@ -148,7 +148,7 @@ class LinearMotion:
         self._found: dict[float, tuple[np.ndarray, int, int]] = {}
 
     def _alive(self, t: float) -> tuple[np.ndarray, int, int]:
-        """The bases' values at t, and the first of those in use and the one after the last; 0 outside of them."""
+        """The bases' values at t, 0 for those not in use; the first in use, and the one after the last."""
         if t not in self._found:
             if len(self._found) == TIMES_KEPT:
                 self._found.clear()

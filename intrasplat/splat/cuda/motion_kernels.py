@@ -1,7 +1,7 @@
 """How Gaussians move on the device: deformation to the frames' times, and Adam on everything but the other harmonics.
 
 N Gaussians in rows of `columns` floats, F frames per step, B bases, C channels (10, 13 or 14);
-state [F, 14, columns], the rest and a program's share as in update.py. The equations are those of raster/cpu/update.py.
+state [F, 14, columns]; other arrays and a program's share as in update.py. cpu/update.py has the same equations.
 A loop whose length only the device knows is a while loop: with a recent NumPy, Triton's interpreter runs no other kind.
 """
 
@@ -41,9 +41,9 @@ def _place():  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _store_state(state, colour, shine, frame, row, at, moved, columns):  # type: ignore[no-untyped-def]
-    """The state, and the colour that it shows where no other harmonic is in use.
+    """Store the state, and the colour of the constant harmonic and the gloss.
 
-    shine [F, 2]: what the frame's camera sees of the gloss, side and dim (intrasplat/splat/camera.py).
+    shine [F, 2]: side and dim of the frame's camera (intrasplat/splat/camera.py).
     """
     tl.store(state + (frame * STATE_ROWS + row) * columns + at, moved, mask=row < STATE_ROWS)
     gloss = tl.sum(tl.where(row == GLOSS_ROW, moved, 0.0), 0)[None, :]
@@ -57,7 +57,7 @@ def _store_state(state, colour, shine, frame, row, at, moved, columns):  # type:
 def deform_linear(  # type: ignore[no-untyped-def]
     values, weight, basis, span, state, colour, shine, columns, bases, CHANNELS: tl.constexpr
 ):
-    """state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (lines, F).
+    """Write state = canonical + sum over j in span of basis_j weight_j, and its colour. Grid (lines, F).
 
     weight [B, C, columns], basis [F, B], span int32 [F, 2]: the first of the bases in use and the one after the last.
     """
@@ -78,7 +78,7 @@ def update_linear(  # type: ignore[no-untyped-def]
     report, slot, size, floor, betas, basis, alive, basis_size, basis_floor, channel_rate, columns, bases, tiles,
     CHANNELS: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the values and on the weights of the bases in use; the report. Grid (lines,).
+    """Adam on the values and on the weights of the bases in use; writes the report. Grid (lines,).
 
     weight and its moments [B, C, columns]; basis [F, B], 0 where a frame does not use it; alive int32 [1 + B]: how many
     bases are in use, and which. Their step's size is basis_size [B] times channel_rate [14], its floor basis_floor [B].
@@ -136,7 +136,7 @@ def fdm_basis(t, centre, width, QUARTIC: tl.constexpr):  # type: ignore[no-untyp
 def deform_fdm(  # type: ignore[no-untyped-def]
     values, weight, centre, width, time, state, colour, shine, columns, bases, QUARTIC: tl.constexpr
 ):
-    """state = canonical + FDM at the frames' times, and its colour. Grid (lines, F).
+    """Write state = canonical + FDM at the frames' times, and its colour. Grid (lines, F).
 
     weight, centre, width [10, B, columns] (Deform3DGS, equations 3 and 4); time [F].
     """
@@ -160,7 +160,7 @@ def update_fdm(  # type: ignore[no-untyped-def]
     statistics, ok, report, slot, size, floor, betas, time, motion_size, columns, bases, tiles,
     QUARTIC: tl.constexpr, FRAMES: tl.constexpr,
 ):  # fmt: skip
-    """Adam on the values and on weight, centre and width of every basis; the report. Grid (lines,).
+    """Adam on the values and on weight, centre and width of every basis; writes the report. Grid (lines,).
 
     Moments of the motion [3, 10, B, columns]; motion_size [1]: the size of its step.
     """

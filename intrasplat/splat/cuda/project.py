@@ -1,4 +1,4 @@
-"""Gaussians to the image and back, on the device: the per-Gaussian half of the rasteriser.
+"""The projection of Gaussians onto the image, on the device; project_backward.py has its gradients.
 
 N Gaussians, F frames; rows of N floats: state [F, 10 or more, N] (intrasplat/splat/layout.py) deformed to each
 frame's time, opacity_logit [N], colour [F, 3, N]. A splat is a Gaussian on the image, RECORD floats:
@@ -53,7 +53,7 @@ _LOW_WORD = tl.constexpr(0xFFFFFFFF)
 
 @triton.jit
 def _store_pair(at, first, second, there):  # type: ignore[no-untyped-def]
-    """Two neighbouring float32 as one int64: half as many stores, each of which meets another 32 bytes per lane."""
+    """Store two neighbouring float32 as one int64: half as many stores, and each lane writes other 32 bytes."""
     low = first.to(tl.int32, bitcast=True).to(tl.int64) & _LOW_WORD
     tl.store(at, (second.to(tl.int32, bitcast=True).to(tl.int64) << 32) | low, mask=there)
 
@@ -64,8 +64,8 @@ def project(  # type: ignore[no-untyped-def]
     N, state_rows, width, height, tiles_x, tiles_y,
     TILE_W: tl.constexpr, TILE_H: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Splats of frame program_id(1): records [F N, RECORD] and extent [F N, EXTENT] (bins.py), both float32 as int64,
-    half as many; count [F N] of tiles, 0 for a culled one; depth_key [F N], which sorts by frame, then depth, culled
+    """Write the splats of frame program_id(1). records [F N, RECORD] and extent [F N, EXTENT] (bins.py) are float32 in
+    pairs as int64. count [F N]: tiles of a splat, 0 if culled. depth_key [F N]: sorts by frame, then depth, culled
     ones last.
 
     camera: float64 [F, CAMERA] (intrasplat/splat/layout.py).
@@ -97,7 +97,7 @@ def project(  # type: ignore[no-untyped-def]
 
     extent2 = (log2_opacity - _LOG2_MIN_ALPHA) * (2.0 * _LN2) + _EXTENT_SLACK
     drawn = in_front & (extent2 >= 0.0) & (det > 0.0) & (det < _MAX_DETERMINANT)
-    # What is not drawn has numbers all the same, so that a NaN does not become a tile.
+    # A splat that is not drawn gets finite numbers too, so that no tile number comes from a NaN.
     cxx, cxy, cyy = tl.where(drawn, cxx, 1.0), tl.where(drawn, cxy, 0.0), tl.where(drawn, cyy, 1.0)
     x, y, det = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0), tl.where(drawn, det, 1.0)
     inverse_det = 1.0 / det

@@ -1,7 +1,7 @@
-"""From the gradients of every instance to those of every Gaussian, on the device.
+"""The gradients of every Gaussian from those of its instances, on the device.
 
-Two kernels: sum_slots adds up a splat's slots (blend.py), always in the same order, and project_backward carries the
-sums back through project.py.
+Two kernels: sum_slots adds up a splat's slots (blend.py), always in the same order, and project_backward differentiates
+project.py.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from intrasplat.splat.cuda.geometry import (
 from intrasplat.splat.layout import CAMERA, CHANNELS, HEIGHT, LOG_SCALE_ROW, POSE, QUATERNION_ROW, WIDTH
 
 SUMS = 10
-"""What a splat's slots add up to: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
+"""Numbers of a splat's sum over slots: the moments 1, x, y, xx, xy, yy of dL/dpower about mean2d, dL/d(r, g, b, z)."""
 SPLATS_BLOCK, LANES, SUM_WARPS = 16, 8, 1
 """sum_slots: splats per program, slots of each that are added at once, warps. A splat has some five to ten slots; one
-with hundreds keeps only its own program waiting."""
+with hundreds delays only its own program."""
 BACKWARD_BLOCK = 128
 POSE_SHARE = 12
 
@@ -51,7 +51,7 @@ def sum_slots(  # type: ignore[no-untyped-def]
     capacity, splats, no_tile,
     RECORD: tl.constexpr, BLOCK: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """sums [SUMS, F N] of every splat's slots; the moments about its mean2d. Zeros for a splat without slots.
+    """Write sums [SUMS, F N] of every splat's slots, moments about its mean2d; zeros for a splat without slots.
 
     slots: float32 [M, SLOT] as int64 [M, SLOT / 2]. key [M] (bins.py): NO_TILE for a slot that no tile has.
     """
@@ -69,7 +69,7 @@ def sum_slots(  # type: ignore[no-untyped-def]
     most = tl.max(own)
     while done < most:
         slot = start + done + lane
-        # An overflow leaves counts and starts that lie outside; the step is void then, but stays in its memory.
+        # After an overflow counts and starts may be out of bounds; the step is void then, but must not read outside.
         valid = (done + lane < own) & (slot >= 0) & (slot < capacity)
         valid = valid & (tl.load(key + slot, mask=valid, other=0).to(tl.int32) != no_tile)
         p0, p_x = _two(slots, slot, 0, valid)
@@ -128,7 +128,7 @@ def _store(out, value, drawn, there):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _ratio_gradient(camera, first: tl.constexpr, v, ratio, inverse_z):  # type: ignore[no-untyped-def]
-    """dL/d(x / z) through J, 0 where J holds it, over z."""
+    """dL/d(x / z) through J, divided by z; 0 where J clamps x / z."""
     low, high = limits(camera, first)
     return tl.where((ratio > low) & (ratio < high), v, 0.0) * inverse_z
 
@@ -165,11 +165,11 @@ def project_backward(  # type: ignore[no-untyped-def]
     _store(colour + N, tl.load(sums + 7 * splats, mask=drawn, other=0.0), drawn, there)
     _store(colour + 2 * N, tl.load(sums + 8 * splats, mask=drawn, other=0.0), drawn, there)
     odds = exp(-tl.load(opacity_logit + n, mask=there, other=0.0))
-    # times 1 - opacity, exact also where opacity rounds to 1
+    # the factor 1 - opacity, exact also where opacity rounds to 1
     v_logit = tl.load(sums, mask=drawn, other=0.0) * odds / (1.0 + odds)
     _store(v_opacity_logit + splat, v_logit, drawn, there)
 
-    # The forward pass again, as far as the backward needs it: B = A R, cov2d = B S^2 B^T + the low-pass.
+    # Repeats the parts of the forward pass that are needed: B = A R, cov2d = B S^2 B^T + the low-pass.
     a, b, c = mean_of(state, n, there, N)
     x, y, z = seen(camera, a, b, c)
     inverse_z = 1.0 / tl.where(drawn, z, 1.0)

@@ -1,4 +1,4 @@
-"""One image size and number of frames, one set of buffers: project, bin, blend and their gradients on the device.
+"""The buffers of one image size and number of frames, and the calls of project, bin, blend and their gradients.
 
     rasterizer = CudaRasterizer(width, height, device, frames)
     rasterizer.project(camera, state, opacity_logit, colour)
@@ -6,12 +6,12 @@
     gradients = rasterizer.loss_backward(rgb, weight, inverse_depth, loss_settings, frame)
 
 Symbols: N Gaussians, F frames, M slots (bins.py), H W pixels, T frames of a clip. Arrays are contiguous tensors on the
-device, float32 where nothing is said.
+device, float32 unless stated otherwise.
 
-Once the buffers are there nothing here asks the device anything or allocates, but for torch.sort's own scratch: so all
-of it can be captured in a CUDA graph. The buffers have room for ``capacity`` slots. A projection that needs more leaves
-ok at 0 and draws only what fits; ok stays 0, and needed the most that was needed, until reset(). A kernel that changes
-parameters reads ok on the device and does nothing where it is 0. The host reads it with grown().
+Once the buffers exist, nothing here reads from the device or allocates, except for the scratch of torch.sort. So all of
+it can be captured in a CUDA graph. The buffers have space for ``capacity`` slots. A projection that needs more sets ok
+to 0 and draws only what fits; until reset(), ok stays 0 and needed is the maximum needed. A kernel that changes
+parameters reads ok on the device and does nothing if it is 0. The host reads it with grown().
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from intrasplat.splat.cuda.project_backward import (
 from intrasplat.splat.layout import CAMERA, CHANNELS
 
 _FIRST_GUESS = 8
-"""Slots per Gaussian and frame for which there is room at first: sorting takes as long for empty ones. At least one
-per tile, for a few Gaussians that cover the image."""
+"""Initial slots per Gaussian and frame; few, because sorting empty ones takes as long. At least one per tile, for a few
+Gaussians that cover the image."""
 _SPARE = 1.25
-"""Room beyond what was needed, so that a scene that grows slowly seldom needs more."""
+"""Capacity over the slots needed, so that a scene that grows slowly seldom needs more."""
 _MAX_NUMBERS = 2**31 - 1
-"""Kernels number the floats of records and slots with 32 bits."""
+"""Kernels index the floats of records and slots with 32 bits."""
 
 
 Numbers = torch.dtype | tuple[torch.dtype, ...]
 
 
 def _check(tensor: Tensor, name: str, shape: tuple[int | None, ...], dtype: Numbers = torch.float32) -> None:
-    """Raises ValueError unless the kernels, which are given an address alone, read what is meant; None: any size."""
+    """Raise ValueError unless shape, type and layout are right, because kernels only get an address; None: any size."""
     fits = len(tensor.shape) == len(shape) and all(b in (None, a) for a, b in zip(tensor.shape, shape, strict=True))
     types = dtype if isinstance(dtype, tuple) else (dtype,)
     if not fits or tensor.dtype not in types or not tensor.is_contiguous():
@@ -108,10 +108,10 @@ class CudaRasterizer:
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
     def reserve(self, gaussians: int, capacity: int | None = None) -> None:
-        """Allocate for N Gaussians and at least so many slots; what is large enough stays.
+        """Allocate for N Gaussians and at least `capacity` slots; buffers that are large enough stay.
 
         Raises:
-            ValueError: more than 32 bits can number.
+            ValueError: more floats than 32 bits can index.
         """
         if gaussians != self.gaussians:
             self._allocate_splats(gaussians)
@@ -158,7 +158,7 @@ class CudaRasterizer:
         self.needed.zero_()
 
     def grown(self) -> bool:
-        """Whether a projection since reset() needed more slots than there were; then there are now. Waits."""
+        """Wait; whether a projection since reset() exceeded the capacity. If so, the capacity is now enough."""
         if int(self.ok) == 1:
             return False
         self._allocate_slots(int(int(self.needed) * _SPARE) + 1)
@@ -166,7 +166,7 @@ class CudaRasterizer:
         return True
 
     def project(self, camera: Tensor, state: Tensor, opacity_logit: Tensor, colour: Tensor) -> None:
-        """Splats of every frame's camera in tiles, nearest first.
+        """Project onto every frame's camera, and list the splats of each tile, nearest first.
 
         camera: float64 [F, CAMERA], rows as camera_vector gives; state [F, 10 or more, N]; opacity_logit [N];
         colour [F, 3, N].
@@ -193,7 +193,7 @@ class CudaRasterizer:
         self._bin()
 
     def _bin(self) -> None:
-        """Slots in depth order, then the instances of every tile."""
+        """Fill the slots in depth order, then sort them by tile."""
         splats, no_tile = self.frames * self.gaussians, self.frames * self.tiles
         torch.sort(self._depth_key, stable=True, out=(self._sorted_depth, self._order))
         torch.index_select(self.count.view(-1), 0, self._order, out=self._ordered_count)
@@ -211,7 +211,7 @@ class CudaRasterizer:
     def _blend(
         self, mode: int, image: Tensor, values: bool, clip: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None = None
     ) -> None:
-        """The kernel in one of its modes. clip: rgb, weight, inverse depth, loss settings, frame."""
+        """Launch the kernel in one of its modes. clip: rgb, weight, inverse depth, loss settings, frame."""
         rgb, weight, inverse_depth, settings, frame = clip or (self._nothing,) * 5
         blend[(self.frames * self.tiles,)](
             self._records.view(torch.int64), self._sorted_owner, self._sorted_slot, self._tile_start, self._before,
@@ -270,7 +270,7 @@ class CudaRasterizer:
         return self._carry_back(pose)
 
     def _carry_back(self, pose: bool) -> Gradients:
-        """The slots' gradients, left by blend, to the parameters of their Gaussians."""
+        """Gradients of the Gaussians' parameters from those of the slots, which blend has written."""
         out, splats = self.gradients, self.frames * self.gaussians
         if splats == 0:
             return out

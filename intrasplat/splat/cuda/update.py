@@ -1,13 +1,13 @@
-"""Adam on the device: what all parameters share; the canonical state and the opacity; and what a step reports.
+"""Adam on the device: functions for all parameters, the update of canonical state and opacity, the report of a step.
 
 N Gaussians in rows of `columns` floats, a multiple of COLUMNS; F frames per step. values [VALUES, columns] are the rows
-of the canonical state, as in raster/cpu/update.py, and the opacity's logit. A program has COLUMNS Gaussians and all
-of their rows, so tensors in it are [TILE_ROWS, COLUMNS]. A gradient is a sum over the frames.
+of the canonical state (intrasplat/splat/layout.py) and the opacity's logit. A program has COLUMNS Gaussians and all of
+their rows, so its tensors are [TILE_ROWS, COLUMNS]. A gradient is a sum over the frames.
 
 Whatever changes from step to step is read from tensors on the device (control.py), so that a launch never changes.
-Rates come as sizes and floors that have Adam's bias corrections folded in (intrasplat/splat/optimize.py); a size of 0
-leaves a parameter and its moments untouched. Every kernel that changes the model reads `ok` first and does nothing
-where it is 0: the step had no room (rasterizer.py, model.py).
+Rates are given as sizes and floors that include Adam's bias corrections (intrasplat/splat/optimize.py). A size of 0
+leaves a parameter and its moments unchanged. Every kernel that changes the model reads `ok` first and does nothing
+if it is 0, because the step exceeded the capacity (rasterizer.py, model.py).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from intrasplat.splat import layout
 from intrasplat.splat.constants import SH_C0
 
 COLUMNS = 32
-"""Rows are padded to a multiple of so many floats, 128 bytes: they begin where lines of memory begin. A program has one
-such line of every row; with two of them, steps on several frames spill registers."""
+"""Rows are padded to a multiple of so many floats, 128 bytes, so that they are aligned to lines of memory. A program
+has one such line of every row; with two, steps on several frames spill registers."""
 TILE_ROWS = tl.constexpr(16)
 STATE_ROWS, VALUE_ROWS = tl.constexpr(layout.ROWS), tl.constexpr(layout.VALUES)
 COLOUR_ROW = tl.constexpr(layout.COLOUR_ROW)
-"""Of the rows before it the rasteriser gives gradients."""
+"""The rasteriser computes gradients of the rows before this one."""
 GLOSS_ROW, OPACITY_ROW = tl.constexpr(layout.GLOSS_ROW), tl.constexpr(layout.OPACITY_ROW)
 CONSTANT_HARMONIC = tl.constexpr(SH_C0)
 SUMS, MADE, SEEN = 4, 4, 5
-"""The report: floats before SUMS, the sums that rasterizer.statistics lists; then, as int32, how many steps were made,
-and from SEEN on how many Gaussians each of them had in view."""
+"""The report: the sums of rasterizer.statistics as floats before SUMS; at MADE the number of steps made, as int32; from
+SEEN on how many Gaussians each of them had in view, as int32."""
 _MADE, _SEEN = tl.constexpr(MADE), tl.constexpr(SEEN)
 _CHUNK = tl.constexpr(256)
 """Tiles whose sums are added at once."""
@@ -42,8 +42,8 @@ def padded(count: int) -> int:
 
 @triton.jit
 def load_trained(value, first, second, at, mask):  # type: ignore[no-untyped-def]
-    """A value and its two moments. All at once, and before anything is stored: a load waits for no other, but no
-    compiler moves it ahead of a store."""
+    """A value and its two moments. They are loaded together, before anything is stored, because loads overlap, but the
+    compiler moves no load ahead of a store."""
     return (
         tl.load(value + at, mask=mask, other=0.0),
         tl.load(first + at, mask=mask, other=0.0),
@@ -62,7 +62,7 @@ def adam(value, m, v, gradient, size, floor, betas):  # type: ignore[no-untyped-
 
 @triton.jit
 def store_trained(value, first, second, at, mask, new, m, v):  # type: ignore[no-untyped-def]
-    """What load_trained loaded, after a step."""
+    """Store a value and its two moments after a step."""
     tl.store(value + at, new, mask=mask)
     tl.store(first + at, m, mask=mask)
     tl.store(second + at, v, mask=mask)
@@ -72,9 +72,9 @@ def store_trained(value, first, second, at, mask, new, m, v):  # type: ignore[no
 def gradient_of_values(  # type: ignore[no-untyped-def]
     v_state, v_opacity, v_colour, colour, shine, frame, row, at, columns
 ):
-    """dL/dvalues of a frame: v_state [F, 10, columns]; what v_colour [F, 3, columns] says of the constant harmonic and
-    the gloss where the colour was not held at 0; v_opacity [F, columns]. shine [F, 2]: side and dim of the frame's
-    camera; dim is 0 of every camera that trains. row [TILE_ROWS, 1], at [1, COLUMNS]."""
+    """dL/dvalues of a frame, from v_state [F, 10, columns]; v_colour [F, 3, columns], which gives the constant harmonic
+    and the gloss where the colour was not clamped at 0; and v_opacity [F, columns]. shine [F, 2]: side and dim of the
+    frame's camera; training cameras have dim 0. row [TILE_ROWS, 1], at [1, COLUMNS]."""
     of_colour = (row >= COLOUR_ROW) & (row < GLOSS_ROW)
     gradient = tl.load(v_state + (frame * COLOUR_ROW + row) * columns + at, mask=row < COLOUR_ROW, other=0.0)
     hue = (frame * 3 + row - COLOUR_ROW) * columns + at
@@ -108,8 +108,8 @@ def update_values(  # type: ignore[no-untyped-def]
 def report_step(  # type: ignore[no-untyped-def]
     touched, statistics, report, slot, at, columns, tiles, FRAMES: tl.constexpr
 ):
-    """Count the program's Gaussians in view, at the step's place slot [1]; the first program adds the step to those
-    made, and its sums to the report. touched int32 [F, columns]: tiles of a Gaussian; statistics [tiles, 4]."""
+    """Add the program's Gaussians in view to the report, at the step's place slot [1]; the first program also counts
+    the step and adds its sums. touched int32 [F, columns]: tiles of a Gaussian; statistics [tiles, 4]."""
     most = tl.load(touched + at)
     for frame in tl.static_range(1, FRAMES):
         most = tl.maximum(most, tl.load(touched + frame * columns + at))

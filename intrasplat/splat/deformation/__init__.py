@@ -1,4 +1,4 @@
-"""How the canonical Gaussians move: FDM and ours, one promise for all (base.Deformation).
+"""The motion of the canonical Gaussians: FDM and ours, with one interface (base.Deformation).
 
 | kind          | numbers per Gaussian | bases                                                    |
 |---------------|----------------------|----------------------------------------------------------|
@@ -39,7 +39,7 @@ MOTIONS: Mapping[str, type[Deformation]] = MappingProxyType(_MOTIONS)
 
 
 def register_motion(motion: type[Deformation]) -> None:
-    """Make a motion known by its kind, for this process. To register it again changes nothing.
+    """Register a motion by its kind, in this process. Registering it again changes nothing.
 
     Raises:
         ValueError: another motion has the kind.
@@ -63,7 +63,7 @@ def restore(kind: str, tensors: dict[str, Tensor]) -> Deformation:
     """The motion whose kind, parameters() and constants() were stored.
 
     Raises:
-        ValueError: a kind that is not known, or tensors that do not make one of it.
+        ValueError: the kind is unknown, or the tensors do not belong to it.
     """
     motion = motion_named(kind)
     try:

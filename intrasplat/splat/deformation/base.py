@@ -1,8 +1,8 @@
-"""What all motions share: the channels they move and the promises they keep.
+"""The interface of all motions.
 
 Symbols: N Gaussians, B bases or weights per channel, C = 10 channels, t model time in [0, 1).
-The channels are the rows of a state (intrasplat/splat/layout.py). Opacity never deforms; colour does where a motion has
-channels 10:13 for it, and gloss where it has channel 13.
+The channels are the rows of a state (intrasplat/splat/layout.py). Opacity never changes over time. Colour does if a
+motion has channels 10:13, and gloss if it has channel 13.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from intrasplat.splat.layout import CHANNELS, COLOUR, COLOUR_CHANNELS, GLOSS_ROW
 
 @dataclass(frozen=True)
 class AtRest:
-    """What a preset and a clip say about a motion before it is trained.
+    """The arguments that a preset and a clip give to an untrained motion.
 
-    bases  B; None where the motion has no such number
-    width  of a basis, model time; None: the motion chooses
+    bases  B; None: the motion chooses
+    width  width of a basis, model time; None: the motion chooses
     times  model times of the training frames
-    seed   of random numbers
-    gloss  whether two eyes teach, so that there is gloss to move
+    seed   seed of random numbers
+    gloss  whether two eyes are trained on, so that there is gloss to move
     """
 
     bases: int | None
@@ -39,13 +39,13 @@ class AtRest:
 
 
 class Deformation(ABC):
-    """A motion: what it adds to the canonical Gaussians at time t.
+    """A motion: the canonical Gaussians as a function of time t.
 
     A subclass is a frozen dataclass whose fields are its tensors, or defines from_tensors.
 
     Attributes:
         kind: its name in the registry, in presets and in stored scenes.
-        has_kernels: whether the CPU's and the GPU's kernels train it (intrasplat/splat/); else torch does, on the CPU.
+        has_kernels: whether the CPU and GPU kernels train it (intrasplat/splat/); otherwise torch does, on the CPU.
         min_bases: the fewest bases it can have.
     """
 
@@ -56,7 +56,7 @@ class Deformation(ABC):
     @classmethod
     @abstractmethod
     def at_rest(cls, gaussians: Gaussians, start: AtRest) -> Self:
-        """The motion of these Gaussians before training: none."""
+        """The motion of these Gaussians before training, in which nothing moves."""
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> Self:
@@ -65,7 +65,7 @@ class Deformation(ABC):
 
     @property
     def bases(self) -> int:
-        """B of every channel; 0 where there is no such number."""
+        """B of every channel; 0 if the motion has no bases."""
         return 0
 
     @abstractmethod
@@ -77,19 +77,19 @@ class Deformation(ABC):
         """The tensors to train, by name."""
 
     def constants(self) -> dict[str, Tensor]:
-        """The tensors that stay as they are, by name; with parameters() they are the whole state."""
+        """The tensors that are not trained, by name; with parameters() they are the whole state."""
         return {}
 
     @abstractmethod
     def select(self, rows: Tensor | slice) -> Self:
-        """The motion of the Gaussians rows: [M] indices, repeats allowed, [N] bool, a slice. Shared tensors stay so."""
+        """The motion of these Gaussians: [M] indices, repeats allowed, [N] bool or a slice. Shared tensors stay so."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearDeformation(Deformation):
-    """psi(t) = weight basis(t): each Gaussian and channel weighs bases that all of them share.
+    """psi(t) = weight basis(t): each Gaussian and channel has weights for bases that all of them share.
 
-    A subclass gives basis(t), and has kernels by that.
+    A subclass implements basis(t); the kernels then train it.
 
     weight [N, C, B]  trained, in the channel's unit; C = 10, 13 where channels 10:13 add to the colour's harmonic 0, or
                       14 where channel 13 adds to the gloss, too
@@ -126,7 +126,7 @@ class LinearDeformation(Deformation):
 
 
 def add_offsets(gaussians: Gaussians, offsets: Tensor) -> Gaussians:
-    """Adds offsets [N, 10] to the canonical state. The quaternion stays unnormalised: projection normalises it."""
+    """The Gaussians with offsets [N, 10] added. The quaternion is not normalised here: projection does that."""
     if offsets.shape != (len(gaussians), CHANNELS):
         raise ValueError(f"offsets have shape {tuple(offsets.shape)}, {len(gaussians)} Gaussians need [N, {CHANNELS}]")
     return dataclasses.replace(

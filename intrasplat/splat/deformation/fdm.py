@@ -19,12 +19,12 @@ from intrasplat.splat.layout import CHANNELS
 
 PAPER_BASES = 17
 PAPER_WIDTH = 0.01
-"""Share of the clip. Leaves most of the timeline between two bases without any; wider starts cover it."""
+"""Share of the clip. Most times between two bases are then covered by neither; a wider start covers them."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlexibleDeformation(Deformation):
-    """psi(t) = sum_j w_j b_j(t): every Gaussian and channel has B bases of its own, all of their numbers trained.
+    """psi(t) = sum_j w_j b_j(t): every Gaussian and channel has B bases of its own, with all their numbers trained.
 
     weight [N, 10, B]  w, in the channel's unit
     centre [N, 10, B]  theta, model time
@@ -37,7 +37,7 @@ class FlexibleDeformation(Deformation):
 
     has_kernels: ClassVar[bool] = True
     quartic: ClassVar[bool]
-    """Which form of b_j the kernels compute; the quartic one is that of the released code (docs/deformation.md)."""
+    """Whether the kernels compute the quartic form of b_j, that of the released code (docs/deformation.md)."""
 
     def __post_init__(self) -> None:
         shapes = {tuple(each.shape) for each in self.parameters().values()}
@@ -56,7 +56,7 @@ class FlexibleDeformation(Deformation):
 
     @classmethod
     def at_rest(cls, gaussians: Gaussians, start: AtRest) -> Self:
-        """Initial with the bases and the width of the preset, else those of the paper."""
+        """No motion, with the bases and the width of the preset, or those of the paper where it has none."""
         bases = PAPER_BASES if start.bases is None else start.bases
         return cls.initial(len(gaussians), bases=bases, width=PAPER_WIDTH if start.width is None else start.width)
 
@@ -82,7 +82,7 @@ class FlexibleDeformation(Deformation):
 class GaussianFdm(FlexibleDeformation):
     """The paper's form: b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
 
-    |sigma_j| is held at MIN_WIDTH where it is smaller, and gets no gradient there.
+    |sigma_j| is clamped to at least MIN_WIDTH; where it is smaller, it gets no gradient.
     """
 
     kind = "fdm-gaussian"

@@ -1,4 +1,4 @@
-"""FDM with one set of bases for all Gaussians: a third of the numbers, linear in them, and colour may move too.
+"""FDM with one set of bases for all Gaussians: a third of the numbers, linear in its weights; colour may move too.
 
 Symbols: N Gaussians, C = 10 channels, 13 with the colour's constant harmonic, 14 with the gloss too, B bases, T
 training frames.
@@ -20,17 +20,17 @@ from intrasplat.splat.layout import CHANNELS, COLOUR_CHANNELS, ROWS
 
 DEFAULT_BASES = 9
 WIDTH_IN_SPACINGS = 0.6
-"""Neighbouring bases of this width cross at 0.7, so that no time is left without one."""
+"""Width of a basis over the larger gap next to it. Neighbours then cross at 0.7, so that every time is covered."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharedBasis(LinearDeformation):
     """psi(t) = sum_j w_j phi_j(t), phi_j = b_j / sum_k b_k, b_j(t) = exp(-(t - theta_j)^2 / (2 sigma_j^2)).
 
-    theta and sigma are common to all and fixed.
+    theta and sigma are the same for all Gaussians and fixed.
 
-    Divided by their sum, the bases carry motion across a stretch without frames (an instrument in the way) from both of
-    its ends; undivided ones fall back to the canonical state there.
+    Because they are divided by their sum, the bases interpolate motion over times without frames (an instrument in the
+    way) from both sides. Without the division the motion would return to the canonical state there.
 
     weight [N, C, B]  trained, in the channel's unit; channels 10:13, if there are any, add to the colour's harmonic 0,
                       channel 13 to the gloss
@@ -69,7 +69,7 @@ class SharedBasis(LinearDeformation):
         Args:
             colour: whether the colour's constant harmonic moves too: 13 channels instead of 10.
             gloss: whether colour and gloss move too: 14 channels.
-            times: of the training frames; centres lie at their even quantiles, without them evenly over [0, 1].
+            times: model times of the training frames; centres are their even quantiles. None: evenly over [0, 1].
 
         Raises:
             ValueError: bases < 1.
@@ -83,12 +83,12 @@ class SharedBasis(LinearDeformation):
         return cls(
             weight=torch.zeros(count, ROWS if gloss else COLOUR_CHANNELS if colour else CHANNELS, bases),
             centre=torch.from_numpy(centre).float(),
-            width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),  # repeated quantiles of few frames: 0
+            width=torch.from_numpy(np.maximum(width, MIN_WIDTH)).float(),  # equal quantiles of few frames have width 0
         )
 
     @classmethod
     def at_rest(cls, gaussians: Gaussians, start: AtRest) -> SharedBasis:
-        """Initial with moving colour, and with no more bases than training frames."""
+        """No motion, with channels for colour, and with no more bases than training frames."""
         bases = DEFAULT_BASES if start.bases is None else start.bases
         count, bases = len(gaussians), min(len(start.times), bases)
         return cls.initial(count, bases=bases, colour=True, gloss=start.gloss, times=start.times)
