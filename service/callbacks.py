@@ -118,7 +118,7 @@ def _is_permitted(text: str, private: bool) -> bool:
     address = _meant(ip_address(text.partition("%")[0]))
     if address.is_link_local or address.is_multicast or address.is_unspecified or address in METADATA:
         return False
-    if address.is_reserved and not address.is_loopback:  # some stand for an IPv4 address that is not told
+    if address.is_reserved and not address.is_loopback:  # some map to an IPv4 address that is unknown here
         return False
     return address.is_global or (private and (address.is_private or address.is_loopback))
 

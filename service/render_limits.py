@@ -1,8 +1,7 @@
 """Limits how much rendering a caller and a tenant may request at a time. The cost of a render is pixels x Gaussians.
 
 Small renders are not counted: workers answer them between the parts of large ones, and service/limits.py counts
-requests.
-Each process counts for itself.
+requests. Each process counts for itself.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def check_retention(options: JobOptions, settings: Settings) -> None:
 
 
 def kept_hours(options: JobOptions, settings: Settings) -> float | None:
-    """How long a job is kept after its end; None: until somebody removes it."""
+    """How many hours a job is kept after its end; None: until it is deleted."""
     wanted = settings.retention_hours if options.retention_hours is None else options.retention_hours
     limits = [hours for hours in (wanted, settings.max_retention_hours) if hours is not None]
     return min(limits, default=None)

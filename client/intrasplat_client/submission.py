@@ -33,7 +33,7 @@ TUS = {"Tus-Resumable": "1.0.0"}
 TUS_CONTENT_TYPE = "application/offset+octet-stream"
 
 RESUME_AFTER = frozenset({httpx.codes.REQUEST_TIMEOUT, httpx.codes.CONFLICT, httpx.codes.LOCKED})
-"""The request stalled; the offset differs; the service still holds the connection that was lost."""
+"""Statuses after which an upload resumes: it stalled, the offset differs, or the lost connection is still open."""
 
 OnUpload = Callable[[int, int], object]
 """Called with the bytes sent and the total. After a lost connection the bytes sent can decrease."""

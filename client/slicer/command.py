@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 18944
 PATIENCE_S = 2.0
-"""How long a call is repeated before peers are told that the service does not answer."""
+"""How long a call is repeated before the bridge reports to peers that the service does not answer."""
 MAX_DEVICE_CHARACTERS = 20
 
 

@@ -127,7 +127,7 @@ class AuditLog:
                 line = b"\n" + line  # a crash cut off the last line; this one starts on its own line
             if os.write(descriptor, line) < len(line):
                 with contextlib.suppress(OSError):
-                    os.ftruncate(descriptor, size)  # safe under the lock: nobody else has appended since
+                    os.ftruncate(descriptor, size)  # safe under the lock: no other process has appended since
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(descriptor)
             if size == 0:

@@ -323,7 +323,7 @@ def check_keys(settings: Settings) -> None:
     """Return if the service has keys, or needs none because only this machine's user may reach it.
 
     Raises:
-        UnavailableError: nobody could get in without a key, and there are none.
+        UnavailableError: every caller needs a key, and there are none.
     """
     if needs_keys(settings) and not KeyFile(settings.data_dir).list():
         at = settings.host if settings.host not in LOOPBACK_NAMES else ", ".join(sorted(settings.hosts))

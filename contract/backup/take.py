@@ -179,7 +179,7 @@ def _has_files(copier: Copier, record: JobRecord) -> bool:
 
 
 def _noted(data_dir: Path) -> set[str]:
-    """The jobs whose removal has begun and not ended."""
+    """The jobs whose removal has started and not ended."""
     return {path.name for path in (data_dir / PURGING).glob("*") if is_job_id(path.name)}
 
 

@@ -69,12 +69,10 @@ def find_server() -> ServerBinary:
 
 
 def short_socket_path(folder: Path, name: str) -> Path:
-    """folder/name, or, if that is too long for a socket, a short path in this user's runtime directory.
-
-    The same arguments always give the same path.
+    """folder/name or, if too long for a socket, a short path in this user's runtime directory. It is deterministic.
 
     Raises:
-        UnavailableError: the short folder exists and belongs to somebody else.
+        UnavailableError: the short folder exists and belongs to another user.
     """
     path = folder / name
     if len(os.fsencode(path)) <= MAX_SOCKET_PATH_BYTES:

@@ -51,7 +51,7 @@ def held(path: Path, what: str) -> Iterator[None]:
         what: what is changed meanwhile, for the error message.
 
     Raises:
-        UnavailableError: somebody else holds it for longer than HELD_TIMEOUT_S.
+        UnavailableError: another process or thread holds it for longer than HELD_TIMEOUT_S.
         OSError: the file cannot be opened.
     """
     lock = FolderLock(path)

@@ -2,7 +2,7 @@
 
     s3://bucket/prefix/
     ├── spool/<job>/        as on disk; submission.json is written last and removed first: without it there is no clip
-    ├── scenes/<job>.<n>/   as on disk; the same holds of manifest.json
+    ├── scenes/<job>.<n>/   as on disk; manifest.json is likewise written last and removed first
     └── resume/<job>.<n>/   the state from which attempt n can be continued, put there when its worker released the job
 
 The customary AWS_* variables give address and credentials (AWS_ENDPOINT_URL for a server that is not Amazon's). Uploads
