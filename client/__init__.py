@@ -1,1 +1,1 @@
-"""The `intrasplat` command, the demo, and the page for the browser. No torch at import."""
+"""The server's part of the `intrasplat` command, the Python client, and the web page. No torch at import."""

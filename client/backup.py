@@ -84,10 +84,10 @@ def _restore(options: argparse.Namespace) -> int:
 
 
 def _check_installation(settings: Settings) -> None:
-    """Refuse to back up what cannot be the data directory, or the queue, of the service that is meant."""
+    """Refuse a data directory or a queue that cannot belong to a service's installation."""
     check_owner(settings.data_dir)
     data_dir = settings.data_dir.expanduser()
-    if not os.path.isdir(data_dir / "spool"):  # nor where this user may not look
+    if not os.path.isdir(data_dir / "spool"):  # False also where this user may not read
         remedy = "Name that of the service (--data-dir, or INTRASPLAT_DATA_DIR), and run the command as its user."
         raise InputError("--data-dir", f"{data_dir} is no data directory.", remedy)
     if settings.redis_url is None and not (data_dir / "valkey").is_dir():

@@ -1,5 +1,5 @@
-"""The commands that the server adds to `intrasplat`: up and worker run it, keys, backup and restore look after it, the
-others talk to it. intrasplat/__main__.py runs them, and the library's own commands."""
+"""The commands that the server adds to `intrasplat`: up and worker run a service; keys, backup and restore maintain it;
+the others are its clients. intrasplat/__main__.py runs them, and the library's own commands."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_worker(arguments: Sequence[str]) -> int:
-    """Replace this process by the worker's program, so that signals and exit status are the worker's."""
+    """Replace this process with the worker's program, so that the worker gets signals and sets the exit status."""
     command = [sys.executable, "-m", "worker", "consume", *arguments]
     if os.name == "posix":
         os.execv(sys.executable, command)
-    process = subprocess.Popen(command)  # without exec on Windows, where the caller would not wait
+    process = subprocess.Popen(command)  # no exec on Windows, where the caller would not wait
     while True:
         with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C reaches both processes; the worker decides
             return process.wait()

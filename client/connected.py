@@ -1,7 +1,7 @@
-"""A client for the commands: its errors become those of intrasplat/errors.py, and its remedies name commands.
+"""A client for the commands. It raises the errors of intrasplat/errors.py, and its remedies name commands.
 
-The service's remedies name routes. Which command helps instead follows from the error's type and from the command that
-was refused, never from the words of the service.
+The service's remedies name routes. The error's type and the refused command determine which command to name instead;
+the service's words never do.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def connected(url: str, api_key: str | None = None, remedies: Remedies | None = 
 
 
 class _Waiting:
-    """Says once why a command waits, so that nobody takes it for dead."""
+    """Prints once why a command waits."""
 
     def __init__(self) -> None:
         self._is_told = False
@@ -59,7 +59,7 @@ class _Waiting:
 
 
 def command_error(error: intrasplat_client.IntrasplatError, remedies: Remedies = REMEDIES) -> IntrasplatError:
-    """The error of the command line that means the same."""
+    """The equivalent error of the command line."""
     match error:
         case intrasplat_client.RequestRefused(status=HTTPStatus.INSUFFICIENT_STORAGE):
             return InputError(

@@ -1,4 +1,4 @@
-"""What `up` says of the disk: once that it has too little room, and once that there is enough again."""
+"""Warnings of `up` about the disk: printed once when free space is short, and once when there is enough again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOOK_PERIOD_S = 1.0
 
 
 class RoomWatch:
-    """Looks at the data directory's disk every LOOK_PERIOD_S. say: prints a message of the launcher."""
+    """Checks the data directory's disk every LOOK_PERIOD_S. say: prints a message of the launcher."""
 
     def __init__(self, disk: Disk, min_free_bytes: int, say: Callable[[str], None]) -> None:
         self._disk = disk
@@ -24,13 +24,13 @@ class RoomWatch:
         """The service accepts no clips."""
 
     def look(self, *, now: bool = False) -> None:
-        """Look if it is time, or now; say what has changed."""
+        """Check the disk if it is time, or now, and print what has changed."""
         if not now and time.monotonic() < self._next_s:
             return
         self._next_s = time.monotonic() + LOOK_PERIOD_S
         try:
             free_bytes, self.is_full = self._disk.free_bytes(), self._disk.is_full()
-        except OSError:  # the disk is gone, which the service and the worker say
+        except OSError:  # the disk is gone, which the service and the worker report
             return
         was_short, self.is_short = self.is_short, self.is_full or free_bytes < self._min_free_bytes
         if self.is_short == was_short:

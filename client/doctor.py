@@ -1,4 +1,4 @@
-"""What `intrasplat doctor` says of the server: its packages, its queue, its data directory and its keys."""
+"""The checks of `intrasplat doctor` for the server: packages, queue, data directory and keys."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ OPTIONAL_PACKAGES = {
 
 
 def server_findings(settings: Settings | None = None) -> list[Diagnosis]:
-    """What the server needs, in the order it is printed. settings: None means those of the environment.
+    """The findings about the server, in printing order. settings: None: those of the environment.
 
     Raises:
-        InputError: a variable of the environment holds what its setting does not accept.
+        InputError: an environment variable has a value that its setting does not accept.
     """
     settings = settings or Settings.from_environment()
     packages = package_findings(PACKAGES, OPTIONAL_PACKAGES)

@@ -23,9 +23,9 @@ from intrasplat.report import Report
 
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
 READ = (JobView, Delivery, Report, SceneCameras, Measurement)
-"""What the service answers with; types that these contain follow."""
+"""Types that the service answers with; the types that they contain are added."""
 CLOSED = ("JobState",)
-"""Enumerations whose every member a reader must know. Of others, a member that a later version adds is read as text."""
+"""Enumerations of which a reader must know every member. Unknown members of all others are read as text."""
 GIVEN_ALSO = {"holdout": "list[int]"}
 """Forms that the service accepts besides the schema's."""
 EXCLUSIVE_OPTIONS = (JobOptions.exclusive,)
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def definitions() -> dict[str, Any]:
-    """The JSON schema of each type that the service answers with, by its name."""
+    """The JSON schema of each type that the service answers with, by name."""
     _, document = models_json_schema([(each, "validation") for each in READ])
     schemas: dict[str, Any] = document["$defs"]
     return schemas
@@ -118,7 +118,7 @@ def _given(schema: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _read_type(kind: Mapping[str, Any], open_enums: Set[str]) -> str:
-    """The type of a field that the service sends: no bounds and no fixed choices, because a later version adds some."""
+    """The type of a field that the service sends, without bounds or choices, which a later version may extend."""
     if "$ref" in kind:
         name = _name_of(kind)
         return f'Annotated[{name} | str, Field(union_mode="left_to_right")]' if name in open_enums else name

@@ -1,5 +1,5 @@
-"""`intrasplat keys`: make, rotate, list and revoke the API keys of an installation, in its data directory; and tell the
-secret with which a tenant's receivers verify webhooks.
+"""`intrasplat keys`: create, rotate, list and revoke the API keys of an installation, in its data directory; and print
+the secret with which a tenant's receivers verify webhooks.
 
 The commands edit the file that the services read (contract/access/keys.py). Run them as the user that runs the service:
 that user can read the clips anyway.
@@ -115,7 +115,7 @@ def _webhook_secret(options: argparse.Namespace) -> int:
 
 
 def _own_keys(options: argparse.Namespace) -> KeyFile:
-    """The keys of an installation of this user, to be changed."""
+    """The keys of an installation of this user, for changes."""
     data_dir = settings_of(options).data_dir
     check_owner(data_dir)
     return KeyFile(data_dir)
@@ -123,8 +123,8 @@ def _own_keys(options: argparse.Namespace) -> KeyFile:
 
 @contextmanager
 def _recorded(options: argparse.Namespace, *acts: tuple[AuditAction, ApiKey, str]) -> Iterator[None]:
-    """The time in which keys are changed: the audit says what begins, and what was done. An act that was begun and
-    not done failed or was cut off."""
+    """Record a change of keys in the audit log, before and after. An action with a "begun" line and no "done" line
+    failed or was cut off."""
     data_dir = settings_of(options).data_dir.expanduser()
     with disk_errors():
         data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -148,10 +148,10 @@ def _scopes(text: str) -> frozenset[KeyScope]:
 
 
 def _until(flag: str, text: str) -> float:
-    """The UNIX time that a length of time from now, or a date, names.
+    """Parse a date, or a duration from now. Returns UNIX time.
 
     Raises:
-        InputError: it is neither, or is over.
+        InputError: it is neither, or it lies in the past.
     """
     now_s = time.time()
     if length := re.fullmatch(r"(\d{1,5})([dh])", text, re.ASCII):

@@ -1,4 +1,4 @@
-"""Where the files of the page for the browser are."""
+"""The folder of the web page's files."""
 
 from __future__ import annotations
 

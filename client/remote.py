@@ -1,4 +1,4 @@
-"""The commands that talk to a service: submit, import, watch, fetch, jobs, cancel, retry, delete."""
+"""The commands that call a service: submit, import, watch, fetch, jobs, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def _show_until_done(client: Client, job_id: str) -> int:
 
 
 def progress_of(job: JobView) -> JobProgress:
-    """What the progress bar shows: the stage, or the state of a job that has not reported a stage."""
+    """The progress bar's content: the stage, or the state of a job that has not reported a stage."""
     if job.stage is None or job.state is JobState.QUEUED:
         return JobProgress(stage=job.state.value, fraction=0.0, seconds_left=job.eta_s)
     return JobProgress(
@@ -248,7 +248,7 @@ def _fetch(options: argparse.Namespace) -> int:
 
 
 def _stored_files(client: Client, scene: str) -> dict[str, bytes]:
-    """The scene's folder as it is stored, by name; the manifest last, without which there is no scene."""
+    """The scene's stored files by name; the manifest last, because a scene exists only with it."""
     manifest = client.file(scene, MANIFEST)
     try:
         names = [*json.loads(manifest)["files"]]

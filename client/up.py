@@ -1,13 +1,13 @@
-"""`intrasplat up`: a queue, the service and its workers on this machine, watched until the caller ends them.
+"""`intrasplat up`: runs a queue, the service and its workers on this machine until the caller ends them.
 
 If `up` itself is killed, service and workers are killed with it. Accepted clips are on disk, and training resumes from
-its last checkpoint at the next start. Only the queue's server stays; the next `up` of the same data directory takes it
-over, and ends it when it ends itself.
+its last checkpoint at the next start. Only the queue's server keeps running; the next `up` of the same data directory
+adopts it, and stops it at its own end.
 
 A child that ends is started again (contract/runtime/supervised.py). If it lacks something that cannot come back by
-itself, and has never worked, the next child would end as well; so `up` ends with the child's remedy instead.
+itself, and was never healthy, the next child would end as well, so `up` ends with the child's remedy instead.
 
-A full disk ends nothing that runs: views and purges go on, the rest waits for room.
+A full disk stops no process: views and purges continue, and everything else waits for free space.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from intrasplat_client import Client
 WATCH_PERIOD_S = 0.2
 READY_PERIOD_S = 1.0
 QUEUE_PERIOD_S = 1.0
-"""Between two starts of the queue's server."""
+"""Minimum interval between two starts of the queue's server."""
 QUEUE_ENDS = {
     ServerEnd.DIED: "had died",
     ServerEnd.WITH_ITS_STARTER: "ended with the command that had started it, such as a backup,",
 }
 HEALTHY_AFTER_S = 60.0
-"""A child that has lived this long works: if it ends, it is started again at once."""
+"""A child that has run this long is healthy: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
 WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
 UP_LOCK = "up.lock"
-"""In run/ of a data directory."""
+"""The lock file of `up`, in run/ of a data directory."""
 EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """The loopback address of a service that listens at every address."""
 
@@ -56,7 +56,7 @@ class Installation:
     """Queue, service and workers of one data directory; a context manager that starts and ends them."""
 
     def __init__(self, settings: Settings, worker_count: int = 1) -> None:
-        Store(settings.data_dir)  # makes the folders, readable by their owner only
+        Store(settings.data_dir)  # creates the folders, readable by their owner only
         data_dir = settings.data_dir.expanduser().resolve()
         self._lock = FolderLock(data_dir / "run" / UP_LOCK)
         self._queue = EmbeddedServer(data_dir) if settings.redis_url is None else None
@@ -75,7 +75,7 @@ class Installation:
 
     @property
     def url(self) -> str:
-        """Where the service answers callers on this machine."""
+        """The service's URL on this machine."""
         host = EVERY_ADDRESS.get(self.settings.host, self.settings.host)
         return f"http://{f'[{host}]' if ':' in host else host}:{self.settings.port}"
 
@@ -112,7 +112,7 @@ class Installation:
         )
 
     def watch(self) -> None:
-        """Start again what has ended; call it often. Raises UnavailableError if a child cannot work here."""
+        """Restart the processes that have ended; call it often. Raises UnavailableError if a child cannot run here."""
         self.room.look()
         self._watch_queue()
         for child in (self.service, *self.workers):
@@ -120,14 +120,14 @@ class Installation:
                 ended = child.watch()
             except UnavailableError as lack:
                 self.room.look(now=True)
-                if self.room.is_full:  # nor had its last words room to say what may return
+                if self.room.is_full:  # the child could not write to disk that what it lacks may come back
                     continue
                 raise UnavailableError(f"The {child.name} cannot work here: {lack.problem}", lack.remedy) from lack
             if ended is not None:
                 say(f"the {child.name} {ended.cause}; starting it again in {ended.pause_s:g} s")
 
     def _watch_queue(self) -> None:
-        """Start the queue's server again if it has ended. While the disk is full it may die again and again."""
+        """Restart the queue's server if it has ended. While the disk is full it may die repeatedly."""
         if self._queue is None or time.monotonic() < self._queue_at_s:
             return
         try:
@@ -143,7 +143,7 @@ class Installation:
         self._queue_at_s = time.monotonic() + QUEUE_PERIOD_S
 
     def wait_until_ready(self, is_ended: Callable[[], bool], timeout_s: float) -> bool:
-        """Watch until the service would train a clip; False after timeout_s, once is_ended(), or if the disk is short.
+        """Watch until the service is ready; False after timeout_s, once is_ended(), or if free disk space is short.
 
         Raises as watch.
         """
@@ -161,7 +161,7 @@ class Installation:
 
 
 def end_together(children: Sequence[Supervised]) -> None:
-    """Ask all to end before waiting for any."""
+    """Ask all children to end, then wait for each."""
     for child in children:
         child.ask_to_end()
     for child in children:
@@ -169,7 +169,7 @@ def end_together(children: Sequence[Supervised]) -> None:
 
 
 def worker_names(first: str, number: int) -> list[str]:
-    """`first` alone; for several, its stem with a number: worker-1, worker-2 and so on."""
+    """The names of the workers: `first` for one; for several its stem with a number: worker-1, worker-2, ..."""
     stem = first.removesuffix("-1")
     return [first] if number == 1 else [f"{stem}-{each}" for each in range(1, number + 1)]
 
@@ -180,11 +180,11 @@ def say(text: str) -> None:
 
 
 def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.0) -> None:
-    """Start everything, say where it is, and watch until SIGINT or SIGTERM.
+    """Start all processes, print the URL, and watch until SIGINT or SIGTERM.
 
     Raises:
-        UnavailableError: there is no key to let anybody in, the port is taken, there is no queue, the service or a
-            worker lacks something, or nothing becomes ready.
+        UnavailableError: there is no API key, the port is taken, there is no queue, the service or a worker lacks
+            something, or the service does not become ready.
         StoreFullError: the disk is so full that nothing can start; the error names it.
     """
     end = told_to_end()
@@ -214,7 +214,7 @@ def _run(settings: Settings, worker_count: int, ready_timeout_s: float, end: thr
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise UnavailableError if somebody else listens there."""
+    """Raise UnavailableError if another process listens there."""
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,7 +1,7 @@
-"""What several processes must agree on, in rooms that import only those before them.
+"""What service and worker must agree on. A folder imports only the folders named before it.
 
-wire/ (what is sent and stored), runtime/ (settings, logs, child processes), intake/ (files from outside), store/ (clips
-and scenes), queue/ (jobs), access/ (keys and audit). No torch, no web framework.
+wire/ (what is sent and stored), runtime/ (settings, logs, child processes), store/ (clips and scenes), queue/ (jobs),
+access/ (keys and audit), backup/ (backup and restore). No torch, no web framework.
 """
 
 CONTRACT_VERSION = 2

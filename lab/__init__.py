@@ -1,1 +1,1 @@
-"""The laboratory: synthetic tissue, conditions, rivals, evaluations and benchmarks. It is never installed."""
+"""The laboratory: synthetic tissue, adverse conditions, rival systems, evaluations, benchmarks. Never installed."""

@@ -20,7 +20,7 @@ COMMANDS = {
         "spoil synthetic clips in many ways, and draw where presets break and whether they say so",
     ),
 }
-"""By command: the module with its add_cli_arguments and run_cli, and a summary."""
+"""The module with add_cli_arguments and run_cli, and a summary, by command."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

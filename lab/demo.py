@@ -29,7 +29,7 @@ FRAMES = 48
 WIDTH, HEIGHT = 480, 384
 SEED = 3
 TRAINING = "train"
-"""Name of the stage in JobView.stage."""
+"""The name of the training stage in JobView.stage."""
 BUDGET_S = 45.0
 """With this size and budget the demo takes two minutes on two quiet cores, and less than four on slow ones."""
 

@@ -47,7 +47,7 @@ class Case:
 
 
 RECORDING = "d4d_stereo"
-"""A recording of both eyes; its cases are left out where it is not there."""
+"""A recording of both eyes; its cases are skipped if it is missing."""
 CASES = (
     *(Case(clip, preset, 200) for preset in ("fast", "instant", "paper") for clip in CLIPS),
     *(Case(RECORDING, preset, 60) for preset in ("fast", "instant", "paper")),

@@ -20,17 +20,17 @@ from service.renderer import ZmqRenderer
 from service.server import Server
 
 QUEUE_PATIENCE_S = 2.7
-"""Callers hear within 3 s that the queue does not answer."""
+"""How long the queue's client retries, so that callers learn within 3 s that the queue does not answer."""
 KNOWN_WORKERS = "workers.json"
 SWITCH_S = 0.0005
-"""After so long a thread that computes gives Python's lock to one that waits for it. The loop takes the lock several
-times for each answer, and at the usual 5 ms every upload that is looked at would delay all others by tens of ms."""
+"""Python's thread switch interval. The event loop takes the interpreter lock several times for each answer. At the
+usual 5 ms, every upload that a thread inspects would delay all other answers by tens of ms."""
 
 logger = logging.getLogger("intrasplat.service")
 
 
 def main() -> int:
-    """Serve until a signal ends it."""
+    """Serve until a signal ends the process."""
     try:
         settings = Settings.from_environment()
         check_keys(settings)

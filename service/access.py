@@ -1,8 +1,8 @@
-"""Who calls: the key of a request, or nobody in particular where that is allowed.
+"""Authentication: finds the caller of a request by its API key.
 
-A key is required unless the service is bound to loopback and answers to no other name. There, requests without a key
-are this machine's user's, tenant "local", with every scope; but a request that a proxy has passed on comes from
-elsewhere, whatever address it has. A key that is wrong is refused everywhere.
+A key is required unless the service is bound to loopback and answers to no other name. There, a request without a key
+belongs to this machine's user, tenant "local", with every scope. A request that a proxy has forwarded always needs a
+key, whatever its address. A wrong key is refused everywhere.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ KEY_REMEDY = "Send `Authorization: Bearer KEY`; whoever runs the service makes k
 EXPIRED_REMEDY = "Ask whoever runs the service for a new one: `intrasplat keys rotate`, or `create`."
 WRONG_KEYS_PER_S = 0.2
 WRONG_KEYS_AT_ONCE = 10.0
-"""From one address. Keys cannot be guessed; this keeps whoever tries from filling logs and audit."""
+"""Wrong keys accepted from one address in a burst. Keys cannot be guessed; this limits what attempts write to logs and
+audit log."""
 
 MAX_STRANGERS = 64
-"""Viewers at a time whose key has yet to come."""
+"""Maximum viewers at a time that have not sent their key yet."""
 
 FORWARDED_HEADERS = frozenset(
     {"forwarded", "via", "x-real-ip", "x-client-ip", "true-client-ip", "cf-connecting-ip", "cdn-loop"}
 )
 FORWARDED_PREFIX = "x-forwarded"
-"""X-Forwarded-For, -Host, -Proto and whatever else a proxy may say in this way."""
+"""The prefix of X-Forwarded-For, -Host, -Proto and other headers of proxies."""
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Whose request it is and what it may do. key_id is None for this machine's user."""
+    """The tenant of a request and what it may do. key_id is None for this machine's user."""
 
     tenant: str
     scopes: frozenset[KeyScope]
@@ -48,19 +49,19 @@ class Caller:
     expires_at_s: float | None = None
 
     def require(self, scope: KeyScope) -> None:
-        """Return if the caller has the scope; Problem 403 that names it otherwise."""
+        """Return if the caller has the scope. Raises Problem 403, which names it, otherwise."""
         if scope not in self.scopes:
             remedy = f"Use a key that has it: `intrasplat keys create --scopes {scope}`."
             detail = f"This key lacks the scope {scope.value!r}."
             raise AccessRefusal(403, detail, remedy, address=self.address, caller=self)
 
     def owns(self, record: JobRecord) -> bool:
-        """Whether the job is the caller's tenant's; if not, the caller hears what it would hear of no job at all."""
+        """Whether the job belongs to the caller's tenant. If not, the caller gets the answer for a missing job."""
         return record.tenant == self.tenant
 
 
 class AccessRefusal(Problem):
-    """A caller asked for what it may not have; recorded in the audit (service/audit.py) where it leaves a route."""
+    """A caller requested what it may not have. The audit log records it when it leaves a route (service/audit.py)."""
 
     def __init__(
         self,
@@ -82,7 +83,7 @@ class AccessRefusal(Problem):
 
 
 class Access:
-    """The rules above for one service."""
+    """The rules at the head of this file, for one service."""
 
     def __init__(self, settings: Settings) -> None:
         self._keys = KeyFile(settings.data_dir)
@@ -91,10 +92,10 @@ class Access:
         self.keys_required = needs_keys(settings)
 
     def caller(self, headers: Mapping[str, str], address: str) -> Caller | None:
-        """Whose request has these headers (names in lower case); None if it has no key and needs one.
+        """The caller of a request with these headers (names in lower case); None if it needs a key and has none.
 
         Raises:
-            Problem: 401: the key is wrong, or has expired. 429: too many wrong keys came from this address. Right keys
+            Problem: 401: the key is wrong, or has expired. 429: too many wrong keys came from this address. Valid keys
                 still pass, so that nobody behind a common proxy can lock out the others.
             UnavailableError: the file of keys is damaged.
         """
@@ -106,7 +107,7 @@ class Access:
         return Caller(LOCAL_TENANT, ALL_SCOPES, None, address)
 
     def caller_of_key(self, text: str, address: str) -> Caller:
-        """Whose key it is; raises as caller()."""
+        """The caller with this key; raises as caller()."""
         key: ApiKey | None = self._keys.find(text)
         if key is None:
             self._wrong_keys.admit(address)
@@ -119,7 +120,7 @@ class Access:
 
     @contextmanager
     def stranger(self) -> Iterator[None]:
-        """The time in which somebody is connected who has yet to say who it is; Problem 503 if too many are."""
+        """Count a connection without a key during the context. Raises Problem 503 if there are too many."""
         if self._strangers >= MAX_STRANGERS:
             detail = f"{MAX_STRANGERS} viewers have yet to send their keys, as many as may be."
             raise Problem(503, detail, remedy="Come back, or send the key as a header.")
@@ -140,7 +141,7 @@ def _is_forwarded(headers: Mapping[str, str]) -> bool:
 
 
 def _key_text(headers: Mapping[str, str]) -> str | None:
-    """What was sent as a key, in either header; an Authorization of another kind is a wrong key."""
+    """The text sent as a key, in either header. An Authorization header of another kind counts as a wrong key."""
     authorization = headers.get("authorization")
     if authorization is None:
         return headers.get("x-api-key")

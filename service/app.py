@@ -1,4 +1,4 @@
-"""create_app: the HTTP face. Routes parse, make one call and return; nothing here computes an image."""
+"""create_app: the HTTP application. Routes parse, make one call and return; nothing here computes an image."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ logger = logging.getLogger("intrasplat.service")
 
 
 def create_app(settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> FastAPI:
-    """The application; it takes over `queue` and `renderer` and closes them when it ends."""
+    """The application. It owns `queue` and `renderer` and closes them when it ends."""
     deps = Deps(settings, queue, store, renderer)
 
     @asynccontextmanager
@@ -91,7 +91,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
 
 
 async def _kept_up(run: Callable[[], Awaitable[None]]) -> None:
-    """Work in the background that goes on after an error nobody foresaw."""
+    """Run background work, and run it again after an unexpected error."""
     while True:
         try:
             await run()

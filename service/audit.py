@@ -1,4 +1,4 @@
-"""What the service records of its callers (contract/access/audit.py); the calls block for one write to disk."""
+"""Records the actions of callers in the audit log (contract/access/audit.py). Calls block for one write to disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ logger = logging.getLogger("intrasplat.service")
 
 
 class Audit:
-    """The audit of one service."""
+    """The audit log of one service."""
 
     def __init__(self, log: AuditLog) -> None:
         self._log = log
@@ -32,21 +32,21 @@ class Audit:
     def record(
         self, action: AuditAction, caller: Caller | None, job_id: str | None = None, outcome: str = "ok"
     ) -> None:
-        """Record an act before it is done. caller None: the service itself.
+        """Record an action before it takes place. caller None: the service itself.
 
         Raises:
-            UnavailableError: it cannot be recorded, so the act must not happen.
+            UnavailableError: it cannot be recorded, so the action must not take place.
         """
         self._log.append(_entry(action, caller, job_id, outcome))
 
     async def viewed(self, caller: Caller, job_id: str) -> None:
-        """Record that the caller sees a scene; at once if that is recorded for this minute. Raises as record()."""
+        """Record that the caller views a scene, once a minute. Raises as record()."""
         entry = _entry(AuditAction.VIEWED, caller, job_id, "ok")
         if not self._is_noted(entry):
             await run_in_threadpool(self._once_a_minute, entry)
 
     async def refused(self, refusal: AccessRefusal) -> None:
-        """Record a refusal, once a minute for each caller and reason. It stands even if it cannot be recorded."""
+        """Record a refusal, once a minute for each caller and reason. A failure to record it is not raised."""
         entry = _entry(AuditAction.REFUSED, refusal.caller, refusal.job_id, str(refusal.status))
         try:
             await run_in_threadpool(self._once_a_minute, entry.model_copy(update={"address": refusal.address}))
@@ -54,7 +54,7 @@ class Audit:
             logger.error("a refusal was not recorded in the audit: %s", type(error).__name__)
 
     def _once_a_minute(self, entry: AuditEntry) -> None:
-        with self._lock:  # of callers that come together, one writes and the others wait until it has
+        with self._lock:  # of simultaneous callers, one writes and the others wait for it
             if not self._is_noted(entry):
                 self._log.append(entry)
                 self._noted.add(_note(entry))
@@ -82,13 +82,13 @@ def _entry(action: AuditAction, caller: Caller | None, job_id: str | None, outco
 
 
 def _note(entry: AuditEntry) -> Note:
-    """The minute, and all that makes an entry another one."""
+    """The key under which an entry counts as recorded: the minute and the fields that distinguish entries."""
     same = (entry.action, entry.outcome, entry.job_id, entry.tenant, entry.key_id, entry.address)
     return entry.time[:MINUTE_LENGTH], same
 
 
 def install_refusal_handler(app: FastAPI, audit: Audit) -> None:
-    """Record every refusal that leaves a route, then answer it as the problem it is; after install_handlers()."""
+    """Record every refusal that leaves a route, then answer with its problem. Call after install_handlers()."""
     answer: Any = app.exception_handlers[Problem]
 
     async def on_refusal(connection: Any, error: Exception) -> Any:

@@ -80,7 +80,7 @@ BODIES: dict[str, dict[str, Any]] = {
     **models_json_schema([(DescribedClip, "validation")], ref_template="#/components/schemas/{model}")[1]["$defs"],
     "SceneForm": SCENE_FORM,
 }
-"""Schemas by name. Which parts go together is no part of them, for generators read no conditions."""
+"""Schemas by name. They do not say which parts go together, because generators do not read conditions."""
 
 JSON_PARTS = {name: {"contentType": "application/json"} for name in ("options", "metadata")}
 SCENE_BODY: dict[str, Any] = {
@@ -108,4 +108,4 @@ REQUEST_BODY: dict[str, Any] = {
         },
     }
 }
-"""What the route adds to its description."""
+"""The request body that the route adds to its description."""

@@ -1,8 +1,8 @@
-"""Where webhooks may go: to hosts that the operator has named, at addresses that the operator has not ruled out.
+"""Checks where webhooks may go: to hosts that the operator has listed, at addresses that the operator allows.
 
-A caller chooses the URL, and the service connects to it from inside the hospital's network. So the URL is judged when
-it is given and again at every try, and the address that was judged is the one that is connected to: a name that means
-another machine a moment later changes nothing.
+A caller chooses the URL, and the service connects to it from inside the hospital's network. So the URL is checked when
+it is submitted and again at every attempt. The service connects to the address that it has checked, so a DNS name that
+resolves to another machine a moment later has no effect.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from intrasplat.errors import InputError
 
 DEFAULT_PORTS = {"https": 443, "http": 80}
 URL_TEXT = re.compile(r"[!-~]+", re.ASCII)
-"""Visible ASCII."""
+"""The characters of a URL: visible ASCII."""
 NAT64 = IPv6Network("64:ff9b::/96")
 METADATA = frozenset(map(ip_address, ("fd00:ec2::254", "fd20:ce::254", "fd00:c1::a9fe:a9fe")))
-"""Where clouds tell their machines secrets; others lie among the link-local addresses."""
+"""Metadata servers of clouds, which give secrets to their machines; others have link-local addresses."""
 URL_REMEDY = "Give a URL such as https://his.example.org/intrasplat, without a user, a password or a fragment."
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_WEBHOOK_HOSTS."
 
 
 class LookUps:
-    """Asks the resolver, at most so often at a time, in threads that the end of the process does not wait for."""
+    """Resolves names in a limited number of threads, for which the end of the process does not wait."""
 
     def __init__(self, most: int) -> None:
         self._places = asyncio.Semaphore(most)
 
     async def addresses(self, host: str) -> list[str]:
-        """The addresses of a host; if this is cancelled, its place stays taken until the resolver answers.
+        """The addresses of a host. A cancelled look-up counts against the limit until the resolver answers.
 
         Raises:
-            OSError, UnicodeError: the name means nothing.
+            OSError, UnicodeError: the name cannot be resolved.
         """
         await self._places.acquire()
         loop, answer = asyncio.get_running_loop(), Future[list[str]]()
@@ -65,10 +65,10 @@ class LookUps:
 
 
 def check_callback(url: str | None, settings: Settings) -> None:
-    """Return if webhooks may go there, as far as can be told without looking up its name.
+    """Return if webhooks may go to this URL, as far as that is known without a DNS look-up.
 
     Raises:
-        InputError: it is no URL, or its host is not allowed.
+        InputError: it is not a URL, or its host is not allowed.
     """
     if url is None:
         return
@@ -85,23 +85,23 @@ def check_callback(url: str | None, settings: Settings) -> None:
 
 
 def is_allowed(url: str, settings: Settings) -> bool:
-    """Whether the operator has named the URL's scheme, host and port."""
+    """Whether the operator has listed the URL's scheme, host and port."""
     named = (host if "://" in host else f"https://{host}" for host in settings.webhook_hosts)
     return _origin(url) in {_origin(each) for each in named}
 
 
 async def permitted_addresses(host: str, settings: Settings, look_ups: LookUps) -> list[str]:
-    """The addresses of a host that may be connected to, in the resolver's order.
+    """The allowed addresses of a host, in the resolver's order.
 
     Raises:
-        OSError, UnicodeError: the name means nothing.
+        OSError, UnicodeError: the name cannot be resolved.
     """
     addresses = await look_ups.addresses(host)
     return [address for address in addresses if _is_permitted(address, settings.webhook_private == "yes")]
 
 
 def _origin(url: str) -> str | None:
-    """Scheme, host and port in one form; None if it is no URL, or one with a user or a fragment."""
+    """Scheme, host and port, normalised; None if it is not a URL, or has a user or a fragment."""
     if not URL_TEXT.fullmatch(url):
         return None
     try:
@@ -118,13 +118,13 @@ def _is_permitted(text: str, private: bool) -> bool:
     address = _meant(ip_address(text.partition("%")[0]))
     if address.is_link_local or address.is_multicast or address.is_unspecified or address in METADATA:
         return False
-    if address.is_reserved and not address.is_loopback:  # some stand for an IPv4 address that is not told
+    if address.is_reserved and not address.is_loopback:  # some map to an IPv4 address that is unknown here
         return False
     return address.is_global or (private and (address.is_private or address.is_loopback))
 
 
 def _meant(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:
-    """The IPv4 address inside an IPv6 one that stands for it; others themselves."""
+    """The IPv4 address that an IPv6 address embeds; any other address unchanged."""
     if isinstance(address, IPv4Address):
         return address
     if address in NAT64:

@@ -1,7 +1,8 @@
-"""POST /reconstruct/check: what speaks against a clip, before it is sent. Nothing is kept of it.
+"""POST /reconstruct/check: checks the description of a clip before the clip is sent. Nothing is stored.
 
-The rules are those of POST /reconstruct, and those of the worker that need no decoder. What POST /reconstruct would
-refuse is told as refused; what rests on numbers that the caller has measured, or fails in the worker, is told as well.
+The rules are those of POST /reconstruct, and those of the worker that need no decoder. A finding is `refused` if POST
+/reconstruct would refuse the clip. Findings that rest on the caller's own measurements, or that would fail in the
+worker, are reported too.
 """
 
 from __future__ import annotations
@@ -34,16 +35,16 @@ from service.upload import check_part_size, checked_suffix
 router = APIRouter(tags=["jobs"])
 
 MAX_BODY_BYTES = 3 * 1024 * 1024
-"""Of a description; a calibration's text may double in JSON."""
+"""Maximum bytes of a description; a calibration's text may double in JSON."""
 REMEDY = 'Send {"clip": {"suffix": ".mp4", "size_bytes": N}} and what else is known of its files.'
 MAX_APART_S = 0.1
-"""Two eyes whose durations differ by more have not the same number of frames."""
+"""If the durations of two eyes differ by more, they do not have the same number of frames."""
 EYES_OF = {
     "sbs": ((2, 1),),
     "tb": ((1, 2),),
     "auto": ((2, 1), (1, 2)),
 }
-"""How many eyes lie beside and below each other in a video, by layout."""
+"""The numbers of eyes (columns, rows) in a video frame, by layout."""
 
 
 class Findings(BaseModel):
@@ -87,7 +88,7 @@ def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
         yield _finding(part, FindingCode.EMPTY, "the file is empty.", "Send a file with content.")
         return
     if wrong := list(_found(FindingCode.ENDING, lambda: checked_suffix(part, file.suffix))):
-        yield from wrong  # what it holds is judged once it is a file of a kind that may hold it
+        yield from wrong  # the content is checked only if the kind of file is right
         return
     yield from _found(FindingCode.TOO_LARGE, lambda: check_part_size(part, file.size_bytes))
     head = bytes.fromhex(file.head)
@@ -100,7 +101,7 @@ def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
 
 
 def _of_sizes(limits: ClipLimits, files: dict[str, DescribedFile]) -> Iterator[Finding]:
-    """What the numbers that the caller measured say."""
+    """Findings from the sizes and durations that the caller measured."""
     for part in files.keys() & {"clip", "left", "right"}:
         file = files[part]
         if file.width and file.height:
@@ -172,7 +173,7 @@ def _of_options(services: Deps, caller: Caller, described: DescribedClip) -> Ite
 
 
 def _found(code: FindingCode, check: Callable[[], Any], *, refused: bool = True) -> Iterator[Finding]:
-    """What a check that raises has found."""
+    """The finding of a check that raises."""
     try:
         check()
     except LimitError as error:

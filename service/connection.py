@@ -1,4 +1,4 @@
-"""One lasting ZeroMQ connection from the service to a worker, with many requests on it."""
+"""One persistent ZeroMQ connection from the service to a worker, with many requests on it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from contract.wire.rendering import CancelRequest, SceneRequest, WorkerReply, Wo
 from intrasplat.errors import UnavailableError
 
 CONNECT_TIMEOUT_S = 2.0
-"""A worker that listens is connected to in milliseconds; one that has just died is tried for no longer than this."""
+"""How long to try to connect. A worker that listens answers in milliseconds; one that has just died never does."""
 
 LAST_ANSWERS_S = 0.05
 
 HEARTBEAT_MS, SILENCE_MS = 2000, 6000
-"""ZeroMQ's own: a machine that is gone without a word, or a process that is stopped, is noticed by its silence."""
+"""ZeroMQ's heartbeat interval and timeout: they detect a lost machine or a stopped process by its silence."""
 
 UP = zmq.Event.HANDSHAKE_SUCCEEDED
 DOWN = zmq.Event.DISCONNECTED | zmq.Event.CONNECT_RETRIED
@@ -37,7 +37,7 @@ logger = logging.getLogger("intrasplat.service")
 
 @dataclass(frozen=True)
 class Answer:
-    """A worker's answer: its head, the encoded image or file, and the endpoint of the worker, where it is known."""
+    """A worker's answer: its head, the encoded image or file, and the worker's endpoint if known."""
 
     head: WorkerReply
     body: bytes
@@ -45,22 +45,22 @@ class Answer:
 
 
 class WorkerGoneError(Exception):
-    """The worker cannot be reached, or went away before it answered."""
+    """The worker cannot be reached, or disconnected before it answered."""
 
 
 class Reached(StrEnum):
-    """Whether the worker is there."""
+    """The state of the connection to the worker."""
 
     TRYING = "trying"
     UP = "up"
     DOWN = "down"
-    """ZeroMQ goes on trying."""
+    """Not connected; ZeroMQ keeps trying."""
     REFUSED = "refused"
-    """The two do not know the same secret. ZeroMQ gives up then: a new connection is needed to try again."""
+    """The two sides have different secrets. ZeroMQ then gives up: a retry needs a new connection."""
 
 
 class Connection:
-    """A DEALER to one worker; answers find their request by its id."""
+    """A DEALER socket to one worker; an answer carries the id of its request."""
 
     def __init__(self, context: zmq.asyncio.Context, endpoint: str, render_secret: str | None = None) -> None:
         if endpoint.startswith("tcp:") and render_secret is None:
@@ -85,13 +85,13 @@ class Connection:
         self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._watch())]
 
     async def ask(self, request: SceneRequest, *, patiently: bool = True) -> Answer:
-        """The worker's answer. patiently: wait a moment for a worker that is down, for there is no other.
+        """The worker's answer. patiently: wait a moment for a worker that is down, because there is no other.
 
-        The worker has all requests at once and chooses their order. If this is cancelled, so is the request.
+        The worker gets all requests at once and chooses their order. Cancelling this call cancels the request.
 
         Raises:
-            WorkerGoneError: there will be none.
-            UnavailableError: it is not one that this version can read.
+            WorkerGoneError: no answer will come.
+            UnavailableError: this version cannot read the answer.
         """
         document = WorkerRequest(request=request, trace=traces.traceparent()).model_dump_json().encode()
         await self.reach(patiently=patiently)
@@ -111,11 +111,11 @@ class Connection:
 
     @property
     def is_idle(self) -> bool:
-        """Nobody waits for an answer."""
+        """Whether no caller waits for an answer."""
         return not self._waiting
 
     async def close(self) -> None:
-        """End the connection. Callers that still wait get the error that the worker is gone."""
+        """Close the connection. Callers that still wait get WorkerGoneError."""
         for task in [*self._tasks, *self._cancelling]:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -126,13 +126,13 @@ class Connection:
         self._socket.close()
 
     async def _cancel(self, request_id: bytes) -> None:
-        """Tell the worker that nobody waits for this answer any more."""
+        """Tell the worker that no caller waits for this answer any more."""
         if self.state is Reached.UP:
             document = WorkerRequest(request=CancelRequest()).model_dump_json().encode()
             await self._socket.send_multipart([request_id, document])
 
     async def reach(self, *, patiently: bool) -> None:
-        """Return when the worker is there; WorkerGoneError if it is not. patiently: as in ask()."""
+        """Return when the worker is connected; WorkerGoneError if it is not. patiently: as in ask()."""
         hopeless = {Reached.REFUSED} if patiently else {Reached.REFUSED, Reached.DOWN}
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
@@ -155,9 +155,9 @@ class Connection:
             else:
                 self.state = Reached.DOWN
             if self.state is not Reached.UP:
-                # What was asked and not answered died with the worker; an answer that has just come is read before.
+                # Unanswered requests were lost with the worker; an answer that has just arrived is read first.
                 loop.call_later(LAST_ANSWERS_S, _give_up, list(self._waiting.values()))
-            self._changed.set()  # wakes who waits now
+            self._changed.set()  # wakes the present waiters
             self._changed.clear()
 
     async def _read(self) -> None:

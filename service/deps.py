@@ -1,6 +1,6 @@
-"""What routes work with, handed to them by the application: the parts of the service, and who calls.
+"""What the application passes to routes: the parts of the service, and the caller.
 
-Every route but those of service/system.py that say nothing of anybody's work takes AnyCaller, and requires a scope:
+Every route takes AnyCaller and requires a scope, except those of service/system.py that report nothing about jobs:
 
     def list_jobs(services: Services, caller: AnyCaller) -> ...:
         caller.require(KeyScope.VIEW)
@@ -42,20 +42,20 @@ NO_ADDRESS = "unknown"
 
 
 class Deps:
-    """What the service is made of: four things that it is given, and its own parts, made of those."""
+    """The parts of the service: four that are passed in, and others built from those."""
 
     def __init__(self, settings: Settings, queue: Queue, store: Store, renderer: Renderer) -> None:
         self.settings = settings
         self.queue = queue
         self.store = store
         self.renderer = renderer
-        # who may do what, and what is known of it afterwards
+        # access and its audit log
         self.access = Access(settings)
         self.limiter = Limiter(settings.requests_per_s)
         self.render_limits = RenderLimits(settings)
         self.audit = Audit(AuditLog(settings.data_dir))
         self.metrics = Metrics(queue, store)
-        # how a clip comes in, how callers follow its job and hear of its end, and how all of it is removed
+        # uploads, events and webhooks of jobs, removal
         self.intake = Intake(settings, store)
         self.sweep = Sweep(queue, store)
         self.feeds = Feeds(queue)
@@ -76,7 +76,7 @@ Services = Annotated[Deps, Depends(_deps_of)]
 
 
 def address_of(connection: HTTPConnection) -> str:
-    """The caller's address, as far as the proxies in between are trusted to tell it; no other text of theirs."""
+    """The caller's address, which only trusted proxies may set; nothing but an IP address."""
     if connection.client is None:
         return UNIX_SOCKET
     try:
@@ -103,12 +103,12 @@ AnyCaller = Annotated[Caller, Depends(_caller)]
 """The caller of a request or WebSocket. Without a valid key where one is needed: 401, before any handshake."""
 
 EarlyCaller = Annotated[Caller | None, Depends(_caller_if_known)]
-"""For a WebSocket whose key may come in its first message, since browsers send no header: None means that it must.
-services.access.caller_of_key(text, address) then says whose it is."""
+"""The caller of a WebSocket, or None if the key has to come in its first message, because browsers send no header.
+services.access.caller_of_key(text, address) then gives the caller."""
 
 
 def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
-    """The record of a job of the caller's tenant; the same 404 if there is none and if it is another's."""
+    """The record of a job of the caller's tenant. A missing job and another tenant's job give the same 404."""
     record = services.queue.get(job_id) if is_job_id(job_id) else None
     if record is not None and caller.owns(record):
         return record
@@ -116,7 +116,7 @@ def owned_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
 
 
 def owned_scene(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
-    """As owned_job(), of a scene, or of the job that is to become one; of a finished scene also without the queue."""
+    """As owned_job(), for a scene or the job that will become one. Finds finished scenes without the queue, too."""
     record = services.done.record(scene_id) if is_job_id(scene_id) else None
     if record is not None and caller.owns(record):
         return record
@@ -129,7 +129,7 @@ def no_such_scene(scene_id: str, caller: Caller, record: JobRecord | None) -> Pr
 
 
 def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobRecord | None) -> Problem:
-    """The 404 of what is not there and of what is another tenant's: alike, but the latter is recorded in the audit."""
+    """The same 404 for what does not exist and for what is another tenant's; the audit log records only the latter."""
     if record is None:
         return Problem(404, detail, field=field, remedy=remedy)
     return AccessRefusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=record.job_id)

@@ -1,7 +1,7 @@
-"""Records of done jobs, so that their scenes are shown also while the queue is away.
+"""Records of done jobs, so that their scenes can be shown while the queue is unreachable.
 
-A done job's record never changes: those that were looked up are remembered. While the queue is away, the record of any
-other finished scene is made of what the store knows: the submission names the tenant, the scene's folder the attempt.
+A done job's record never changes, so records are cached. While the queue is unreachable, the record of any other
+finished scene is built from the store: the submission names the tenant, and the scene's folder the attempt.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from service.listing import Page, SceneSearch, find_among, find_page
 from service.questions import Questions
 
 REMEMBERED = 1_000
-"""Records, of a few kilobytes each."""
+"""Size of the cache in records, of a few kilobytes each."""
 
 PATIENCE_S = 1.0
-"""How long to wait for the queue's record. The queue's client itself tries for many seconds."""
+"""How long to wait for the queue's record. The queue's client itself retries for many seconds."""
 
 LIST_PATIENCE_S = 5.0
 """The same for the list of all jobs."""
 
 
 class DoneJobs:
-    """The queue's records, those of done jobs out of memory or from the store; for many threads."""
+    """Records from the queue; those of done jobs also from memory or from the store. Thread-safe."""
 
     def __init__(self, queue: Queue, store: Store, questions: Questions) -> None:
         self._queue = queue
@@ -42,7 +42,7 @@ class DoneJobs:
         """The job's record; None if there is none, or if the job is done and its scene has been removed.
 
         Raises:
-            UnavailableError: the queue is away, and the job has no finished scene.
+            UnavailableError: the queue is unreachable, and the job has no finished scene.
         """
         record = self._records.get(job_id)
         if record is None:
@@ -52,22 +52,22 @@ class DoneJobs:
                 stored = self._stored(job_id)
                 if stored is None:
                     raise
-                return stored  # not remembered: the queue may know better when it is back
+                return stored  # not cached: the queue may have a newer record when it is back
         if record is None or record.state is not JobState.DONE:
             return record
         there = self._store.has_scene(job_id, record.attempt)
         with self._lock:
             self._records.pop(job_id, None)
             if there:
-                self._records[job_id] = record  # at the end: looked up last
+                self._records[job_id] = record  # at the end: most recently used
             if len(self._records) > REMEMBERED:
                 del self._records[next(iter(self._records))]
         return record if there else None
 
     def page_of(self, tenant: str, search: SceneSearch) -> tuple[Page, bool]:
-        """A page of the tenant's done jobs, and whether the queue named them.
+        """A page of the tenant's done jobs, and whether it comes from the queue.
 
-        While it is away they are those with a finished scene in the store.
+        While the queue is unreachable, these are the jobs with a finished scene in the store.
         """
         find = functools.partial(self._queue.records, tenant)
         try:
@@ -78,22 +78,22 @@ class DoneJobs:
         return told, True
 
     def forget(self, job_id: str) -> None:
-        """Remember no more of a job that was purged."""
+        """Remove a purged job from the cache."""
         with self._lock:
             self._records.pop(job_id, None)
 
     def _stored(self, job_id: str) -> JobRecord | None:
-        """The record of a finished scene as the store knows it; None if there is none.
+        """The record of a finished scene, built from the store; None if there is none.
 
-        Of a job with several finished attempts only the queue knows which one counts.
+        None also for a job with several finished attempts: only the queue knows which one counts.
         """
         return _as_done(self._store.submission(job_id), self._store.scene_attempts(job_id))
 
     def _stored_of(self, tenant: str) -> list[JobRecord]:
-        """As _stored(), of all scenes of a tenant, the last submitted first."""
+        """As _stored(), for all scenes of a tenant, the last submitted first."""
         attempts = self._store.finished_scenes()
         found = {job_id: self._submitted.get(job_id) or self._store.submission(job_id) for job_id in attempts}
-        self._submitted = {job_id: each for job_id, each in found.items() if each is not None}  # they never change
+        self._submitted = {job_id: each for job_id, each in found.items() if each is not None}  # never change
         done = (_as_done(each, attempts[job_id]) for job_id, each in self._submitted.items() if each.tenant == tenant)
         return sorted(filter(None, done), key=place_of, reverse=True)
 

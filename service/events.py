@@ -1,7 +1,7 @@
-"""What happens to a job, as it happens: server-sent events from the queue's own record of changes.
+"""Server-sent events for each change of a job, from the queue's own stream of changes.
 
-One poller per watched job asks the queue, however many callers listen. Each caller reads the same list of the last
-MAX_EVENTS changes at its own pace, so a slow one costs no memory and delays nobody.
+One poller per watched job reads the queue, however many callers listen. All callers read the same list of the last
+MAX_EVENTS changes, each at its own pace, so a slow caller costs no memory and delays nobody.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from intrasplat.errors import UnavailableError
 
 POLL_PERIOD_S = 0.4
 LOOK_PERIOD_S = 2.0
-"""How often a job that has not ended is looked at: whether it was purged, and how far it has come in the queue."""
+"""How often to check whether a job that has not ended was purged, and its position in the queue."""
 HEARTBEAT_S = 15.0
-"""Proxies take a connection for dead after 30 s or more of silence."""
+"""Interval of heartbeats: proxies close a connection after 30 s or more of silence."""
 STREAM_S = 3600.0
-"""Then the caller comes again, with its key: a revoked one ends here at the latest."""
+"""Maximum length of a stream. The caller then reconnects with its key, so a revoked key stops here at the latest."""
 RETRY_MS = 2000
 
 EventOrder = tuple[int, int]
-"""What events' numbers are compared by."""
+"""The sort key of an event number."""
 NOTHING_SEEN: EventOrder = (0, 0)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing to tell the listeners. number None: it is not an event of the queue, such as a new forecast."""
+    """One message to the listeners. number None: it is not an event of the queue, such as a new forecast."""
 
     number: str | None
     state: JobState
@@ -44,7 +44,7 @@ class Entry:
 
 
 class Feed:
-    """The last changes of one job. count: how many there have been; changed: set at the next one."""
+    """The last changes of one job. count: how many there have been in total; changed: set at the next one."""
 
     def __init__(self, job_id: str) -> None:
         self.job_id = job_id
@@ -60,23 +60,23 @@ class Feed:
         return self._entries[-1] if self._entries else None
 
     def add(self, record: JobRecord, number: str | None = None, forecast: Forecast | None = None) -> None:
-        """Tell the listeners how the job is now."""
+        """Send the job's present state to the listeners."""
         self._entries.append(Entry(number, record.state, JobView.of(record, forecast).model_dump_json()))
         self.count += 1
         self.wake()
 
     def end(self) -> None:
-        """There is nothing more to come."""
+        """Mark the feed as ended."""
         self.is_over = True
         self.wake()
 
     def wake(self) -> None:
-        """Let all listeners look again."""
+        """Wake all listeners."""
         self.changed.set()
         self.changed = asyncio.Event()
 
     def since(self, seen: int) -> list[Entry]:
-        """The entries after the first `seen`, as far as they are kept."""
+        """The stored entries after the first `seen`."""
         new = min(self.count - seen, len(self._entries))
         return list(self._entries)[len(self._entries) - new :]
 
@@ -89,7 +89,7 @@ class Feed:
 
 
 class Feeds:
-    """The feeds that somebody listens to, with their pollers."""
+    """The feeds that have listeners, with their pollers."""
 
     def __init__(self, queue: Queue) -> None:
         self._queue = queue
@@ -98,11 +98,11 @@ class Feeds:
         self._is_ending = False
 
     def end(self) -> None:
-        """All streams end within a poll's period; may be called from a signal's handler."""
+        """End all streams within a poll's period. May be called from a signal handler."""
         self._is_ending = True
 
     async def stream(self, job_id: str, after: EventOrder) -> AsyncIterator[bytes]:
-        """The events after that one, and those to come until the job's end, as they go over the wire."""
+        """The events after `after` and all later ones until the job's end, encoded for text/event-stream."""
         ends_at_s = time.monotonic() + STREAM_S
         with self._listening(job_id) as feed:
             yield format_sse_event(retry=RETRY_MS)
@@ -142,7 +142,7 @@ class Feeds:
     async def _poll(self, feed: Feed) -> None:
         after, looked_at_s, forecast = "0", 0.0, None
         while not (feed.is_over or self._is_ending):
-            with contextlib.suppress(UnavailableError):  # the listeners hear of the job when the queue is back
+            with contextlib.suppress(UnavailableError):  # the listeners get the changes when the queue is back
                 for event in await run_in_threadpool(self._queue.events, feed.job_id, after):
                     feed.add(event.record, event.number)
                     after, forecast = event.number, None
@@ -153,13 +153,13 @@ class Feeds:
         feed.end()
 
     async def _look(self, feed: Feed, told: Forecast | None) -> Forecast | None:
-        """Tell of another position in the queue, and of a job without events; the forecast that was told last."""
+        """Send a changed position in the queue, and a job without events. Returns the forecast that was sent last."""
         record = await run_in_threadpool(self._queue.get, feed.job_id)
         if record is None:
             feed.end()
             return None
         if record.state in TERMINAL_STATES:
-            if feed.newest is None:  # put back after the queue had lost it
+            if feed.newest is None:  # the job was restored after the queue had lost it
                 feed.add(record)
             return None
         forecast = await run_in_threadpool(self._queue.forecast, feed.job_id)

@@ -32,7 +32,7 @@ router = APIRouter(prefix="/scenes", tags=["scenes"])
 MAX_EXPORT_S = 3600.0
 """An export that takes longer is cut off."""
 FIRST_BYTES_S = 10.0
-"""How long the head of an answer waits for the first bytes, so that an error has its status."""
+"""How long the response head waits for the first bytes, so that an error still has an HTTP status."""
 BUSY_PAUSE_S = 1.0
 
 logger = logging.getLogger("intrasplat.service")
@@ -95,7 +95,7 @@ async def export_scene(
 
 
 async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> Response:
-    """The file of a format that needs no worker."""
+    """The stored file of a format that needs no worker."""
     caller.require(KeyScope.DOWNLOAD)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
@@ -110,10 +110,10 @@ def _disposition(scene_id: str, name: str) -> str:
 
 
 async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: int) -> AsyncIterator[bytes]:
-    """The rest of an export from this answer on, which is its part of this number.
+    """The rest of an export, starting with `answer`, which is its part number `part`.
 
     Raises:
-        UnavailableError: it cannot go on. The transfer is cut off then, for its head has been sent.
+        UnavailableError: it cannot continue. The transfer is then cut off, because its head has been sent.
     """
     until_s = time.monotonic() + MAX_EXPORT_S
     yield answer.body
@@ -129,10 +129,10 @@ async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: i
 
 
 async def _part(services: Deps, request: ExportRequest, worker: str | None) -> Answer:
-    """The worker's answer, when it has time for it.
+    """The answer of the worker, waiting while it is busy.
 
     Raises:
-        UnavailableError: the worker is gone or mute.
+        UnavailableError: the worker is gone or does not answer.
     """
     until_s = time.monotonic() + MAX_EXPORT_S
     while True:

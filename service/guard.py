@@ -1,9 +1,9 @@
-"""What every request and answer passes: no foreign page may use a service that trusts the loopback interface.
+"""Checks Host and Origin of every request: no foreign web page may use a service that trusts the loopback interface.
 
-A page from elsewhere that is open in a browser on this machine could reach a service that asks for no key; it is
-refused by its Origin, or by Sec-Fetch-Site where browsers tell no Origin, as of images. A name that was rebound to
-127.0.0.1 is refused by its Host. WebSockets are asked the same, since browsers let any page open one. HTTPS, and the
-header that insists on it, are the proxy's.
+A foreign page in a browser on this machine could reach a service that needs no key. Its Origin refuses it, or
+Sec-Fetch-Site where browsers send no Origin, as for images. A DNS name that was rebound to 127.0.0.1 is refused by its
+Host. WebSockets are checked in the same way, because browsers let any page open one. HTTPS and
+Strict-Transport-Security are left to the proxy.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from contract.runtime.settings import LOOPBACK_NAMES
 from service.problems import LENGTH_REMEDY, Problem
 
 ANY_HOST = "*"
-"""As a host: every name is answered, for clusters that address a service by changing ones. Keys are required then."""
+"""As a host: accept every name, for clusters that address a service by changing names. Keys are then required."""
 
 ANSWER_HEADERS = {
     "Content-Security-Policy": (
@@ -42,16 +42,16 @@ EXPOSED_HEADERS = (
         )
     ),
 )
-"""What a page from elsewhere may read of an answer."""
+"""The response headers that a page of another origin may read."""
 FOREIGN_SITES = frozenset({"cross-site", "same-site"})
-"""How a browser says that another page asks; of images and the like it tells no Origin. Links may lead here."""
+"""Values of Sec-Fetch-Site for a request of another page; browsers send no Origin for images. Links are allowed."""
 CORS_METHODS = ("GET", "HEAD", "POST", "PATCH", "DELETE")
 
 
 class Guard:
-    """ASGI middleware: refuses foreign hosts and origins, adds the security headers.
+    """ASGI middleware that refuses foreign hosts and origins and adds the security headers.
 
-    origins: of pages from elsewhere that may use the service all the same; they send a key, never cookies.
+    origins: other origins whose pages may use the service; they send a key, never cookies.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str] = LOOPBACK_NAMES, origins: Collection[str] = ()) -> None:
@@ -96,7 +96,7 @@ class Guard:
         if is_foreign and headers.get("sec-fetch-dest") != "document":
             remedy = "Whoever runs the service admits pages from elsewhere with INTRASPLAT_CORS_ORIGINS."
             return Problem(403, "Pages from elsewhere may not use this service.", field="Sec-Fetch-Site", remedy=remedy)
-        if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: how requests are smuggled
+        if "transfer-encoding" in headers and "content-length" in headers:  # RFC 9112, 6.1: request smuggling
             close = {"Connection": "close"}
             detail = "The request gives its body's length in two ways."
             return Problem(400, detail, field="Content-Length", remedy=LENGTH_REMEDY, headers=close)
@@ -104,7 +104,7 @@ class Guard:
 
 
 def _split(url: str) -> SplitResult:
-    """The parts of a URL; all of them empty, and so allowed nowhere, if it is none."""
+    """The parts of a URL; all empty, and so never allowed, if the text is not a URL."""
     try:
         return urlsplit(url)
     except ValueError:

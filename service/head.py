@@ -9,7 +9,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 
 class HeadAsGet:
-    """ASGI middleware, inside all others. Routes that have a HEAD of their own keep it."""
+    """ASGI middleware, innermost of all. Routes with their own HEAD keep it."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,6 +1,6 @@
-"""POST /scenes: a scene that another installation made becomes a scene of the caller's, by a job like any other.
+"""POST /scenes: imports a scene that another installation exported, by a job like any other.
 
-The service judges the archive without reading a number of it; the worker that takes the job reads the scene.
+The service checks the archive without reading its numbers; the worker that claims the job reads the scene.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from service.upload import SCENE_FORM, SCENE_PART, Received
 router = APIRouter(tags=["scenes"])
 
 OPTIONS = ("priority", "retention_hours")
-"""What may be chosen about an import: nothing is trained."""
+"""The options of an import; those about training do not apply."""
 
 
 @router.post("/scenes", status_code=202, operation_id="import_scene", openapi_extra=SCENE_BODY)
@@ -47,7 +47,7 @@ async def import_scene(
 
 
 def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
-    """Spool first, then queue: a job exists only for an archive that is on disk and has passed the checks."""
+    """Spool first, then enqueue: a job exists only for an archive that is on disk and has passed the checks."""
     options = _options(received.options)
     check_retention(options, services.settings)
     check_scopes(options, caller, services.settings)
@@ -80,7 +80,7 @@ def _options(text: str) -> JobOptions:
     """The options of an import.
 
     Raises:
-        InputError: names an option that is about training, or cannot be used.
+        InputError: names an option that concerns training, or that cannot be used.
     """
     options = parse_options(JobOptions, text)
     for name in sorted(options.model_fields_set - {*OPTIONS}):

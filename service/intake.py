@@ -1,4 +1,4 @@
-"""How much may come in: uploads at once, bytes of each, bytes of all that the disk still has room for."""
+"""Limits of uploads: how many at once, bytes of each, and the free space on the disk for all of them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from service.problems import LENGTH_REMEDY, Problem, no_room_for, room_remedy
 from service.upload import LIMIT_REMEDY
 
 MIN_BYTES = 4096
-"""What a body must bring in upload_silence_s, or end: whoever drips holds a place that another could use."""
+"""The minimum that a body must bring per upload_silence_s: a slow sender occupies a slot that another could use."""
 
 
 @dataclass(eq=False)
 class UploadSlot:
-    """One of the uploads that are being received, and the bytes on disk that are kept for what it has yet to bring."""
+    """An upload that is being received, and the disk space that is reserved for its remaining bytes."""
 
     kept_bytes: int
     tenant: str
 
 
 class Intake:
-    """Counts what this process is receiving; what resumable uploads were promised stands in their folders."""
+    """Counts the uploads of this process. The folders of resumable uploads record the space reserved for them."""
 
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
@@ -39,11 +39,11 @@ class Intake:
 
     @contextmanager
     def place(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[UploadSlot]:
-        """A place among the uploads that are received at once, with room for `declared_bytes`. part: what is sent.
+        """A slot for one upload, with disk space for `declared_bytes`. part: what is sent.
 
         Raises:
-            Problem: 429: the tenant holds its share. 503: all places are taken. 507: the disk has no room for it.
-            LimitError: it is larger than any upload may be.
+            Problem: 429: the tenant has used its share. 503: all slots are taken. 507: the disk has no space for it.
+            LimitError: it exceeds the maximum size of an upload.
         """
         own, share = sum(place.tenant == tenant for place in self._places), self._settings.tenant_share
         if own and own + 1 > self._settings.max_uploads * share:
@@ -62,9 +62,9 @@ class Intake:
             self._places.discard(place)
 
     def check(self, tenant: str, declared_bytes: int, part: str = "clip") -> None:
-        """Return if an upload of this size is allowed and has room; raises as place().
+        """Return if an upload of this size is allowed and fits on the disk; raises as place().
 
-        A tenant that has been promised room already gets no more of the disk's than its share.
+        A tenant with reserved space gets no more of the disk's free space than its share.
         """
         if declared_bytes > self._settings.max_upload_bytes:
             problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
@@ -80,32 +80,32 @@ class Intake:
             raise Problem(429, detail, field="uploads", remedy="Send them, or give some up: DELETE /uploads/{id}.")
 
     def has_room(self) -> bool:
-        """Whether the disk has what must stay free: without it no clip is accepted."""
+        """Whether the disk has more than the minimum free space; otherwise no clip is accepted."""
         return self.missing_bytes() <= 0
 
     def missing_bytes(self) -> int:
-        """How much more must be free before clips are accepted."""
+        """How many more bytes must be free before clips are accepted."""
         return self._settings.min_free_bytes - self._store.free_bytes()
 
     def room_remedy(self) -> str:
-        """What to do when there is no room, with the bytes that are missing."""
+        """The remedy for a full disk, with the number of missing bytes."""
         return room_remedy(self.missing_bytes(), self._settings.min_free_bytes)
 
     def room_bytes(self) -> int:
-        """What may be written now: not what must stay free, nor what is kept for uploads that are on their way."""
+        """Bytes that may be written now: free space less the minimum and what is reserved for uploads."""
         return self._store.free_bytes() - self._settings.min_free_bytes - self._kept_bytes()
 
     def _kept_bytes(self, tenant: str | None = None) -> int:
-        """What is kept for uploads that are on their way, of one tenant or of all."""
+        """Bytes reserved for unfinished uploads, of one tenant or of all."""
         places = sum(place.kept_bytes for place in self._places if tenant in (None, place.tenant))
         return places + promised_bytes(self._store, tenant)
 
     async def body(self, request: Request, place: UploadSlot | None = None) -> AsyncIterator[bytes]:
-        """The pieces of a request's body as they come.
+        """The pieces of a request's body as they arrive.
 
         Raises:
             Problem: 408: fewer than MIN_BYTES came in upload_silence_s.
-            ClientDisconnect: the caller has gone.
+            ClientDisconnect: the caller has disconnected.
         """
         pieces, silence_s = request.stream(), self._settings.upload_silence_s
         while True:
@@ -119,7 +119,7 @@ class Intake:
                     raise _silence(silence_s) from None
                 if piece is None:
                     return
-                left_s -= time.monotonic() - asked_at_s  # the time that writing takes is not the caller's
+                left_s -= time.monotonic() - asked_at_s  # counts waiting for the caller, not writing to disk
                 new_bytes += len(piece)
                 if place is not None:
                     place.kept_bytes = max(place.kept_bytes - len(piece), 0)
@@ -132,10 +132,10 @@ def _silence(silence_s: float) -> Problem:
 
 
 def declared_length(request: Request) -> int:
-    """Content-Length of a request; 0 if it does not say.
+    """Content-Length of a request; 0 if there is none.
 
     Raises:
-        Problem: 400: it is not a length.
+        Problem: 400: it is not a valid length.
     """
     text = request.headers.get("content-length", "0")
     if not (text.isascii() and text.isdigit() and len(text) < 20):

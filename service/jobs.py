@@ -1,4 +1,4 @@
-"""Where jobs stand, and what may be done to them."""
+"""Routes of /jobs: list, show, label, cancel, retry and follow jobs; deliveries of their webhooks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from service.renders import matches
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 STREAM_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-"""The second keeps nginx from collecting events before it passes them on."""
+"""The second header stops nginx from buffering events."""
 
 UNCHANGED: dict[int | str, dict[str, object]] = {304: {"description": "they are those that the caller has"}}
 STREAM_RESPONSES: dict[int | str, dict[str, object]] = {
@@ -161,12 +161,12 @@ async def watch_job(
     if after > NOTHING_SEEN and record.state in TERMINAL_STATES:
         missed = await run_in_threadpool(services.queue.events, job_id, last_event_id)
         if not missed:
-            return Response(status_code=204)  # which tells a browser not to come again
+            return Response(status_code=204)  # a browser does not reconnect after 204
     return EventSourceResponse(services.feeds.stream(job_id, after), headers=STREAM_HEADERS)
 
 
 def _view(services: Deps, record: JobRecord, response: Response) -> JobView:
-    """The job as it stands, with when to ask again while it is under way."""
+    """The job's present state; sets Retry-After while it has not ended."""
     if record.state in TERMINAL_STATES:
         return JobView.of(record)
     response.headers["Retry-After"] = str(RETRY_AFTER_S)

@@ -1,7 +1,7 @@
-"""How often somebody may ask: a token bucket for each key, or for each address where no key is asked for.
+"""Rate limits: a token bucket for each key, or for each address where no key is needed.
 
-A bucket holds `burst` tokens and gains `rate_per_s` of them; a request takes one. Each process counts for itself.
-Buckets are used from the event loop alone, so they need no lock.
+A bucket has at most `burst` tokens and gains `rate_per_s` per second; a request takes one. Each process counts for
+itself. Only the event loop uses buckets, so they need no lock.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from service.problems import Problem
 
 BUCKETS_KEPT = 10_000
-"""The least recently used go first, so that many addresses cost no more memory than this; about 2 MB."""
+"""Maximum number of buckets, about 2 MB. The least recently used one is removed first."""
 
 BURST_S = 1.0
-"""So long a pause saves up as many requests as may then come at once."""
+"""The size of a bucket, as seconds at its rate."""
 
 
 @dataclass
@@ -35,7 +35,7 @@ class Limiter:
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
 
     def take(self, name: str, now_s: float | None = None) -> float:
-        """Take a token: 0 if there was one, else the seconds until there is. now_s: monotonic, given by tests."""
+        """Take a token. Returns 0 if there was one, else the seconds until the next. now_s: monotonic, for tests."""
         now_s = time.monotonic() if now_s is None else now_s
         bucket = self._buckets.get(name)
         if bucket is None:
@@ -51,7 +51,7 @@ class Limiter:
         return 0.0
 
     def admit(self, name: str) -> None:
-        """Take a token, or raise Problem 429 that says when there will be one."""
+        """Take a token, or raise Problem 429 with the time of the next one."""
         wait_s = self.take(name)
         if wait_s > 0.0:
             raise self._too_often(wait_s)

@@ -1,7 +1,7 @@
-"""Lists of jobs and scenes: what a caller looks for, and one page after the other by cursor.
+"""Lists of jobs and scenes: search conditions, and pages by cursor.
 
-A cursor is the place of the last job of a page (its time and id). The next page begins after that place, so jobs that
-come or go meanwhile repeat and hide none.
+A cursor is the position of the last job of a page (its time and id). The next page starts after that position, so jobs
+that are added or removed meanwhile neither repeat nor hide others.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from intrasplat.errors import InputError
 from intrasplat.names import PresetName
 
 MAX_LOOKED_AT = 2000
-"""Jobs, for one page. Where none of so many fits, the page is short or empty and has a cursor all the same."""
+"""Maximum jobs examined for one page. If few of them match, the page is short or empty and still has a cursor."""
 MAX_CONDITIONS = 16
 ID_CHARACTERS = 4
-"""A word of a search that may be the beginning of an id has at least so many."""
+"""A search word matches the beginning of an id if it has at least this many characters."""
 NEXT_HEADER = "X-Intrasplat-Next"
 LAST_ID = "~"
-"""After all ids."""
+"""Sorts after all ids."""
 PAGED: dict[int | str, dict[str, Any]] = {
     200: {
         "headers": {
@@ -40,10 +40,11 @@ PAGED: dict[int | str, dict[str, Any]] = {
         }
     }
 }
-"""What a route with pages says of its answer."""
+"""The OpenAPI responses of a route with pages."""
 
 Find = Callable[[int, ListingPosition | None], Sequence[JobRecord]]
-"""At most so many records of the caller's tenant, newest first, after a place; empty only at the end."""
+"""(limit, after) -> at most `limit` records of the caller's tenant, newest first, after a position; empty only at the
+end."""
 
 
 class SceneSearch(BaseModel):
@@ -84,17 +85,17 @@ JobQuery = Annotated[JobSearch, Query()]
 
 @dataclass(frozen=True)
 class Page:
-    """Records, newest first, and the place after which the next page begins; None: there is none."""
+    """Records, newest first, and the position after which the next page starts; None: there is no next page."""
 
     records: list[JobRecord]
     end: ListingPosition | None
 
 
 def find_page(search: SceneSearch, tenant: str, find: Find, state: JobState | None = None) -> Page:
-    """The page that was asked for, of jobs in `state` if it is given.
+    """The requested page, only of jobs in `state` if it is given.
 
     Raises:
-        InputError: the cursor is not one of this tenant's, or a condition on metadata is none.
+        InputError: the cursor is not one of this tenant's, or a condition on metadata is invalid.
     """
     fits = _condition(search, state)
     place = None if search.cursor is None else _place_of_cursor(search.cursor, tenant)
@@ -118,12 +119,12 @@ def find_page(search: SceneSearch, tenant: str, find: Find, state: JobState | No
 
 
 def find_among(records: Sequence[JobRecord]) -> Find:
-    """A Find on records that are there, newest first."""
+    """A Find on the given records, which are newest first."""
     return lambda limit, before: [each for each in records if before is None or place_of(each) < before][:limit]
 
 
 def tell_next(response: Response, page: Page, tenant: str) -> None:
-    """Put the cursor of the next page into the answer's headers, if there is one."""
+    """Put the cursor of the next page into the response headers, if there is one."""
     if page.end is not None:
         response.headers[NEXT_HEADER] = _cursor_of(page.end, tenant)
 
@@ -171,5 +172,5 @@ def _place_of_cursor(cursor: str, tenant: str) -> ListingPosition:
 
 
 def _seal(text: str, tenant: str) -> str:
-    """What a cursor of this tenant ends in: one of another tenant's lists is a mistake, and is told."""
+    """The suffix of this tenant's cursors, by which a cursor of another tenant is refused."""
     return hashlib.sha256(f"{tenant} {text}".encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""GET /metrics: what Prometheus asks for. Labels are routes, states and devices: never a tenant, an id or a name."""
+"""GET /metrics for Prometheus. Labels are routes, states and devices: never a tenant, an id or a name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from intrasplat.errors import UnavailableError
 from intrasplat.version import version
 
 NO_ROUTE = "none"
-"""The page's files, and all that does not exist: paths are a caller's to choose, so they are no label."""
+"""The label of the page's files and of unknown paths. Callers choose paths, so a path is never a label."""
 METHODS = frozenset({"GET", "HEAD", "POST", "PATCH", "DELETE", "OPTIONS"})
 DURATIONS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 600.0)
 RENDER_DURATIONS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 5.0)
@@ -40,7 +40,7 @@ REASONS = {
 
 
 class Metrics:
-    """The figures of one service; those of the queue are asked for when Prometheus asks."""
+    """The figures of one service. Those of the queue are read when Prometheus asks."""
 
     def __init__(self, queue: Queue, store: Store) -> None:
         registry = self._registry = CollectorRegistry()
@@ -77,7 +77,7 @@ class Metrics:
         self.streams = Gauge("intrasplat_streams", "Open WebSockets on /stream.", registry=registry)
 
     def exposition(self) -> bytes:
-        """All figures in Prometheus' text format; asks queue and disk."""
+        """All figures in Prometheus' text format. Reads queue and disk."""
         return generate_latest(self._registry)
 
     def rendered(self, state: str, render_ms: float) -> None:
@@ -86,7 +86,7 @@ class Metrics:
 
 
 class Measure:
-    """ASGI middleware, outside of all others: counts requests and times them."""
+    """ASGI middleware, outermost of all, that counts and times requests."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -130,27 +130,27 @@ class Measure:
 
 
 class _KeyCollector(Collector):
-    """The keys whose holders will be refused soon."""
+    """How many keys expire soon."""
 
     def __init__(self, store: Store) -> None:
         self._keys = KeyFile(store.data_dir)
 
     def collect(self) -> Iterator[Metric]:
-        """How many expire within 14 days; nothing while the file cannot be read."""
+        """The number of keys that expire within 14 days; nothing while the file cannot be read."""
         with contextlib.suppress(UnavailableError):
             number = len(self._keys.expiring(time.time()))
             yield GaugeMetricFamily("intrasplat_keys_expiring", "Keys that expire within 14 days.", number)
 
 
 class _QueueCollector(Collector):
-    """What the queue, the workers and the disk say at this moment."""
+    """Present figures of the queue, the workers and the disk."""
 
     def __init__(self, queue: Queue, store: Store) -> None:
         self._queue = queue
         self._store = store
 
     def collect(self) -> Iterator[Metric]:
-        """The figures; of a queue or disk that is away, that it is."""
+        """The figures; for an unreachable queue or disk, only that it is unreachable."""
         try:
             yield from self._of_queue()
             yield GaugeMetricFamily("intrasplat_queue_up", "Whether the queue answers.", 1)

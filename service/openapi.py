@@ -1,4 +1,4 @@
-"""What the API says of itself: what FastAPI finds in the routes, and the problem that every operation may answer."""
+"""The OpenAPI document: what FastAPI derives from the routes, and the problem that every operation may answer."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ WEBHOOKS = {
         }
     }
 }
-"""What the service sends of its own accord."""
+"""The webhooks that the service sends."""
 KEY_SCHEME = {
     "type": "http",
     "scheme": "bearer",
@@ -87,10 +87,10 @@ class ProblemDocument(BaseModel):
 
 
 class DescribedApp(FastAPI):
-    """A FastAPI whose description tells the truth about errors and keys."""
+    """A FastAPI whose OpenAPI document describes errors and keys correctly."""
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document, made once."""
+        """The OpenAPI document, built once."""
         if self.openapi_schema is None:
             self.openapi_schema = _completed(super().openapi())
         return self.openapi_schema
@@ -99,7 +99,7 @@ class DescribedApp(FastAPI):
 def _completed(document: dict[str, Any]) -> dict[str, Any]:
     components = document.setdefault("components", {})
     schemas = components.setdefault("schemas", {})
-    for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is answered here
+    for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which this service never sends
         schemas.pop(name, None)
     schemas["Problem"] = ProblemDocument.model_json_schema()
     schemas |= BODIES

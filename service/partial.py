@@ -1,9 +1,9 @@
-"""Uploads that come in pieces, on disk: how far one has come is the size of its file, so a restart forgets nothing.
+"""Resumable uploads on disk. The size of the file is the upload's offset, so a restart loses nothing.
 
-    incoming/<upload>/upload.json   what was declared, and the job it became part of
-    incoming/<upload>/<part>.mp4    what has come so far; gone once a job has it
+    incoming/<upload>/upload.json   the declaration, and the job that took the file
+    incoming/<upload>/<part>.mp4    the bytes received so far; gone once a job has the file
 
-One request at a time writes to the file, whichever process has it.
+One request at a time writes to the file, across all processes.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Partial:
 
     @property
     def path(self) -> Path:
-        """The file that grows."""
+        """The file to which pieces are appended."""
         return self.folder / (self.declaration.part + self.declaration.suffix)
 
     @property
     def offset_bytes(self) -> int:
-        """How much has come; all of it once a job has taken the file."""
+        """Bytes received; all of them once a job has taken the file."""
         try:
             return self.path.stat().st_size
         except FileNotFoundError:
@@ -63,14 +63,14 @@ class Partial:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of it has come."""
+        """Whether all bytes were received."""
         return self.offset_bytes == self.declaration.length_bytes
 
     def open(self) -> RawIOBase:
-        """The file, to append to; to be given to close().
+        """The file, locked and open for appending; pass it to close().
 
         Raises:
-            BlockingIOError: another request is writing to it, of this process or another.
+            BlockingIOError: another request, of this or another process, is writing to it.
             FileNotFoundError: a job has taken it, or it was removed.
         """
         file = self.path.open("r+b", buffering=0)
@@ -87,7 +87,7 @@ class Partial:
         return sha256_of(self.path)
 
     def give_to(self, job_id: str) -> None:
-        """Say which job has the file, and let go of it here."""
+        """Record which job has the file, and remove the file here."""
         taken = self.declaration.model_copy(update={"job_id": job_id})
         replace_file(self.folder / DECLARATION, taken.model_dump_json().encode())
         self.path.unlink(missing_ok=True)
@@ -103,20 +103,20 @@ def sha256_of(path: Path) -> str:
 
 
 def append(file: RawIOBase, piece: bytes) -> None:
-    """Write all of it."""
+    """Write the whole piece."""
     rest = memoryview(piece)
     while rest:
         rest = rest[file.write(rest) or 0 :]
 
 
 def close(file: RawIOBase) -> None:
-    """Let go of an upload's file once all that was written is on disk."""
+    """Sync an upload's file to disk and close it."""
     with file:
         os.fsync(file.fileno())
 
 
 def create_partial(store: Store, declaration: Declaration) -> Partial:
-    """A new upload of which nothing has come, on disk before this returns."""
+    """Create an empty upload, which is on disk when this returns."""
     upload_id = new_job_id()
     partial = Partial(upload_id, store.open_incoming(upload_id), declaration)
     partial.path.touch(mode=0o600)
@@ -137,7 +137,7 @@ def open_partials(store: Store) -> list[Partial]:
 
 
 def partials_of(store: Store, job_id: str) -> list[Partial]:
-    """Uploads a job has taken; also those whose file it has, though the service died before it could note that."""
+    """The uploads that a job has taken, even if the service died before it could note that in upload.json."""
     taken: set[tuple[int, int] | None] = set()
     with contextlib.suppress(FileNotFoundError):
         taken = {_identity(path) for path in store.spool_folder(job_id).iterdir()} - {None}
@@ -145,7 +145,7 @@ def partials_of(store: Store, job_id: str) -> list[Partial]:
 
 
 def promised_bytes(store: Store, tenant: str | None = None) -> int:
-    """What uploads, of one tenant or of all, have declared and not sent yet: room on disk that is theirs."""
+    """Bytes that uploads, of one tenant or of all, have declared and not sent yet; disk space is reserved for them."""
     partials = [each for each in open_partials(store) if tenant in (None, each.declaration.tenant)]
     return sum(partial.declaration.length_bytes - partial.offset_bytes for partial in partials)
 
@@ -156,7 +156,7 @@ def _all(store: Store) -> list[Partial]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Of the file itself, whatever its names are."""
+    """Device and inode: the same for all hard links of a file."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -18,7 +18,7 @@ from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
-"""Said with 423, 429 and 503, unless the problem knows better."""
+"""Default Retry-After of 423, 429 and 503."""
 API_REMEDY = "The API is described at /openapi.json."
 ROOM_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"
@@ -27,7 +27,7 @@ SCENES_REMEDY = "GET /scenes lists what there is."
 FAULT_REMEDY = "Report it with the log's lines of this X-Request-Id."
 
 MAX_SHOWN = 80
-"""Characters of a caller's own text that an answer repeats, such as a key that is no field."""
+"""Maximum characters of a caller's own text that an answer repeats, such as an unknown field's name."""
 
 TITLES = {
     400: "The request cannot be understood",
@@ -50,10 +50,10 @@ TITLES = {
 
 
 class Problem(Exception):
-    """An answer other than the one asked for; raised anywhere below a route.
+    """An error response; raised anywhere below a route.
 
-    remedy has no default, so that nobody forgets it. `extensions` are further members of the document, such as the job
-    it speaks of. retry_after_s: when the same will be answered; in the document too, for those who see no headers.
+    remedy has no default, so that nobody forgets it. `extensions` are further members of the document, such as the
+    job. retry_after_s: seconds until a retry may succeed; in the document too, for callers that see no headers.
     """
 
     def __init__(
@@ -81,25 +81,25 @@ class Problem(Exception):
             self.headers.setdefault("Retry-After", str(RETRY_AFTER_S))
 
     def document(self) -> dict[str, object]:
-        """The problem as RFC 9457 has it, with the remedy, and the field if one is at fault."""
+        """The problem document of RFC 9457, with the remedy, and the field if one is at fault."""
         title = TITLES.get(self.status, "Error")
         document = {"type": "about:blank", "title": title, "status": self.status, "detail": self.detail}
         about = {"field": self.field, "remedy": self.remedy, **self.extensions}
         return document | {name: value for name, value in about.items() if value is not None}
 
     def response(self) -> JSONResponse:
-        """The problem document as an answer."""
+        """The problem document as a response."""
         return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
 def install_handlers(app: FastAPI) -> None:
-    """Answer every exception that leaves a route with a problem document; an unforeseen one stays a fault (500)."""
+    """Answer every exception that leaves a route with a problem document; an unexpected one remains a fault (500)."""
     for kind in (Problem, InputError, SceneError, UnavailableError, RequestValidationError, HTTPException, OSError):
         app.add_exception_handler(kind, _answer)
 
 
 async def _answer(connection: Any, error: Exception) -> Any:
-    """For a Request, the problem as a response. A WebSocket is refused, or closed after a last message."""
+    """The problem as a response to a Request. A WebSocket is refused, or closed after a last message."""
     problem = problem_of(error)
     if problem is None:
         raise error
@@ -114,7 +114,7 @@ async def _answer(connection: Any, error: Exception) -> Any:
 
 
 def problem_of(error: Exception) -> Problem | None:
-    """What an error is over HTTP; None for one that nobody foresaw."""
+    """The problem for an error; None for an unexpected one."""
     match error:
         case Problem():
             return error
@@ -140,23 +140,23 @@ def problem_of(error: Exception) -> Problem | None:
 
 
 def fault() -> Problem:
-    """The answer where an error was that nobody foresaw; the log has the details, under the request's id."""
+    """The answer to an unexpected error; the log has the details, under the request's id."""
     return Problem(500, "Something went wrong in the service; its log has the details.", remedy=FAULT_REMEDY)
 
 
 def no_room(detail: str, remedy: str = ROOM_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:
-    """The answer to what the disk has no room for; its member `code` is "store_full"."""
+    """The answer when the disk is full; its member `code` is "store_full"."""
     return Problem(status, detail, field=field, remedy=remedy, extensions={"code": ErrorCode.STORE_FULL.value})
 
 
 def no_room_for(upload_bytes: int, room_bytes: int, min_free_bytes: int) -> Problem:
-    """The answer to an upload of so many bytes where there is room for room_bytes beside what must stay free."""
+    """The answer to an upload of upload_bytes when only room_bytes may be written."""
     detail = f"The disk has room for {max(room_bytes, 0)} bytes of an upload, and {upload_bytes} are needed."
     return no_room(detail, room_remedy(upload_bytes - room_bytes, min_free_bytes))
 
 
 def room_remedy(missing_bytes: int | None, min_free_bytes: int) -> str:
-    """What to do about a disk with too little room. missing_bytes None: the caller is not to know."""
+    """The remedy for a disk with too little free space. missing_bytes None: not shown to the caller."""
     amount = "space" if missing_bytes is None else f"{missing_bytes} bytes"
     return f"Free {amount}, such as by DELETE /scenes/{{id}}: {min_free_bytes} must stay free ({MIN_FREE})."
 

@@ -1,8 +1,7 @@
-"""Removal of a job and of all that is known of it, with a receipt; and what a removal that was cut off left undone.
+"""Removes a job and all its data, with a receipt, and finishes removals that were cut off.
 
-Order: a note on disk (data_dir/purging/<job>), the files, the queue's record, the note. Whatever ends the service in
-between, the note makes service/retention.py go through all of it again; and while the record is there, so does whoever
-asks once more.
+Order: write a note (data_dir/purging/<job>), remove the files, the queue's record, then the note. If the service ends
+in between, the note makes service/retention.py repeat all steps. While the record exists, another request does so too.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from service.partial import partials_of
 from service.problems import Problem
 
 NOTE_IS_OLD_S = 60.0
-"""A younger note may be of a removal that is under way."""
+"""A younger note may belong to a removal that still runs."""
 LOG_CLEARED_AFTER_S = 90.0
-"""The queue itself remembers for a minute which ids are gone."""
+"""The queue itself stores for a minute which ids were removed."""
 logger = logging.getLogger("intrasplat.service")
 
 
@@ -59,12 +58,11 @@ class Purger:
         self._log_stale_since_s: float | None = None
 
     def purge(self, job_id: str, caller: Caller | None, reason: str = "request") -> Receipt:
-        """Remove a job that has ended, recorded in the audit before it begins and before it is reported.
+        """Remove a job that has ended. The audit log records the start and the end.
 
         Raises:
             Problem: 409: the job is queued or running.
-            UnavailableError: queue, store or audit cannot do their part; the removal is finished later, or by asking
-                again.
+            UnavailableError: queue, store or audit log fails; the removal is finished later, or by asking again.
         """
         self._refuse_live(job_id)
         self._audit.record(AuditAction.PURGED, caller, job_id, f"begun ({reason})")
@@ -81,17 +79,17 @@ class Purger:
         return receipt
 
     def log_is_stale(self) -> None:
-        """Say that the queue's log on disk holds what must not stay there."""
+        """Note that the queue's log on disk contains a purged job."""
         self._log_stale_since_s = time.monotonic()
 
     def clear_log(self, now_s: float | None = None) -> None:
-        """Rid the queue's log on disk of what was purged, once its notes of that have expired. now_s: monotonic."""
+        """Remove purged jobs from the queue's log on disk, once their keys have expired. now_s: monotonic."""
         since_s, now_s = self._log_stale_since_s, time.monotonic() if now_s is None else now_s
         if since_s is not None and now_s - since_s > LOG_CLEARED_AFTER_S and self._queue.rewrite_log():
             self._log_stale_since_s = None
 
     def finish_cut_off(self) -> None:
-        """Finish what earlier services were removing when they ended."""
+        """Finish the removals that earlier services had started."""
         for note in list(self._notes.glob("*")) if self._notes.is_dir() else []:
             with contextlib.suppress(FileNotFoundError):  # finished meanwhile
                 if is_job_id(note.name) and note.stat().st_mtime < time.time() - NOTE_IS_OLD_S:
@@ -104,7 +102,7 @@ class Purger:
             raise Problem(409, f"The job is still {record.state}.", field="scene_id", remedy=remedy)
 
     def _write_note(self, job_id: str) -> Path:
-        """Say on disk that the job is being removed. A full disk does not stop a removal, which makes room."""
+        """Note on disk that the job is being removed. A full disk does not stop a removal, which frees space."""
         note = self._notes / job_id
         with contextlib.suppress(StoreFullError), disk_errors():
             self._notes.mkdir(mode=0o700, exist_ok=True)
@@ -113,18 +111,18 @@ class Purger:
         return note
 
     def _remove_uploads(self, job_id: str) -> Removed:
-        """Remove what the job's resumable uploads have left."""
+        """Remove the folders of the job's resumable uploads."""
         files = sizes = 0
         with disk_errors():
             for partial in partials_of(self._store, job_id):
-                with contextlib.suppress(FileNotFoundError):  # somebody else removes the same
+                with contextlib.suppress(FileNotFoundError):  # another process removes the same
                     found = [path.stat().st_size for path in partial.folder.iterdir()]
                     files, sizes = files + len(found), sizes + sum(found)
                 self._store.discard_incoming(partial.upload_id)
         return Removed({"uploads": files}, {"uploads": sizes})
 
     def _receipt(self, job_id: str, removed: Removed, uploads: Removed) -> Receipt:
-        """The receipt, after a look whether anything is left; the store has looked for itself."""
+        """The receipt, after a check that nothing is left; the store has checked its own files."""
         if self._queue.get(job_id) is not None or self._queue.events(job_id):
             raise UnavailableError(f"The queue still knows job {job_id}.", "Ask for its removal once more.")
         return Receipt(
@@ -138,10 +136,10 @@ class Purger:
 
 
 def try_to_purge(purger: Purger, job_id: str, reason: str) -> bool:
-    """Purge for the service itself; False, and a line in the log, if that must wait until the next time."""
+    """Purge a job for the service itself. If that fails, log it and return False; the next call tries again."""
     try:
         purger.purge(job_id, None, reason)
-    except Problem:  # it came to life again, and ends some time
+    except Problem:  # the job was queued again meanwhile
         return False
     except (OSError, UnavailableError) as error:
         logger.error("a job could not be purged", extra={"job_id": job_id, "error": type(error).__name__})

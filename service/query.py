@@ -1,4 +1,4 @@
-"""The names of a request's query: one that the route does not have is refused, as is one that comes twice."""
+"""Checks the parameters of a request's query: unknown and repeated names are refused."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from service.problems import API_REMEDY, Problem
 
 
 def check_query(connection: HTTPConnection) -> None:
-    """Return if the route has every name of the query, and each comes once, or may come often.
+    """Return if the route has every parameter of the query, and none is repeated that may not be.
 
     Raises:
-        Problem: 422: names the first one at fault, and the nearest that the route has.
+        Problem: 422: names the first wrong parameter, and the most similar one that the route has.
     """
     given = connection.query_params.multi_items()
     if not given or connection.scope["type"] != "http":
@@ -34,7 +34,7 @@ def check_query(connection: HTTPConnection) -> None:
 
 
 def _schemas(connection: HTTPConnection) -> Mapping[str, Mapping[str, Any]]:
-    """What the route's description says of its query, by name."""
+    """The schemas of the route's query parameters, by name."""
     path, method = connection.scope["route"].path, connection.scope["method"].lower()
     operation = connection.app.openapi()["paths"].get(path, {}).get(method, {})
     return {each["name"]: each["schema"] for each in operation.get("parameters", ()) if each["in"] == "query"}

@@ -1,6 +1,6 @@
-"""Questions to the queue that are answered within a time, or not at all: the queue's client itself tries for seconds.
+"""Calls to the queue with a short timeout; the queue's client itself retries for seconds.
 
-While one question has no answer, others are not asked: they would wait in vain, and hold a thread each.
+While one call has no answer, further calls fail at once: each would wait in vain and occupy a thread.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from contract.queue.redis_client import QUEUE_REMEDY
 from intrasplat.errors import UnavailableError
 
 THREADS = 8
-"""Questions at a time."""
+"""Maximum calls at a time."""
 
 Answer = TypeVar("Answer")
 
 
 class Questions:
-    """Asks in threads of its own; for many threads."""
+    """Calls the queue in its own threads. Thread-safe."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="questions")
@@ -29,7 +29,7 @@ class Questions:
         """The queue's answer.
 
         Raises:
-            UnavailableError: it, or one to an earlier question, does not come in time; or the queue is away.
+            UnavailableError: this answer, or one to an earlier call, is late; or the queue is unreachable.
         """
         unanswered = self._unanswered
         if unanswered is None or unanswered.done():
@@ -41,5 +41,5 @@ class Questions:
         raise UnavailableError("The queue does not answer.", QUEUE_REMEDY, may_return=True)
 
     def close(self) -> None:
-        """Ask nothing more."""
+        """Make no more calls."""
         self._pool.shutdown(wait=False, cancel_futures=True)

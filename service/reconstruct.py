@@ -1,4 +1,4 @@
-"""POST /reconstruct: a clip, in one form, as finished uploads or of an earlier job, becomes a job."""
+"""POST /reconstruct: turns a clip into a job. It comes in one form, as finished uploads, or from an earlier job."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from service.upload import CLIP_FORM, LIMIT_REMEDY, PARTS, Form, Received, Uploa
 router = APIRouter(tags=["jobs"])
 
 SAME_UNDER_A_KEY = ("input_sha256", "options", "callback_url")
-"""What a second submission under an idempotency key repeats; a callback that differed would never be told."""
+"""Fields that must be equal in a second submission under an idempotency key; another callback would never be called."""
 STEPS_PER_S = 10.0
-"""By which `iterations` are taken for seconds of training; of a plain machine with `paper`."""
+"""Converts `iterations` to seconds of training: the speed of a plain machine with `paper`."""
 MAX_SUBMISSION_BYTES = 128 * 1024
-"""The limit of a JSON body."""
+"""Maximum bytes of a JSON body."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
 
 Body = TypeVar("Body", bound=BaseModel)
@@ -60,7 +60,7 @@ IdempotencyKey = Annotated[
 
 
 Accept: TypeAlias = Callable[[Deps, Caller, str, Received, str | None], JobRecord]
-"""Makes a job of what was received: services, caller, the job's id, the parts, the hash of the idempotency key."""
+"""Creates a job: (services, caller, job id, received parts, hash of the idempotency key) -> record."""
 
 
 class Submission(BaseModel):
@@ -102,12 +102,12 @@ async def reconstruct(
 
 
 def hash_of(idempotency_key: str | None) -> str | None:
-    """What a record keeps of an idempotency key."""
+    """The hash of an idempotency key that a record stores."""
     return None if idempotency_key is None else hashlib.sha256(idempotency_key.encode()).hexdigest()
 
 
 def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
-    """Where a job stands; None where that is unknown just now."""
+    """The forecast of a job; None while it is unknown."""
     try:
         return services.queue.forecast(record.job_id)
     except UnavailableError:
@@ -117,7 +117,7 @@ def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
 async def receive_form(
     request: Request, services: Deps, caller: Caller, key: str | None, accept: Accept, form: Form = CLIP_FORM
 ) -> JobRecord:
-    """The job that `accept` makes of what came in one request."""
+    """Receive a multipart request and return the job that `accept` creates from it."""
     store, settings = services.store, services.settings
     with services.intake.place(caller.tenant, declared_length(request), form.main_part) as place:
         job_id = new_job_id()
@@ -160,7 +160,7 @@ async def read_json(request: Request, services: Deps, model: type[Body], max_byt
 
 
 def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key: str | None) -> JobRecord:
-    """Finished uploads become a job; once they have, asking again yields that job."""
+    """Create a job from finished uploads. Repeating the request returns the same job."""
     options = parse_options(JobOptions, submission.options)
     given = submission.uploads()
     partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
@@ -181,7 +181,7 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
 def _make_job_of(
     services: Deps, caller: Caller, partials: Mapping[str, Partial], received: Received, key: str | None
 ) -> JobRecord:
-    """Link the uploads' files into a new job, and let go of them once it is accepted.
+    """Link the uploads' files into a new job, and remove them from the uploads once the job is accepted.
 
     Raises:
         Problem: 507: the disk is full; the uploads stay.
@@ -200,7 +200,7 @@ def _make_job_of(
             raise LimitError("clip", problem, LIMIT_REMEDY)
         record = _accept(services, caller, job_id, received, key)
     except Problem as problem:
-        if "job_id" in problem.extensions:  # the clip is in the spool all the same
+        if "job_id" in problem.extensions:  # the clip is in the spool despite the error
             _give(partials, job_id)
         raise
     finally:
@@ -210,7 +210,7 @@ def _make_job_of(
 
 
 def _held(partial: Partial) -> RawIOBase:
-    """The upload's file, locked: no other request writes to it or makes a job of it meanwhile."""
+    """The upload's file, locked: no other request writes to it or creates a job from it meanwhile."""
     try:
         return partial.open()
     except (BlockingIOError, FileNotFoundError):
@@ -219,7 +219,7 @@ def _held(partial: Partial) -> RawIOBase:
 
 
 def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Partial:
-    """The caller's upload for that part, all of which has come."""
+    """The caller's complete upload for that part."""
     partial = find_partial(services.store, upload_id, caller.tenant)
     if partial is None:
         raise InputError(part, f"there is no upload {upload_id[:40]!r}.", "Create one: POST /uploads.")
@@ -233,7 +233,7 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
 
 
 def _taken_before(services: Deps, job_ids: set[str | None], submission: Submission, options: JobOptions) -> JobRecord:
-    """The job that has the uploads, if all of them went into this one job and it has the same clip and options."""
+    """The job that took the uploads, if one job took all of them and has the same clip and options."""
     job_id = next(job_id for job_id in job_ids if job_id is not None)
     known = services.queue.get(job_id)
     record = known or services.store.labelled_submission(job_id)
@@ -243,7 +243,7 @@ def _taken_before(services: Deps, job_ids: set[str | None], submission: Submissi
     if len(job_ids) > 1 or record is None or asked_before != asked:
         detail = f"An upload was used for the job {job_id} already."
         raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
-    # A clip that was accepted is never refused for want of room in a queue that has lost its record.
+    # An accepted clip is never refused by a full queue that has lost its record.
     return known or services.queue.submit(record)
 
 
@@ -253,7 +253,7 @@ def _give(partials: Mapping[str, Partial], job_id: str) -> None:
 
 
 def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
-    """Spool first, then queue: a job exists only for a clip that is on disk."""
+    """Spool first, then enqueue: a job exists only for a clip that is on disk."""
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)
     check_scopes(options, caller, services.settings)
@@ -286,7 +286,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
 
 
 def check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> None:
-    """Return if the caller may ask for this priority, and for so long a training; Problem 403 otherwise."""
+    """Return if the caller may request this priority and training time. Raises Problem 403 otherwise."""
     if options.priority == "high":
         caller.require(KeyScope.PRIORITY)
     training_s = options.budget_s or (options.iterations or 0) / STEPS_PER_S
@@ -295,10 +295,10 @@ def check_scopes(options: JobOptions, caller: Caller, settings: Settings) -> Non
 
 
 def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: Collection[str]) -> None:
-    """Refuse what cannot be a clip, and options that cannot go with it.
+    """Refuse files that cannot be a clip, and options that do not fit them.
 
-    How much memory it may take is for the worker to say, which may be elsewhere. names: of all files, by part. sent:
-    the parts that are not an earlier job's.
+    Memory is not checked here, because the worker may run on another machine. names: names of all files, by part.
+    sent: the parts that do not come from an earlier job.
     """
     limits = replace(services.settings.clip_limits, decoded_bytes=MAX_MEMORY_BYTES)
     folder = services.store.incoming_folder(record.job_id)
@@ -309,7 +309,7 @@ def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: 
 
 
 def spool_and_queue(services: Deps, record: JobRecord) -> JobRecord:
-    """Put what was received into the spool and then into the queue; the record that stands there. As enqueue()."""
+    """Put the received files into the spool, then enqueue the job. Returns and raises as enqueue()."""
     traces.describe(get_current_span(), job_id=record.job_id, input_bytes=record.input_bytes)
     record = record.model_copy(update={"trace": traces.traceparent()})
     with services.sweep.in_hand(record.job_id):
@@ -320,11 +320,11 @@ def spool_and_queue(services: Deps, record: JobRecord) -> JobRecord:
 
 
 def enqueue(services: Deps, record: JobRecord) -> JobRecord:
-    """The record that stands in the queue for a clip in the spool.
+    """Enqueue the job of a clip in the spool. Returns the record that the queue has for it.
 
     Raises:
-        QueueFullError: there is no room in the queue; the clip is removed.
-        Problem: 503: the queue is away. The clip stays, and is queued as soon as the queue is back.
+        QueueFullError: the queue is full; the clip is removed.
+        Problem: 503: the queue is unreachable. The clip stays, and is queued as soon as the queue is back.
         InputError: the idempotency key was used for another clip, other options or another callback; the clip is
             removed.
     """

@@ -1,4 +1,4 @@
-"""GET /scenes/{id}/recorded: recorded frames and their masks, to compare the model with and to judge masks by."""
+"""GET /scenes/{id}/recorded: recorded frames and masks, to compare with renders and to check masks."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ async def get_recorded(
 
 
 def _as_stored(services: Deps, request: RecordedRequest, attempt: int) -> Answer:
-    """A frame or mask of a finished scene as it lies on the disk. No worker is asked: one that trains has little time.
+    """A stored frame or mask of a finished scene, read from disk: a worker that trains has little time.
 
     Raises:
-        SceneError: the scene keeps none, or the file is damaged.
-        InputError: none of this eye, or no masks.
+        SceneError: the scene has no recorded frames, or the file is damaged.
+        InputError: it has none of this eye, or no masks.
     """
     is_mask = request.masks is RecordedMasks.ONLY
     path = services.store.scene_folder(request.scene_id, attempt) / RECORDED

@@ -1,7 +1,7 @@
-"""How much rendering a caller and a tenant may ask for at a time, by what it costs: pixels x Gaussians.
+"""Limits how much rendering a caller and a tenant may request at a time. The cost of a render is pixels x Gaussians.
 
-Small renders are not counted: they are answered between the parts of large ones, and service/limits.py counts requests.
-Each process counts for itself.
+Small renders are not counted: workers answer them between the parts of large ones, and service/limits.py counts
+requests. Each process counts for itself.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from service.access import Caller
 from service.problems import Problem
 
 OF_CALLER, OF_TENANT = 2, 4
-"""How many renders of the most pixels, of a typical scene, may wait or be made at a time."""
+"""How many renders of a typical scene at the maximum size may wait or run at a time, per caller and per tenant."""
 
 SMALL_SHARE = 1 / 8
-"""A render that costs less than this share of one of the most pixels is small."""
+"""A render is small if it costs less than this share of one at the maximum size."""
 
 SCENES_KEPT = 1_000
 
 FIRST_SPEED = 1e11
-"""Cost answered in a second, until large renders have been timed."""
+"""Assumed cost per second until large renders have been timed."""
 LEARNING = 0.3
-"""Share of the newest render in what is known of the speed."""
+"""Weight of the newest render in the moving average of the speed."""
 
 
 class RenderLimits:
-    """What is asked for and not answered yet; from the event loop alone, so it needs no lock."""
+    """The cost of pending renders. Only the event loop uses it, so it needs no lock."""
 
     def __init__(self, settings: Settings) -> None:
         largest = render_cost(settings.max_render_pixels, TYPICAL_GAUSSIANS)
@@ -43,15 +43,15 @@ class RenderLimits:
         self._speed = FIRST_SPEED
 
     def cost(self, request: RenderRequest) -> float:
-        """What a render costs, as far as its scene is known."""
+        """The cost of a render; an estimate while the size of its scene is unknown."""
         gaussians, size = self._scenes.get(request.scene_id, (TYPICAL_GAUSSIANS, TYPICAL_SIZE))
         return sum(render_cost(each, gaussians) for each in request.most_drawn(size))
 
     @contextmanager
     def admitted(self, caller: Caller, request: RenderRequest) -> Iterator[None]:
-        """The time in which a render is asked for; Problem 429 if the caller or its tenant has too much in hand.
+        """Count a render during the context. Raises Problem 429 if the caller or its tenant has too much pending.
 
-        Who has nothing in hand is never refused.
+        A caller with nothing pending is never refused.
         """
         cost = self.cost(request)
         if cost <= self._small:
@@ -75,7 +75,7 @@ class RenderLimits:
                     del self._in_hand[name]
 
     def learn(self, scene_id: str, head: WorkerReply) -> None:
-        """Remember how large a scene is."""
+        """Store the size of a scene."""
         if head.gaussians and head.clip_size is not None:
             self._scenes[scene_id] = head.gaussians, head.clip_size
             self._scenes.move_to_end(scene_id)

@@ -1,4 +1,4 @@
-"""Which worker is asked for a render, and who is asked instead when that one does not answer."""
+"""Chooses the worker for a render, and another one if the first does not answer."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from service.connection import Answer, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `intrasplat worker`."
 ADDRESSES_VALID_S = 1.0
-"""How long the list of live workers is used before the queue is asked again, while renders go on."""
+"""How long the list of live workers is valid before the queue is read again, during renders."""
 KNOWN_PERIOD_S = 5.0
-"""How often the list is read while nobody asks for a render, so that it is known when the queue goes away."""
+"""How often the list is read between renders, so that it is known when the queue becomes unreachable."""
 READ_PATIENCE_S = 0.5
-"""How long a render waits for a newer list where the known one is older than an announcement lasts."""
+"""How long a render waits for a newer list if the known one is older than the lifetime of an announcement."""
 
 ADDRESSES = TypeAdapter(list[WorkerAddress])
 
@@ -39,36 +39,36 @@ logger = logging.getLogger("intrasplat.service")
 
 
 class Renderer(Protocol):
-    """Whoever can answer render and export requests."""
+    """Answers render and export requests."""
 
     async def ask(self, request: SceneRequest, worker: str | None = None) -> Answer:
-        """The answer, of the worker of that endpoint if one is named.
+        """The answer, from the worker at endpoint `worker` if given.
 
         Raises:
-            UnavailableError: there is none in time.
+            UnavailableError: no answer comes in time.
         """
         ...
 
     async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:
-        """Those that are there, or come within timeout_s."""
+        """The workers that can be reached within timeout_s."""
         ...
 
     async def run(self) -> None:
-        """Keep knowing whom to ask, until cancelled."""
+        """Keep the list of workers up to date, until cancelled."""
         ...
 
     async def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""
         ...
 
 
 class ZmqRenderer:
     """Asks the live workers that the queue lists.
 
-    A running job is shown by the worker that runs it. A finished scene any worker can show: one that trains nothing
-    and holds it is asked, or else always the same one, which will. If that one is gone, mute or busy, another is, once.
+    The worker that runs a job renders it. Any worker can render a finished scene: an idle one that has it in memory is
+    preferred, else always the same one, which then loads it. If that worker is gone, silent or busy, another is tried.
 
-    known: a file that keeps the workers' addresses, so that a service that starts while the queue is away has them.
+    known: a file with the workers' addresses, for a service that starts while the queue is unreachable.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class ZmqRenderer:
             self._context = None
 
     async def _workers_for(self, request: SceneRequest) -> list[WorkerAddress]:
-        """Who can answer, best first; none if a job is asked for that nobody runs.
+        """The workers that can answer, best first; empty for a job that no worker runs.
 
         Raises:
             UnavailableError: there is no worker at all.
@@ -158,7 +158,7 @@ class ZmqRenderer:
         return running or [each for each in await self._live(reread=True) if each.job_id == request.scene_id]
 
     def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bool, bool, bytes]:
-        """Rather one that answers, trains nothing, holds the scene; of several always the same (rendezvous hashing)."""
+        """Sort key: prefers workers that answer, are idle and have the scene; then rendezvous hashing."""
         connection = self._connections.get(address.endpoint)
         place = hashlib.sha256(f"{scene_id} {address.name}".encode()).digest()
         is_down = connection is not None and connection.state in (Reached.DOWN, Reached.REFUSED)
@@ -174,7 +174,7 @@ class ZmqRenderer:
         return self._connections[endpoint]
 
     async def _live(self, *, reread: bool = False) -> list[WorkerAddress]:
-        """The live workers, or those that were known when the queue went away.
+        """The live workers, or those that were known when the queue became unreachable.
 
         A render waits for the queue if no worker is known or the list must be read again. If the list is too old, it
         waits READ_PATIENCE_S.
@@ -195,12 +195,12 @@ class ZmqRenderer:
         try:
             addresses = await run_in_threadpool(self._queue.workers)
         except UnavailableError as error:
-            # Renders do not need the queue. Whether a worker still lives shows when it is asked.
+            # Renders do not need the queue. A request shows whether a worker is still alive.
             logger.warning("the queue does not answer; using the workers known before: %s", error.problem)
             self._read_s = self._heard_s = time.monotonic()
             return
         now_s = self._read_s = time.monotonic()
-        # A queue that was away knows of no worker either until they have spoken again.
+        # A queue that has just returned knows no worker until they announce themselves again.
         if addresses or now_s - self._heard_s > WORKER_TTL_S:
             await self._remember(addresses)
             self._addresses, self._heard_s = addresses, now_s
@@ -210,16 +210,16 @@ class ZmqRenderer:
                 await self._connections.pop(endpoint).close()
 
     async def _remember(self, addresses: list[WorkerAddress]) -> None:
-        """Write down where the workers are, unless there are none or the same as before."""
+        """Store the workers' addresses, unless there are none or they have not changed."""
         if self._known is None or not addresses or _places(addresses) == _places(self._addresses):
             return
         content = ADDRESSES.dump_json(_places(addresses))
-        with contextlib.suppress(OSError):  # a full disk: they are known until this service ends
+        with contextlib.suppress(OSError):  # on a full disk they are known only until this service ends
             await run_in_threadpool(replace_file, self._known, content)
 
 
 def _places(addresses: list[WorkerAddress]) -> list[WorkerAddress]:
-    """What of the addresses lasts: not what the workers do just now."""
+    """The lasting part of the addresses, without what the workers are doing now."""
     return [each.model_copy(update={"job_id": None, "scenes": ()}) for each in addresses]
 
 

@@ -1,4 +1,4 @@
-"""GET /render: one view of one scene, straight from the worker that holds it, or that makes it."""
+"""GET /render: one view of one scene, from a worker that has the scene or that trains it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
     304: {"description": "it is the one that the caller has"},
 }
 DEPTH_UNITS = {ImageFormat.PNG: "0.01 mm", ImageFormat.NPY: "mm"}
-"""What a value of 1 of layer=depth is."""
+"""The unit of layer=depth, by format."""
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "busy": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
 
@@ -151,7 +151,7 @@ class RenderQuery(ViewQuery):
 
 @dataclass(frozen=True)
 class Shown:
-    """What a caller is shown: the scene that `attempt` finished; None: the running job's newest snapshot."""
+    """What a caller sees: the scene that `attempt` finished; None: the running job's newest snapshot."""
 
     scene_id: str
     attempt: int | None
@@ -198,12 +198,12 @@ async def render(
 
 
 async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown:
-    """What the caller may be shown of the scene named, or of the only one there is; the audit records that it sees it.
+    """Find the named scene, or the tenant's only one, and record in the audit log that the caller views it.
 
     Raises:
         Problem: 400: no scene is named and the tenant has not exactly one (never show another patient by accident).
             403: the key lacks the scope. 404: the tenant has no such scene. 409: the job has nothing to show.
-            503: it had, and waits for another worker.
+            503: it had a snapshot, and waits for another worker.
     """
     caller.require(KeyScope.VIEW)
     with traces.span("find"):
@@ -238,7 +238,7 @@ def _only(services: Deps, caller: Caller) -> Shown:
 
 
 async def unless_gone(http_request: Request, work: Coroutine[Any, Any, Result]) -> Result | None:
-    """The result of the work; None, and the work is cancelled, if the caller hangs up before."""
+    """The result of the work. If the caller disconnects first, cancel the work and return None."""
     done, left = asyncio.create_task(work), asyncio.create_task(_left(http_request))
     try:
         await asyncio.wait({done, left}, return_when=asyncio.FIRST_COMPLETED)
@@ -249,16 +249,16 @@ async def unless_gone(http_request: Request, work: Coroutine[Any, Any, Result]) 
 
 
 async def _left(http_request: Request) -> None:
-    """Return when the caller has hung up."""
+    """Return when the caller has disconnected."""
     while (await http_request.receive())["type"] != "http.disconnect":
         pass
 
 
 async def answer_to(services: Deps, caller: Caller, request: RenderRequest, shown: Shown) -> tuple[Shown, Answer]:
-    """The worker's answer, and what it shows: the finished scene if the job has just ended.
+    """The worker's answer, and what it shows; the finished scene if the job has just ended.
 
     Raises:
-        Problem: 429: the caller or its tenant has asked for too much that is not answered yet.
+        Problem: 429: the caller or its tenant has too many pending renders.
         UnavailableError: no worker answers in time.
     """
     with services.render_limits.admitted(caller, request):
@@ -274,7 +274,7 @@ async def answer_to(services: Deps, caller: Caller, request: RenderRequest, show
 
 
 def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRequest:
-    """What the worker is asked.
+    """The request to the worker.
 
     Raises:
         InputError: the pose is not valid.
@@ -296,7 +296,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
 
 
 def image_response(scene_id: str, answer: Answer) -> Response:
-    """The body with the headers that say what it shows; a worker's error becomes a problem."""
+    """The response: the image and the headers that describe it. A worker's error becomes a problem."""
     head = answer.head
     if head.error is not None:
         raise problem_of_reply(head.error)
@@ -312,7 +312,7 @@ def image_response(scene_id: str, answer: Answer) -> Response:
 
 
 def problem_of_reply(error: ReplyError) -> Problem:
-    """What a worker's error is over HTTP."""
+    """The HTTP problem for a worker's error."""
     headers = {"Retry-After": NOT_YET_RETRY_S} if error.kind == "not-yet" else None
     return Problem(
         STATUS_OF_REPLY[error.kind],
@@ -325,20 +325,20 @@ def problem_of_reply(error: ReplyError) -> Problem:
 
 
 def tag_of(request: RenderRequest) -> str:
-    """The ETag of what a request shows of a finished scene: the same question to the same attempt has one answer."""
+    """The ETag of a view of a finished scene: the same request to the same attempt always has the same answer."""
     asked = f"{version()} {request.model_dump_json()}"
     return f'W/"{hashlib.sha256(asked.encode()).hexdigest()[:32]}"'
 
 
 def matches(if_none_match: str | None, tag: str) -> bool:
-    """Whether the caller has the answer of this tag (RFC 9110, 13.1.2)."""
+    """Whether the caller already has the answer with this tag (RFC 9110, 13.1.2)."""
     given = [each.strip() for each in (if_none_match or "").split(",")]
     return "*" in given or tag.removeprefix("W/") in [each.removeprefix("W/") for each in given]
 
 
 def cache_headers(shown: Shown, tag: str, *, is_coarse: bool = False) -> dict[str, str]:
-    """A finished scene may be cached but must be revalidated, so that its removal is noticed. A snapshot must not, and
-    no picture that will be sharper when more time is left.
+    """Cache headers. A view of a finished scene may be cached but must be revalidated, so that its removal is noticed.
+    A snapshot must not be cached, nor a coarse picture, which will be sharper later.
     """
     if shown.attempt is None or is_coarse:
         return {"Cache-Control": "no-store"}

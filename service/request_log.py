@@ -1,6 +1,6 @@
-"""Middleware around all routes: request ids, a line in the log and a span for each request, the answer to a fault.
+"""Middleware around all routes: request ids, a log line and a span for each request, and the answer to a fault.
 
-Both tell the route's template, not the path, and nothing of query, headers or body: callers put anything there.
+Log and span contain the route's template, not the path, and no query, headers or body: callers put anything there.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from service.problems import Problem, fault
 
 REQUEST_ID = "X-Request-Id"
 KEPT_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
-"""UUIDs and trace ids are kept. Words are not: the id goes into the log, and words may name somebody."""
+"""A caller's request id is used if it is a UUID or trace id. The id is logged, and words in it could name somebody."""
 
 QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Asked every few seconds by machines; in the log only when they begin to fail, fail otherwise, or work again."""
+"""Routes that machines poll every few seconds. They are logged only when their status changes from or to a failure."""
 
 MAX_OPEN = 512
-"""Requests, streams of events and WebSockets at a time. Each of them may hold a connection for long."""
+"""Maximum requests, event streams and WebSockets at a time. Each may occupy a connection for long."""
 
 NO_ROUTE = "-"
 OTHER_METHOD = "_OTHER"
-"""In spans, of a method that a caller has made up; so OpenTelemetry calls it."""
+"""OpenTelemetry's name for an unknown HTTP method, in spans."""
 OK = 200
 GONE = 499
-"""In the log alone: the caller left before it was answered."""
+"""A status for the log only: the caller disconnected before it was answered."""
 SWITCHED = 101
 
 logger = logging.getLogger("intrasplat.access")
@@ -47,19 +47,19 @@ logger = logging.getLogger("intrasplat.access")
 
 @dataclass
 class _Answered:
-    """How far the answer to one request is."""
+    """The progress of the answer to one request."""
 
     status: int | None = None
 
 
 class RequestLog:
-    """ASGI middleware; only counting is further out."""
+    """ASGI middleware; only the counting of requests is further out."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._open = 0
         self._last_status: dict[str, int] = {}
-        """Of each quiet route; OK for everything below 400."""
+        """The last status of each quiet route; OK for everything below 400."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -88,7 +88,7 @@ class RequestLog:
         except Exception:
             logger.exception("a fault")
             if answered.status is not None:
-                raise  # too late for another answer: the server cuts the connection
+                raise  # the answer has started: the server cuts the connection
             await _refuse(fault(), scope, receive, send)
 
     def _log(self, scope: Scope, status: int, seconds: float) -> None:
@@ -138,7 +138,7 @@ async def _nothing() -> Message:
 
 @contextmanager
 def _span_of(scope: Scope) -> Iterator[Span]:
-    """The span of a request, in the trace that its caller named. Each view of a WebSocket has one of its own."""
+    """The span of a request, in the caller's trace. Each view of a WebSocket has its own span."""
     if scope["type"] == "websocket" or scope["path"] in QUIET_ROUTES:
         yield INVALID_SPAN
         return

@@ -1,4 +1,4 @@
-"""How long jobs are kept: their own retention_hours, else the deployment's, and never longer than its maximum."""
+"""Purges jobs after their retention_hours, or else the deployment's, and never later than its maximum."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from intrasplat.options import JobOptions
 from service.purge import Purger, try_to_purge
 
 LOOK_PERIOD_S = 300.0
-"""Each look reads all records."""
+"""Interval of the checks. Each check reads all records."""
 
 HOUR_S = 3600.0
 logger = logging.getLogger("intrasplat.service")
 
 
 def check_retention(options: JobOptions, settings: Settings) -> None:
-    """Return if a job may be kept as long as it asks.
+    """Return if a job may be kept as long as it requests.
 
     Raises:
-        InputError: it asks for longer than settings.max_retention_hours.
+        InputError: it requests more than settings.max_retention_hours.
     """
     asked, most = options.retention_hours, settings.max_retention_hours
     if asked is not None and most is not None and asked > most:
@@ -38,15 +38,15 @@ def check_retention(options: JobOptions, settings: Settings) -> None:
 
 
 def kept_hours(options: JobOptions, settings: Settings) -> float | None:
-    """How long a job is kept after its end; None: until somebody removes it."""
+    """How many hours a job is kept after its end; None: until it is deleted."""
     wanted = settings.retention_hours if options.retention_hours is None else options.retention_hours
     limits = [hours for hours in (wanted, settings.max_retention_hours) if hours is not None]
     return min(limits, default=None)
 
 
 class Retention:
-    """Purges what was kept long enough. Of the services of one data directory one does it at a time;
-    on several machines they may do it at once, for a purge may be repeated."""
+    """Purges jobs whose retention has expired. One service of a data directory does so at a time. Services on several
+    machines may do so at once, because a purge may be repeated."""
 
     def __init__(self, settings: Settings, queue: Queue, store: Store, purger: Purger) -> None:
         self._settings = settings
@@ -56,7 +56,7 @@ class Retention:
         self._lock = FolderLock(store.run_dir / "retention.lock")
 
     async def run(self) -> None:
-        """Look every LOOK_PERIOD_S, until cancelled."""
+        """Check every LOOK_PERIOD_S, until cancelled."""
         try:
             while True:
                 await run_in_threadpool(self._try_to_purge_due)
@@ -65,7 +65,7 @@ class Retention:
             self._lock.release()
 
     def purge_due(self, now_s: float) -> int:
-        """Finish what was cut off, and purge what is due at that UNIX time; how many jobs those were."""
+        """Finish interrupted removals, and purge jobs that are due at now_s (UNIX time). Returns how many."""
         self._purger.finish_cut_off()
         due = [record.job_id for record in self._queue.records(None, None) if self._is_due(record, now_s)]
         purged = sum(try_to_purge(self._purger, job_id, "retention") for job_id in due)

@@ -1,4 +1,4 @@
-"""What receivers of webhooks say of when to come again: Retry-After (RFC 9110), in seconds or as a date."""
+"""Parses Retry-After (RFC 9110) of webhook receivers, in seconds or as a date."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ASKS_TO_WAIT = frozenset({httpx.codes.TOO_MANY_REQUESTS, httpx.codes.SERVICE_UNA
 
 
 def asked_wait_s(answer: httpx.Response, most_s: float) -> float | None:
-    """For how long an answer asks to be left alone, at most most_s; None if it asks for nothing that can be read."""
+    """The wait that an answer requests, at most most_s; None without a readable Retry-After."""
     text = answer.headers.get("retry-after", "")
     if answer.status_code not in ASKS_TO_WAIT:
         return None
@@ -22,5 +22,5 @@ def asked_wait_s(answer: httpx.Response, most_s: float) -> float | None:
         at = parsedate_to_datetime(text)
     except (ValueError, OverflowError):
         return None
-    at = at if at.tzinfo else at.replace(tzinfo=UTC)  # HTTP's dates are UTC, also where they do not say so
+    at = at if at.tzinfo else at.replace(tzinfo=UTC)  # HTTP dates are UTC, even without a zone
     return max(0.0, min((at - datetime.now(UTC)).total_seconds(), most_s))

@@ -1,4 +1,4 @@
-"""A job of another job's clip: it gets the files of its own, so that each of the two may be removed by itself."""
+"""A new job with the clip of an earlier job. It gets its own links to the files, so either job can be removed alone."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def add_files_of(services: Deps, earlier: JobRecord, folder: Path, received: Rec
     """Link an earlier job's files into the upload of a new one, except the parts that were sent with it.
 
     Args:
-        folder: of the new upload.
+        folder: the folder of the new upload.
 
     Raises:
-        Problem: 409: the clip is not kept any more.
-        LimitError: what was sent and what is linked are larger than an upload may be.
+        Problem: 409: the clip is no longer stored.
+        LimitError: sent and linked files together exceed the maximum size of an upload.
     """
     try:
         source = services.store.fetch_clip(earlier.job_id)
@@ -38,7 +38,7 @@ def add_files_of(services: Deps, earlier: JobRecord, folder: Path, received: Rec
     except FileNotFoundError:
         raise _no_clip(earlier.job_id) from None
     except UnavailableError:
-        if services.store.submission(earlier.job_id) is None:  # removed since it was found
+        if services.store.submission(earlier.job_id) is None:  # removed meanwhile
             raise _no_clip(earlier.job_id) from None
         raise
     if received.total_bytes > services.settings.max_upload_bytes:
@@ -47,12 +47,12 @@ def add_files_of(services: Deps, earlier: JobRecord, folder: Path, received: Rec
 
 
 def earlier_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
-    """The submission of the caller's job of that id, whose clip is kept.
+    """The submission of the caller's job with that id, whose clip is stored.
 
     Raises:
-        InputError: `job_id` cannot be one.
-        Problem: 404: the caller has no such job. 409: its clip is not kept any more.
-        UnavailableError: the clip is not there, and the queue that would know the job is away.
+        InputError: `job_id` is not a job id.
+        Problem: 404: the caller has no such job. 409: its clip is no longer stored.
+        UnavailableError: the clip does not exist, and the queue that would know the job is unreachable.
     """
     if not is_job_id(job_id):
         raise InputError(CLIP_OF, f"{job_id[:40]!r} is no job's id.", "Give the id of a job or scene: GET /jobs.")
@@ -69,13 +69,13 @@ def earlier_job(services: Deps, caller: Caller, job_id: str) -> JobRecord:
 
 
 def first_job(store: Store, job_id: str) -> str:
-    """The job that the clip of this job came with; the job itself if it is not known to be another."""
+    """The job with which the clip was uploaded; the job itself if no other is known."""
     record = store.submission(job_id)
     return job_id if record is None else record.clip_of or job_id
 
 
 def others_with_clip(services: Deps, record: JobRecord) -> list[str]:
-    """The other jobs of the tenant that keep the same clip, newest first."""
+    """The other jobs of the tenant that store the same clip, newest first."""
     first = record.clip_of or record.job_id
     same = [each for each in services.queue.records(record.tenant, None) if first in (each.job_id, each.clip_of)]
     ids = [each.job_id for each in same if each.job_id != record.job_id]

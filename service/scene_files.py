@@ -29,7 +29,7 @@ MEDIA_TYPES = {".json": "application/json", ".csv": "text/csv"}
 ANY_FILE = "application/octet-stream"
 NEVER_CHANGES = "private, max-age=31536000, immutable"
 CHANGES_ONCE = "private, no-cache"
-"""Of the other files, because the scores are added to a finished scene."""
+"""Cache-Control of the other files, which change once: scores are added to a finished scene."""
 RESPONSES: dict[int | str, dict[str, object]] = {
     200: {"description": "the file", "content": dict.fromkeys((ANY_FILE, *MEDIA_TYPES.values()), BINARY)},
     206: {"description": "the part that Range asks for", "content": {ANY_FILE: BINARY}},
@@ -82,7 +82,7 @@ async def get_file(
 
 
 def _file_of(folder: Path, name: str) -> StoredFile | None:
-    """The scene's file of that name; None if its manifest lists no such file.
+    """The scene's file with that name; None if its manifest does not list it.
 
     Raises:
         SceneError: the manifest cannot be read.

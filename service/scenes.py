@@ -1,4 +1,4 @@
-"""Finished scenes: their report, curve and removal."""
+"""Routes of /scenes: list of finished scenes, report, curve, masks, cameras and removal."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def purge_scene(scene_id: str, services: Services, caller: AnyCaller) -> Receipt
 
 
 def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
-    """The record of a done job of the caller's tenant, whose scene is there.
+    """The record of a done job of the caller's tenant, whose scene exists.
 
     Raises:
         Problem: 404: there is no such scene, or it is another tenant's. 409: the job has no finished scene.
@@ -155,7 +155,7 @@ def _known(services: Deps, scene_id: str) -> JobRecord | None:
 
 
 def _summary(services: Deps, record: JobRecord) -> SceneSummary:
-    """A scene's line in the list; a damaged one hides no other."""
+    """A scene's entry in the list. A damaged scene still gets an entry."""
     scene_id = record.job_id
     links = {"report": f"/scenes/{scene_id}", "render": f"/render?scene={scene_id}", "job": f"/jobs/{scene_id}"}
     links["thumbnail"] = f"/scenes/{scene_id}/thumbnail"

@@ -1,4 +1,4 @@
-"""uvicorn as this service uses it: bounded in what it takes in, polite in its refusals, quick to end."""
+"""uvicorn with limits on connections and heads, problem documents for bad requests, and a quick shutdown."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from service.problems import MEDIA_TYPE, Problem
 
 KEEP_ALIVE_S = 15
 HEAD_S = 20.0
-"""A connection that is waited on for the head of a request for longer is closed: the first, or one after an answer.
-It is looked at this often, so that it may take twice as long."""
+"""A connection is closed if the head of its first or next request takes longer. The check runs at this interval, so
+closing may take twice as long."""
 MAX_HEAD_BYTES = 32 * 1024
 """The limit of a request's line and headers together."""
 MAX_CONNECTIONS = 1024
-"""Open ones, whether or not something is asked on them; service/request_log.py counts requests."""
+"""Maximum open connections, idle or not; service/request_log.py counts requests."""
 BACKLOG = 128
-"""Connections that wait to be accepted, all of which asyncio takes at once; as many are let in to be told to come back.
-Those that come in excess are closed: it logs each one that it has no file descriptor for, and forgets none of them."""
+"""Connections that wait to be accepted; asyncio accepts all of them at once. As many above the maximum get an answer to
+retry later; further ones are closed, because asyncio logs, and keeps, each one for which it has no file descriptor."""
 SPARE_FILES = 512
-"""Descriptors for all that is not a connection: files, queue, workers, and twice the backlog."""
+"""File descriptors for all but connections: files, queue, workers, and twice the backlog."""
 GRACE_S = 10
 """How long requests in progress may take when the service ends; callers can resume an upload later."""
 
 PING_PERIOD_S = 20.0
 PING_TIMEOUT_S = 20.0
 MAX_MESSAGE_BYTES = 64 * 1024
-"""The limit of a message from a WebSocket's client, which sends times and poses."""
+"""Maximum bytes of a message from a WebSocket's client, which sends times and poses."""
 MAX_WAITING_MESSAGES = 16
 
 UNREADABLE = Problem(400, "This is not a sound HTTP request.", remedy="See that its lengths and headers are right.")
 
 
 class HttpConnection(H11Protocol):
-    """Answers what is no HTTP with a problem document too, and does not wait forever for a request."""
+    """Answers invalid HTTP with a problem document, and does not wait forever for a request."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -54,7 +54,7 @@ class HttpConnection(H11Protocol):
         self.loop.call_later(HEAD_S, self._end_if_silent, None)
 
     def send_400_response(self, msg: str) -> None:
-        """The answer to what h11 cannot read."""
+        """Answer a request that h11 cannot parse."""
         headers = [("content-type", MEDIA_TYPE), ("connection", "close"), ("x-content-type-options", "nosniff")]
         body = json.dumps(UNREADABLE.document()).encode()
         headers.append(("content-length", str(len(body))))
@@ -64,8 +64,8 @@ class HttpConnection(H11Protocol):
         self.transport.close()
 
     def _end_if_silent(self, answered: object) -> None:
-        """Close it if no request has begun since the last look. answered: the request that was the last one then."""
-        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # a WebSocket by now
+        """Close the connection if no request has started since the last check. answered: the last request then."""
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # upgraded to a WebSocket
             return
         last: RequestResponseCycle | None = self.cycle
         is_waiting = last is None or last.response_complete
@@ -76,7 +76,7 @@ class HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """Takes a handshake that was refused with a whole answer for answered; uvicorn logs it as a fault otherwise."""
+    """Treats a handshake that was refused with a complete answer as answered; uvicorn logs it as a fault otherwise."""
 
     async def send(self, message: ASGISendEvent) -> None:
         await super().send(message)
@@ -85,7 +85,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
 
 
 class Server(uvicorn.Server):
-    """Ends the streams of events as soon as a signal asks it to end, for they would end last by themselves."""
+    """Ends the event streams as soon as a signal arrives, because they would end last by themselves."""
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         config = uvicorn.Config(
@@ -119,7 +119,7 @@ class Server(uvicorn.Server):
 
 
 def room_for_connections() -> int:
-    """How many connections the files that this process may open leave room for; raises that limit if it may."""
+    """How many connections the limit of open files allows. Raises that limit if permitted."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_CONNECTIONS + SPARE_FILES
     if soft != resource.RLIM_INFINITY and soft < wanted:

@@ -1,13 +1,13 @@
-"""WS /stream: one view after the other over one connection, each the newest that was asked for.
+"""WS /stream: many views over one connection, each for the newest request.
 
-The client sends JSON texts: the query of /render, and an `id` of its choice that comes back with the answer. An answer
+The client sends JSON texts: the query of /render, and an `id` of its choice that is repeated in the answer. An answer
 is one binary message: the length of its head (4 bytes, big-endian), the head (JSON, StreamHead), the image. An error
-is a JSON text, the problem document of HTTP with the `id`. The connection then stays open, unless the caller may not
-come in (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
+is a JSON text: the problem document of HTTP with the `id`. The connection then stays open, unless the caller is not
+allowed (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
 headers, is {"authorize": KEY}.
 
-While a view is made and sent only the newest of the messages that arrive is kept, so a viewer that asks faster than it
-is served skips views, and one that does not read is sent one and then none.
+While a view is rendered and sent, only the newest incoming message is kept. So a viewer that sends requests faster than
+they are answered skips views, and a viewer that does not read gets one view and then none.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ router = APIRouter()
 
 LENGTH_BYTES = 4
 MAX_MESSAGE = 16 * 1024
-"""Characters; a request is some hundred."""
+"""Maximum characters of a message; a request has some hundred."""
 AUTHORIZE_TIMEOUT_S = 5.0
-"""Who has connected without a key sends it at once."""
+"""A client that connects without a key must send it within this time."""
 SEND_TIMEOUT_S = 30.0
 """A viewer that takes this long to receive one view counts as gone."""
 
 NOT_TEXT, NOT_ALLOWED, TOO_LARGE = 1003, 1008, 1009
-"""Codes of RFC 6455, 7.4.1."""
+"""Close codes of RFC 6455, 7.4.1."""
 
 AUTHORIZE = "authorize"
 GONE = (WebSocketDisconnect, TimeoutError)
-"""What is raised when the viewer has left, or takes nothing more."""
+"""Raised when the viewer has disconnected, or does not read any more."""
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -105,9 +105,9 @@ async def stream(websocket: WebSocket, services: Services, caller: EarlyCaller) 
 
 
 class _Viewer:
-    """One connection: a task that reads, and keeps the newest request, and one that answers.
+    """One connection: one task reads and keeps the newest request, another answers.
 
-    lobby: where it waits until its key has come.
+    lobby: counts it as a connection without a key until the key has come.
     """
 
     def __init__(self, websocket: WebSocket, services: Deps, lobby: contextlib.ExitStack, *, may_come_in: bool) -> None:
@@ -120,7 +120,7 @@ class _Viewer:
         self._arrived = asyncio.Event()
 
     async def serve(self) -> None:
-        """Until one side hangs up."""
+        """Serve until one side closes the connection."""
         tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._answer_all())]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -154,7 +154,7 @@ class _Viewer:
                 self._arrived.set()
 
     async def _receive(self) -> Message:
-        """What the viewer sends next; its key must come at once."""
+        """The viewer's next message. The key must come within AUTHORIZE_TIMEOUT_S."""
         try:
             async with asyncio.timeout(AUTHORIZE_TIMEOUT_S if self._caller is None else None):
                 return await self._websocket.receive()
@@ -191,7 +191,7 @@ class _Viewer:
         return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)
 
     async def _tell(self, error: Exception, message_id: object) -> None:
-        """Say what went wrong; who is not known here, or no more, is shown out."""
+        """Send the error; close the connection of a caller without a valid key."""
         problem = problem_of(error)
         if problem is None:
             logger.error("a fault in a stream: %s", type(error).__name__, exc_info=error)
@@ -213,7 +213,7 @@ class _Viewer:
                 await self._websocket.close(reason.code)
 
     def _known_caller(self) -> Caller:
-        """Whose connection it is, asked for each view: a key that is revoked ends its streams too."""
+        """The connection's caller, checked for each view, so that revoking a key ends its streams."""
         assert self._caller is not None
         caller = self._caller()
         caller.require(KeyScope.VIEW)
@@ -226,7 +226,7 @@ class _Viewer:
         return caller
 
     def _authorized(self, document: dict[str, Any] | Problem) -> Callable[[], Caller]:
-        """Whose connection it is, by the key in a message."""
+        """The connection's caller, by the key in a message."""
         key = document.get(AUTHORIZE) if isinstance(document, dict) else None
         if not isinstance(key, str):
             raise _HangUp(NOT_ALLOWED, key_missing(self._address))
@@ -242,11 +242,11 @@ class _Viewer:
 
 
 def document_of(text: str) -> dict[str, Any] | Problem:
-    """The JSON object of a message, or what is to be said of one that is none."""
+    """The JSON object of a message, or the problem if it is not one."""
     try:
         document = from_json(
             text
-        )  # stricter than json: not too deep, and no half characters, which nobody can send back
+        )  # stricter than json: limits depth, and refuses lone surrogates, which cannot be sent back
     except ValueError:
         document = None
     if not isinstance(document, dict):
@@ -255,7 +255,7 @@ def document_of(text: str) -> dict[str, Any] | Problem:
 
 
 def message_of(document: dict[str, Any]) -> StreamMessage:
-    """The request that the document is.
+    """Parse a request.
 
     Raises:
         Problem: 422: the document is not a valid request; names the field.

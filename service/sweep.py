@@ -1,9 +1,9 @@
-"""What a death or an unreachable queue has left between the spool and the queue is put right here.
+"""Repairs differences between spool and queue after a crash or an unreachable queue.
 
-A clip in the spool was accepted, or was about to be: its job must stand in the queue. The sweep goes through the
-spool at the start of the service, every hour, again for as long as a submission's answer is owing, and whenever a job
-was cancelled or failed: where its worker had died, the queue ended it, and nobody has removed its files. It may run in
-several services at once, for all it does may be repeated.
+A clip in the spool was accepted, or was about to be, so its job must be in the queue. The sweep goes through the spool
+when the service starts, every hour, while the queue may not know a submission, and whenever a job was cancelled or
+failed: if its worker had died, the queue ended the job, and nobody has removed its files. It may run in several
+services at once, because all its steps may be repeated.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from intrasplat.errors import UnavailableError
 
 SWEEP_PERIOD_S = 2.0
 ABANDONED_PERIOD_S = 3600.0
-"""Uploads that nobody goes on with are looked for this often."""
+"""How often to look for abandoned uploads."""
 
 logger = logging.getLogger("intrasplat.service")
 
 
 class Sweep:
-    """Knows whether anything may be unsettled, and settles it."""
+    """Tracks whether spool and queue may differ, and repairs that."""
 
     def __init__(self, queue: Queue, store: Store) -> None:
         self._queue = queue
@@ -42,7 +42,7 @@ class Sweep:
 
     @contextmanager
     def in_hand(self, job_id: str) -> Iterator[None]:
-        """A request is submitting this job; the sweep lets it be until the context ends."""
+        """Skip this job in sweeps during the context, while a request submits it."""
         with self._lock:
             self._in_hand.add(job_id)
         try:
@@ -52,13 +52,13 @@ class Sweep:
                 self._in_hand.discard(job_id)
 
     def owe(self, job_id: str) -> None:
-        """The queue may not know this job, whose clip is in the spool: it is the sweep's from now on."""
+        """Leave a job to the sweep: its clip is in the spool, and the queue may not know it."""
         with self._lock:
             self._in_hand.discard(job_id)
         self._unsettled = True
 
     async def run(self) -> None:
-        """Settle all clips whenever one may be unsettled, until cancelled."""
+        """Run settle() whenever spool and queue may differ, until cancelled."""
         abandoned_at_s = time.monotonic()
         while True:
             if self._unsettled or await run_in_threadpool(self._more_ended_badly):
@@ -70,10 +70,10 @@ class Sweep:
             await asyncio.sleep(SWEEP_PERIOD_S)
 
     def settle(self) -> None:
-        """Bring the queue to what the spool says.
+        """Make the queue match the spool.
 
         Raises:
-            UnavailableError: the queue cannot be reached; what is left can be settled later.
+            UnavailableError: the queue cannot be reached; a later call does the rest.
         """
         for job_id in self._store.spooled_ids():
             with self._lock:
@@ -84,19 +84,19 @@ class Sweep:
                 try:
                     self._recover(job_id)
                 except UnavailableError as error:
-                    self._queue.ping()  # if it is the queue that is away, no other job can be settled either
+                    self._queue.ping()  # raises if the queue is unreachable: then no other job can be repaired either
                     logger.warning("an accepted clip cannot be queued: %s", error.problem, extra={"job_id": job_id})
                     self._unsettled = True
-            elif record.state is JobState.CANCELLED:  # its canceller or its worker died before it removed the clip
+            elif record.state is JobState.CANCELLED:  # service or worker died before it removed the clip
                 self._store.purge(job_id)
-            elif record.state is JobState.DONE:  # its worker died before it removed what led to the scene
+            elif record.state is JobState.DONE:  # its worker died before it removed its work
                 if self._store.has_left_work(job_id):
                     self._store.remove_other_attempts(job_id, record.attempt)
-            elif record.state is JobState.FAILED:  # by deaths of its workers, and the last could not remove its work
+            elif record.state is JobState.FAILED:  # its last worker died before it removed its work
                 self._store.remove_failed(job_id, record.attempt)
 
     def _more_ended_badly(self) -> bool:
-        """Whether jobs came to be cancelled or failed since this was asked before."""
+        """Whether jobs were cancelled or failed since the last call."""
         try:
             ended = self._queue.figures().ended
         except UnavailableError:
@@ -105,7 +105,7 @@ class Sweep:
         return self._ended_badly != before
 
     def _try_to_settle(self) -> None:
-        self._unsettled = False  # before the work, so that what comes to be owed meanwhile is not forgotten
+        self._unsettled = False  # before the work, so that a job that is added meanwhile is not missed
         is_settled = False
         try:
             self.settle()
@@ -118,9 +118,9 @@ class Sweep:
             self._unsettled = self._unsettled or not is_settled
 
     def _recover(self, job_id: str) -> None:
-        """Make the queue know a job again: as done if its scene is there, else to be run."""
+        """Enter a job into the queue again: as done if its scene exists, else as queued."""
         submitted = self._store.labelled_submission(job_id)
-        if submitted is None:  # removed since it was listed, or damaged
+        if submitted is None:  # removed meanwhile, or damaged
             return
         attempt = self._store.published_attempt(job_id)
         if attempt is not None:
@@ -137,6 +137,6 @@ class Sweep:
             logger.info("an accepted clip was queued", extra={"job_id": job_id})
 
     def _take_back(self, record: JobRecord) -> None:
-        """Its clip went while it was being queued: whoever removed it promised nothing."""
+        """Remove a job whose clip was removed while it was being queued."""
         self._queue.cancel(record.job_id)
         self._queue.forget(record.job_id)

@@ -1,4 +1,4 @@
-"""Whether the service lives, whether it can work, and what it is."""
+"""Routes /healthz, /readyz, /info, /key and /metrics."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LIMITS = (
     *("tenant_share", "long_training_s"),
     *("max_render_pixels", "render_timeout_s", "retention_hours", "max_retention_hours"),
 )
-"""Settings that callers are told; None where there is no limit."""
+"""Settings that /info shows; None where there is no limit."""
 
 
 class Readiness(BaseModel):
@@ -56,7 +56,7 @@ async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
 
     It answers within a second, also while the queue does not.
     """
-    # A full disk comes first, for the queue may be away with it.
+    # Check for a full disk first, because it may stop the queue too.
     missing_bytes = await run_in_threadpool(services.intake.missing_bytes)
     if missing_bytes > 0:
         remedy = room_remedy(None if caller is None else missing_bytes, services.settings.min_free_bytes)

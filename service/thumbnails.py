@@ -1,4 +1,4 @@
-"""GET /scenes/{id}/thumbnail: a small picture of a finished scene, rendered once and kept beside its files."""
+"""GET /scenes/{id}/thumbnail: a small picture of a finished scene, rendered once and stored beside its files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.scenes import finished_job
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
 WIDTH = 240
-"""Of a thumbnail in pixels: twice that of the page's cards, for dense screens."""
+"""Width of a thumbnail in pixels: twice that of the page's cards, for dense screens."""
 QUALITY = 80
 MEDIA_TYPE = MEDIA_TYPES[ImageFormat.JPEG]
 RESPONSES: dict[int | str, dict[str, object]] = {
@@ -55,10 +55,10 @@ async def get_thumbnail(
 
 
 async def _rendered(services: Deps, caller: Caller, record: JobRecord) -> bytes:
-    """The picture from a worker. It is kept unless it is coarse, as while the worker trains.
+    """The picture from a worker. It is stored unless it is coarse, as while the worker trains.
 
     Raises:
-        Problem: the worker cannot render the scene now, or the caller asks for too much.
+        Problem: the worker cannot render the scene now, or the caller requests too much.
         UnavailableError: no worker answers in time.
     """
     request = RenderRequest(

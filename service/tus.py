@@ -1,7 +1,7 @@
 """Uploads in pieces that survive lost connections: the tus protocol, version 1.0.0 (tus.io), creation and termination.
 
-An upload is created with its length and what it will be used as, grows by PATCH, and is named in POST /reconstruct
-once all of it has come. An offset is answered only when that much is on disk.
+An upload is created with its length and purpose, grows by PATCH, and is named in POST /reconstruct once it is complete.
+An offset is answered only when that many bytes are on disk.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ METADATA_REMEDY = "Send `part` (clip, left, right, calibration or masks) and `su
 
 
 class TusRoute(APIRoute):
-    """A route that speaks this version alone, and says so in every answer."""
+    """A route that accepts only this version of tus, and names it in every answer."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
@@ -168,7 +168,7 @@ def delete_upload(upload_id: str, services: Services, caller: AnyCaller, tus_res
 
 
 async def _write(pieces: AsyncIterator[bytes], file: RawIOBase, left_bytes: int) -> int:
-    """Write all pieces; how many bytes they had."""
+    """Write all pieces. Returns their number of bytes."""
     new_bytes = 0
     async for piece in pieces:
         _check_fits(new_bytes + len(piece), left_bytes)
@@ -178,7 +178,7 @@ async def _write(pieces: AsyncIterator[bytes], file: RawIOBase, left_bytes: int)
 
 
 def _open_at(partial: Partial, offset_bytes: int) -> RawIOBase:
-    """The upload's file, ours alone to write to from that offset."""
+    """The upload's file, locked, for writing from that offset."""
     try:
         file = partial.open()
     except BlockingIOError:
@@ -195,7 +195,7 @@ def _open_at(partial: Partial, offset_bytes: int) -> RawIOBase:
 
 
 def _owned(services: Deps, caller: Caller, upload_id: str) -> Partial:
-    """The caller's upload; the same 404 if there is none and if it is another's."""
+    """The caller's upload. A missing upload and another tenant's upload give the same 404."""
     partial = find_partial(services.store, upload_id, caller.tenant)
     if partial is None:
         raise Problem(404, f"There is no upload {upload_id[:40]!r}.", remedy="Create one: POST /uploads.")
@@ -223,7 +223,7 @@ def _check_fits(new_bytes: int, left_bytes: int) -> None:
 
 
 def _part_and_suffix(metadata: str) -> tuple[str, str]:
-    """What the upload is to be, from its Upload-Metadata; all else that is said there is forgotten."""
+    """Part and file ending from Upload-Metadata; everything else there is ignored."""
     values = {}
     for pair in metadata.split(","):
         name, _, encoded = pair.strip().partition(" ")

@@ -1,4 +1,4 @@
-"""A multipart upload, streamed to disk part by part while it is counted and hashed; never held in memory."""
+"""A multipart upload, streamed to disk part by part while it is counted and hashed; never whole in memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SUFFIXES = {
     "calibration": (".json", ".yaml", ".yml", ".xml", ".ini"),
     "masks": CLIP_SUFFIXES,
 }
-"""File parts and the endings they may have; the ending is all that is kept of the caller's file name."""
+"""File parts and their allowed endings. Only the ending of the caller's file name is stored."""
 
 PARTS = tuple(SUFFIXES)
 SCENE_PART = "scene"
@@ -48,7 +48,7 @@ MAX_BYTES = {
     METADATA_FIELD: MAX_OPTIONS_BYTES,
     "calibration": MAX_CALIBRATION_BYTES,
 }
-"""Maximum bytes of the parts that are small by their nature."""
+"""Maximum bytes of the small parts."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
@@ -60,7 +60,7 @@ FORM_REMEDY = (
 
 @dataclass(frozen=True)
 class Form:
-    """A multipart form: its file parts and the endings they may have, its parts that are text, how to send it."""
+    """A multipart form: file parts with their allowed endings, text parts, and how to send it."""
 
     suffixes: Mapping[str, tuple[str, ...]]
     texts: tuple[str, ...]
@@ -68,7 +68,7 @@ class Form:
 
     @property
     def main_part(self) -> str:
-        """What all of it is about."""
+        """The name of the main part."""
         return next(iter(self.suffixes))
 
 
@@ -83,7 +83,7 @@ SCENE_FORM = Form(
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """What an upload may take: bytes at all, and bytes before the disk has less than min_free_bytes left."""
+    """Limits of an upload: total bytes, and bytes until the disk has less than min_free_bytes left."""
 
     upload_bytes: int
     room_bytes: int
@@ -92,8 +92,8 @@ class UploadLimits:
 
 @dataclass
 class Received:
-    """What arrived: stored names by part, digests by part, options as text, labels, whose clip is used again, and
-    where a webhook goes at the end."""
+    """The received parts: stored names and digests by part, options as text, labels, the job whose clip is used again,
+    and the webhook's URL."""
 
     names: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
@@ -126,7 +126,7 @@ class Received:
                     raise InputError(eye if other in given else "clip", problem, FORM_REMEDY)
 
     def files(self) -> JobFiles:
-        """The parts by their role, once all files are there."""
+        """The stored names of the parts, once all files have arrived."""
         return JobFiles(
             clip=self.names.get("clip") or self.names["left"],
             right=self.names.get("right"),
@@ -155,7 +155,7 @@ def checked_suffix(part: str, suffix: str, suffixes: Mapping[str, tuple[str, ...
 
 
 def check_part_size(part: str, part_bytes: int) -> None:
-    """LimitError for a part of more bytes than one of its kind can have."""
+    """Raise LimitError if a part has more bytes than its kind may have."""
     if part_bytes > MAX_BYTES.get(part, part_bytes):
         raise LimitError(part, f"it is larger than {MAX_BYTES[part]} bytes.", "Send a smaller one.")
 
@@ -166,9 +166,9 @@ async def receive_upload(
     """Write the parts of a multipart body into folder.
 
     Raises:
-        Problem: 400: the body is not a valid multipart form. 507: the disk has no room for it.
+        Problem: 400: the body is not a valid multipart form. 507: the disk has no space for it.
         InputError: an unknown, repeated or empty part, or an ending that is not accepted.
-        LimitError: more than limits.upload_bytes, counted as they come.
+        LimitError: more than limits.upload_bytes, counted as they arrive.
     """
     kind, parameters = parse_options_header(content_type)
     if kind != b"multipart/form-data" or not parameters.get(b"boundary"):
@@ -183,7 +183,7 @@ async def receive_upload(
 
 
 class _Receiver:
-    """The parser's callbacks, and the one part that is being received."""
+    """The parser's callbacks, and the part that is being received."""
 
     def __init__(self, boundary: bytes, folder: Path, limits: UploadLimits, form: Form) -> None:
         self._form = form
@@ -214,7 +214,7 @@ class _Receiver:
         )
 
     def write(self, chunk: bytes) -> None:
-        """Take the next piece of the body."""
+        """Parse the next piece of the body."""
         self._received.total_bytes += len(chunk)
         if self._received.total_bytes > self._limits.upload_bytes:
             problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
@@ -225,7 +225,7 @@ class _Receiver:
         self._parser.write(chunk)
 
     def finish(self) -> Received:
-        """What was received, once the body has ended as it should."""
+        """The received parts, once the body is complete."""
         self._parser.finalize()
         if not self._ended:
             raise Problem(400, "The body ended before its last boundary.", remedy="Send the upload again.")
@@ -237,7 +237,7 @@ class _Receiver:
         return self._received
 
     def close(self) -> None:
-        """Let go of a file that was cut short."""
+        """Close a file that was cut off."""
         if self._file is not None:
             self._file.close()
             self._file = None

@@ -1,7 +1,7 @@
-"""Webhooks: tells callers' systems that a job has ended, signed, as often as it takes.
+"""Webhooks: sends callers' systems a signed message when a job has ended, and retries failed deliveries.
 
-The queue remembers what is owed (contract/queue/deliveries.py); each service lends from it and tries. Nothing is kept
-here, so a service may die at any time, and one that starts goes on with what is owed.
+The queue stores the pending deliveries (contract/queue/deliveries.py). Each service borrows from it and attempts them.
+Nothing is stored here, so a service may die at any time, and the next one continues.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from service.retry_after import asked_wait_s
 
 LOOK_PERIOD_S = 0.5
 MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
-"""Tries under way at a time, in all and of one tenant: a receiver that does not answer holds one for TRY_S."""
+"""Maximum attempts at a time, in total and per tenant. A receiver that does not answer occupies one for TRY_S."""
 MAX_CALLS = 8
-"""Calls of the queue at a time: requests wait for threads of their own while the queue is away."""
+"""Maximum calls to the queue at a time, so that webhooks leave threads to requests while the queue is unreachable."""
 TRY_S = 10.0
-"""How long one try may take, from looking up the name to the head of the answer."""
+"""How long one attempt may take, from the DNS look-up to the head of the answer."""
 CONNECT_S = 4.0
-"""The same for the connection to one address: a host may have another one that answers."""
+"""How long connecting to one address may take: another address of the host may answer."""
 MAX_TRIES = 11
 FIRST_WAIT_S, WAIT_GROWS, MAX_WAIT_S, JITTER = 5.0, 4.0, 6 * 3600.0, 0.2
-"""5 s after the first try, 20 s after the second, ... 6 h after the last but one: 26 h in all, unless receivers ask for
-longer waits."""
+"""Waits of 5 s after the first attempt, 20 s after the second, ... 6 h before the last: 26 h in total, unless receivers
+request longer waits."""
 
 logger = logging.getLogger("intrasplat.service")
 
 
 class TryFailed(Exception):
-    """A try failed. status_code, retry_after_s: of the receiver's answer, if there was one, and if it asked to wait."""
+    """An attempt failed. status_code, retry_after_s: from the receiver's answer, if there was one."""
 
     def __init__(self, failure: TryFailure, status_code: int | None = None, retry_after_s: float | None = None) -> None:
         super().__init__(failure)
@@ -61,25 +61,25 @@ class TryFailed(Exception):
 
 
 class Webhooks:
-    """Delivers what the queue says is owed."""
+    """Sends the pending webhooks of the queue."""
 
     def __init__(self, settings: Settings, queue: Queue) -> None:
         self._settings = settings
         self._queue = queue
         self._is_away = False
         self._under_way: Counter[str] = Counter()
-        """By tenant."""
+        """Attempts in progress, by tenant."""
         self._threads = CapacityLimiter(MAX_CALLS)
         self._look_ups = LookUps(MAX_AT_ONCE)
 
     async def run(self) -> None:
-        """Deliver whatever is due, until cancelled."""
+        """Send all due webhooks, until cancelled."""
         self._under_way.clear()
         tls = await run_in_threadpool(ssl.create_default_context)
         timeout = httpx.Timeout(TRY_S, connect=CONNECT_S)
-        limits = httpx.Limits(max_keepalive_connections=0)  # a connection belongs to the name it was made for
+        limits = httpx.Limits(max_keepalive_connections=0)  # never reuse a connection for another host name
         no_cookies = CookieJar(DefaultCookiePolicy(allowed_domains=[]))  # receivers may share an address
-        # trust_env: no proxy of the environment comes between the address that was judged and the one connected to
+        # trust_env: with a proxy of the environment, the service would not connect to the address that it has checked
         async with (
             httpx.AsyncClient(verify=tls, trust_env=False, limits=limits, timeout=timeout, cookies=no_cookies) as http,
             asyncio.TaskGroup() as tries,
@@ -96,7 +96,7 @@ class Webhooks:
                     tries.create_task(self._deliver(http, loan))
 
     def _lent(self, full: Collection[str]) -> Loan | None:
-        """A delivery that is due; None also while the queue is away, and after a fault."""
+        """Borrow a due delivery; None if there is none, the queue is unreachable, or the call failed."""
         try:
             loan = self._queue.lend_delivery(uuid.uuid4().hex, full)
         except UnavailableError as error:
@@ -104,14 +104,14 @@ class Webhooks:
                 logger.warning("webhooks wait for the queue: %s", error.problem)
             self._is_away = True
             return None
-        except Exception:  # if one was lent, its loan runs out
+        except Exception:  # if a delivery was borrowed, its loan expires
             logger.exception("the queue lends no webhook by a fault of ours")
             return None
         self._is_away = False
         return loan
 
     async def _deliver(self, http: httpx.AsyncClient, loan: Loan) -> None:
-        """Try once, and note it. What nobody foresaw ends this try alone, whose loan then runs out."""
+        """Attempt a delivery once and store the result. After an unexpected error its loan expires."""
         try:
             await self._note(loan, await self._tried(http, loan))
         except Exception:
@@ -120,7 +120,7 @@ class Webhooks:
             self._under_way[loan.tenant] -= 1
 
     async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
-        """The delivery after one more try."""
+        """Attempt a delivery. Returns it with the new attempt."""
         began_s, job_id = time.time(), loan.delivery.job_id
         status_code = failure = retry_after_s = None
         span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=SpanKind.CLIENT, job_id=job_id)
@@ -150,14 +150,14 @@ class Webhooks:
         wait_s = wait_after(_counted(delivery), asked_s) if delivery.status is DeliveryStatus.OWED else None
         try:
             await to_thread.run_sync(self._queue.note_try, loan, delivery, wait_s, limiter=self._threads)
-        except UnavailableError as error:  # the loan runs out, and the webhook is sent once more
+        except UnavailableError as error:  # the loan expires, and the webhook is sent again
             logger.warning("what became of a webhook is not noted: %s", error.problem, extra=_about(delivery))
 
     async def _post(self, http: httpx.AsyncClient, loan: Loan) -> int:
-        """The status of the receiver's answer, which is one of success.
+        """Send the webhook. Returns the status of the receiver's successful answer.
 
         Raises:
-            TryFailed: there was none.
+            TryFailed: no address gave a successful answer.
         """
         secret = self._settings.webhook_secret
         if secret is None or not is_allowed(loan.url, self._settings):
@@ -185,21 +185,21 @@ class Webhooks:
 
 
 def wait_after(tries: int, asked_s: float = 0.0) -> float:
-    """Seconds from so many failed tries to the next, about: many that failed together do not come back together.
+    """Seconds from the last of `tries` failed attempts to the next, with jitter so that retries spread out.
 
-    asked_s: how long the receiver asked to be left alone, which is the least.
+    asked_s: the wait that the receiver requested; the result is never less.
     """
     wait_s = min(FIRST_WAIT_S * WAIT_GROWS ** (tries - 1), MAX_WAIT_S)
     return max(wait_s * random.uniform(1 - JITTER, 1 + JITTER), asked_s * random.uniform(1, 1 + JITTER))
 
 
 def _counted(delivery: Delivery) -> int:
-    """How many of its tries count."""
+    """How many of the delivery's attempts count."""
     return len(delivery.tries) - delivery.forgiven_tries
 
 
 def _after(delivery: Delivery, tried: DeliveryTry) -> Delivery:
-    """The delivery with one more try."""
+    """The delivery with one more attempt."""
     after = delivery.model_copy(update={"tries": (*delivery.tries, tried)})
     status = DeliveryStatus.OWED
     if tried.failure is None:
@@ -231,7 +231,7 @@ class _Request:
 
 
 def _request(loan: Loan, secrets: Sequence[str]) -> _Request:
-    """The webhook, with a signature by each secret."""
+    """The HTTP request of a webhook, with a signature by each secret."""
     body, now_s, event = JobEnded.of(loan.delivery).model_dump_json().encode(), int(time.time()), loan.delivery.event_id
     headers = {
         "Content-Type": "application/json",
@@ -244,7 +244,7 @@ def _request(loan: Loan, secrets: Sequence[str]) -> _Request:
 
 
 async def _send(http: httpx.AsyncClient, url: httpx.URL, address: str, request: _Request) -> int:
-    """The status of an answer of success from that address, whose certificate must be for the URL's host.
+    """Send to one address, whose certificate must be for the URL's host. Returns the status of a successful answer.
 
     Only the head of the answer is read, and no redirect is followed.
     """
@@ -258,12 +258,12 @@ async def _send(http: httpx.AsyncClient, url: httpx.URL, address: str, request: 
 
 
 def _host_of(url: httpx.URL) -> str:
-    """The host as it is looked up and as certificates have it: ASCII."""
+    """The host in ASCII, as in DNS and in certificates."""
     return url.raw_host.decode()
 
 
 def _is_of_tls(error: BaseException | None) -> bool:
-    """Whether TLS is the cause: the certificate is not trusted, or for another name."""
+    """Whether TLS is the cause: the certificate is not trusted, or is for another name."""
     while error is not None:
         if isinstance(error, ssl.SSLError):
             return True

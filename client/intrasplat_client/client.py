@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 
 
 class _Blocking:
-    """What a method made by _blocking() needs."""
+    """The attributes that methods created by _blocking() need."""
 
     _core: Core
 
@@ -27,7 +27,7 @@ class _Blocking:
 def _blocking(
     method: Callable[Concatenate[Core, Arguments], Coroutine[Any, Any, Result]],
 ) -> Callable[Concatenate[_Blocking, Arguments], Result]:
-    """A method of Core as one of Client, with its arguments, types and docstring. It returns when it has the result."""
+    """Turn a method of Core into a blocking one of Client, with the same arguments, types and docstring."""
 
     def call(self: _Blocking, /, *args: Arguments.args, **named: Arguments.kwargs) -> Result:
         return run(method(self._core, *args, **named))
@@ -50,9 +50,9 @@ class Client(_Blocking):
     """A connection to one service: use it as a context, or call close().
 
     api_key: from `intrasplat keys create`; needed unless the service runs on this machine for its user alone.
-    patience_s: how long, in all, a call waits while the service is busy (429, 503) or the connection is lost. Where
-    nobody answers at all, a call fails at once.
-    on_wait(error, pause_s): is called before each of these waits.
+    patience_s: how long, in total, a call waits while the service is busy (429, 503) or the connection is lost. If
+    nothing listens at the address, a call fails at once.
+    on_wait(error, pause_s): called before each of these waits.
     transport: instead of the network, for tests.
     """
 

@@ -1,7 +1,7 @@
-"""How a call travels: one request and its answer, on a connection that blocks or on one that awaits.
+"""One request and its answer, over a blocking or an asynchronous connection.
 
-Everything above this module is written once, as coroutines. BlockingConnection offers them the same three verbs as
-AwaitedConnection, but its verbs never suspend, so `run` takes such a coroutine to its result in one step.
+The modules that import this one are written once, as coroutines. BlockingConnection has the same three methods as
+AwaitedConnection, but they never suspend, so `run` gets the result of such a coroutine in one step.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from intrasplat_client.errors import UNREACHABLE_REMEDY, InputError
 DEFAULT_URL = "http://127.0.0.1:8765"
 CONNECT_TIMEOUT_S = 5.0
 ANSWER_TIMEOUT_S = 60.0
-"""For one read or write without any progress; an upload as a whole may take longer."""
+"""Timeout of one read or write without any progress; an upload as a whole may take longer."""
 HEARTBEAT_TIMEOUT_S = 45.0
-"""Three of the heartbeats that a stream of events brings while nothing happens."""
+"""Timeout of an event stream: three heartbeats."""
 
 EVENT_TIMEOUT = httpx.Timeout(HEARTBEAT_TIMEOUT_S, connect=CONNECT_TIMEOUT_S)
 
@@ -40,7 +40,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Call:
-    """A request. is_repeatable: it may be sent again when its answer was lost."""
+    """A request. is_repeatable: it may be sent again if its answer was lost."""
 
     method: str
     path: str
@@ -51,7 +51,7 @@ class Call:
     is_repeatable: bool = False
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of request() and stream() of an httpx client, but for the body."""
+        """Arguments of request() and stream() of an httpx client, except the body."""
         length = {} if self.body is None else {"Content-Length": str(self.body.length_bytes)}
         headers = {**self.headers, **length}
         return {"method": self.method, "url": self.path, "params": self.query, "headers": headers, "json": self.json}
@@ -67,20 +67,20 @@ class Answer:
 
 
 class Connection(Protocol):
-    """What a client needs of the network. send and stream raise httpx.TransportError where the connection fails."""
+    """The network operations of a client. send and stream raise httpx.TransportError if the connection fails."""
 
     async def send(self, call: Call) -> httpx.Response:
-        """Send a call; its answer, read."""
+        """Send a call. Returns its answer, completely read."""
 
     def stream(self, call: Call) -> AbstractAsyncContextManager[Answer]:
-        """Send a call and keep its answer open."""
+        """Send a call. The answer stays open during the context."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait."""
 
 
 class BlockingConnection:
-    """Its coroutines block and never suspend."""
+    """A Connection whose coroutines block and never suspend."""
 
     def __init__(self, http: httpx.Client) -> None:
         self._http = http
@@ -107,7 +107,7 @@ class BlockingConnection:
 
 
 class AwaitedConnection:
-    """Its coroutines let others run while they wait."""
+    """A Connection whose coroutines suspend while they wait."""
 
     def __init__(self, http: httpx.AsyncClient) -> None:
         self._http = http
@@ -158,7 +158,7 @@ def _sent(body: Body) -> Iterator[bytes]:
 
 
 async def _sent_by_thread(body: Body) -> AsyncIterator[bytes]:
-    """The pieces, read by a thread, since a disk may be slow."""
+    """The pieces, read by a thread because a disk may be slow."""
     pieces, sent_bytes = body.pieces(), 0
     while (piece := await anyio.to_thread.run_sync(next, pieces, None)) is not None:
         yield piece

@@ -1,4 +1,4 @@
-"""What both clients do, written once: AsyncClient inherits these methods, and Client wraps each of them (client.py)."""
+"""The methods of both clients, written once: AsyncClient inherits them, and Client wraps each of them (client.py)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SCORES_WITHIN_S, LOOK_PERIOD_S = 30.0, 0.3
-"""Another scene may have to be scored first."""
+"""How long report() waits for scores, and how often it asks. Another scene may have to be scored first."""
 
 MAX_PAGE = 200
 NEXT_HEADER = "X-Intrasplat-Next"
@@ -131,7 +131,8 @@ class Core:
         """The newest jobs, newest first: at most `limit`, 200 if it is not given.
 
         state: only those in it. q: words, each part of the label or of a value of metadata, or the beginning of the id.
-        metadata: what theirs must have. preset: only those of it. created_from_s, created_until_s: UNIX s.
+        metadata: entries that the job's metadata must have. preset: only jobs with it. created_from_s,
+        created_until_s: UNIX s.
         """
         chosen = None if state is None else JobState(state).value
         search = _search(q, metadata, preset, created_from_s, created_until_s)
@@ -149,7 +150,7 @@ class Core:
         return parsed(response, TypeAdapter(list[Delivery]).validate_json, response.content)
 
     async def send_again(self, job_id: str) -> list[Delivery]:
-        """Have the webhook about a job's last end sent now, whatever became of it; then as deliveries()."""
+        """Have the webhook about a job's last end sent now, whatever its status. Returns as deliveries()."""
         response = await self._session.request(Call("POST", _path("jobs", job_id, "deliveries")))
         return parsed(response, TypeAdapter(list[Delivery]).validate_json, response.content)
 
@@ -240,11 +241,11 @@ class Core:
         created_from_s: float | None = None,
         created_until_s: float | None = None,
     ) -> list[dict[str, Any]]:
-        """Finished scenes, newest first: at most `limit`, 200 if it is not given. The rest as `jobs` has it."""
+        """Finished scenes, newest first: at most `limit`, 200 if it is not given. Other arguments as in jobs()."""
         return await self._pages("scenes", limit, _search(q, metadata, preset, created_from_s, created_until_s))
 
     async def report(self, scene: str, scores_within_s: float = SCORES_WITHIN_S) -> Report:
-        """The scene's quality report. Waits at most so long for its scores, which follow a job's end within seconds.
+        """The scene's quality report. Waits at most scores_within_s for its scores, which follow within seconds.
 
         `scored` is False in a report without them.
         """
@@ -276,7 +277,7 @@ class Core:
         return (await self._get("scenes", scene, "recorded", t=t, eye=eye, masks=masks)).content
 
     async def cameras(self, scene: str) -> SceneCameras:
-        """Where the endoscope was, frame by frame, and its lens; also while the job trains."""
+        """The endoscope's pose in each frame, and its lens; also while the job trains."""
         response = await self._get("scenes", scene, "cameras")
         return parsed(response, SceneCameras.model_validate_json, response.content)
 
@@ -299,7 +300,7 @@ class Core:
         return parsed(response, Measurement.model_validate_json, response.content)
 
     async def export(self, /, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
-        """The scene as a file of a format; docs/export.md lists the formats and their options."""
+        """Export the scene to a file format; docs/export.md lists the formats and their options."""
         return (await self._get("scenes", scene, "export", t=t, format=format, **options)).content
 
     async def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
@@ -308,7 +309,7 @@ class Core:
 
     async def delete(self, scene: str) -> dict[str, Any]:
         """Remove clip, scene and record of a job that has ended; the receipt lists what was removed."""
-        # Not repeated when its answer is lost: the second answer would be that there is no such scene.
+        # Not repeatable: if its answer is lost, the next one would be that there is no such scene.
         receipt: dict[str, Any] = _json_of(await self._session.request(Call("DELETE", _path("scenes", scene))))
         return receipt
 
@@ -323,7 +324,7 @@ class Core:
         return info
 
     async def is_ready(self) -> bool:
-        """Whether the service would train a clip sent now; False too while nobody answers."""
+        """Whether the service would train a clip sent now; False if it does not answer."""
         try:
             return (await self._session.send(Call("GET", "/readyz"))).status_code == httpx.codes.OK
         except Unreachable:
@@ -334,7 +335,7 @@ class Core:
         return await self._session.request(Call("GET", _path(*path), given, is_repeatable=True))
 
     async def _pages(self, path: str, limit: int | None, search: Mapping[str, Any]) -> list[Any]:
-        """The first so many entries of a list, page by page."""
+        """The first `limit` entries of a list, read page by page."""
         left, cursor = limit or MAX_PAGE, None
         found: list[Any] = []
         while left > 0:
@@ -363,7 +364,7 @@ def _search(
     created_from_s: float | None,
     created_until_s: float | None,
 ) -> dict[str, Any]:
-    """The query of a list, with None for what is not asked for."""
+    """The query of a list, with None for unused conditions."""
     wanted = [f"{name}={value}" for name, value in (metadata or {}).items()]
     dates = {"created_from_s": created_from_s, "created_until_s": created_until_s}
     return {"q": q, "metadata": wanted or None, "preset": preset, **dates}

@@ -33,7 +33,7 @@ UNREACHABLE_REMEDY = "Start one with `intrasplat up`, or correct the address."
 
 @dataclass(frozen=True)
 class Refusal:
-    """An answer other than the one asked for, as the service's problem document and headers describe it."""
+    """An error answer, as the service's problem document and headers describe it."""
 
     status: int
     problem: str
@@ -42,7 +42,7 @@ class Refusal:
     request_id: str | None = None
     retry_after_s: float | None = None
     job_id: str | None = None
-    """The job that the clip became all the same."""
+    """The job that the clip became despite the error."""
 
 
 class IntrasplatError(Exception):
@@ -87,7 +87,7 @@ class NotFound(RequestRefused):
 
 
 class Conflict(RequestRefused):
-    """The job or scene is not in a state for this."""
+    """The state of the job or scene does not allow this."""
 
 
 class ServiceUnavailable(IntrasplatError):
@@ -105,11 +105,11 @@ class ServiceUnavailable(IntrasplatError):
 
 
 class RateLimited(ServiceUnavailable):
-    """Too much came from this caller; `retry_after_s` says when there is room again."""
+    """This caller sent too many requests; `retry_after_s` says when to retry."""
 
 
 class Unreachable(ServiceUnavailable):
-    """The connection failed, so status is None. is_nobody_there: it was never made, so nothing was sent."""
+    """The connection failed, so status is None. is_nobody_there: it was never established, so nothing was sent."""
 
     def __init__(self, url: str, error: Exception, is_nobody_there: bool) -> None:
         what = "No service answers at" if is_nobody_there else "The connection was lost to the service at"
@@ -164,7 +164,7 @@ REFUSED: Mapping[int, type[RequestRefused]] = {
 
 
 def error_of_answer(status: int, headers: Mapping[str, str], content: bytes) -> IntrasplatError:
-    """The exception for an answer with an error's status."""
+    """The exception for an answer with an error status."""
     request_id = headers.get("x-request-id")
     try:
         document = json.loads(content)

@@ -1,4 +1,4 @@
-"""Following a job by server-sent events, resumed where a stream was cut off; by polling where none come through."""
+"""Follows a job by server-sent events, resumed where a stream was cut off; by polling where events do not arrive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from intrasplat_client.session import Session, error_of, parsed
 POLL_S = 1.0
 RECONNECT_S = 0.5
 MAX_EMPTY_STREAMS = 3
-"""Streams in a row without any event: a proxy in between holds events back."""
+"""After this many streams in a row without any event, a proxy is assumed to hold events back."""
 NO_EVENTS_HERE = frozenset({404, 405, 406, 501})
 """Statuses of a service without events. A job that does not exist answers 404 as well; the poll then says so."""
 
@@ -46,7 +46,7 @@ class EventReader:
 
 
 async def watch(session: Session, path: str) -> AsyncGenerator[JobView, None]:
-    """The job at `path` whenever something happens to it, the last time in its terminal state."""
+    """Yield the job at `path` after each change, the last time in its terminal state."""
     events, patience, empty, is_known = EventReader(), session.patience(), 0, False
     while empty < MAX_EMPTY_STREAMS:
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": events.last_id} if events.last_id else {})
@@ -81,7 +81,7 @@ async def watch(session: Session, path: str) -> AsyncGenerator[JobView, None]:
 
 
 async def _refusal(answer: Answer) -> ServiceUnavailable | None:
-    """Why no events came, if it is worth another attempt; None: this service sends no events."""
+    """The failure, if another attempt may help; None: this service sends no events."""
     await answer.read()
     if answer.response.is_success or answer.response.status_code in NO_EVENTS_HERE:
         return None
@@ -92,7 +92,7 @@ async def _refusal(answer: Answer) -> ServiceUnavailable | None:
 
 
 def has_events(response: httpx.Response) -> bool:
-    """Whether it is a stream of events. 204 promises none; 200 of another type comes from another server."""
+    """Whether the response is a stream of events. 204: none will come; 200 of another type: another server answered."""
     content_type: str = response.headers.get("content-type", "")
     return response.status_code == httpx.codes.OK and content_type.startswith("text/event-stream")
 
@@ -108,7 +108,7 @@ async def _poll(session: Session, path: str) -> AsyncGenerator[JobView, None]:
 
 
 def finished(job: JobView) -> JobView:
-    """The job, which has ended, if it is done.
+    """Return an ended job if it is done.
 
     Raises:
         JobRejected, JobFailed, JobCancelled: it ended without a scene.

@@ -26,11 +26,11 @@ NEVER_CONNECTED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.UnsupportedPr
 Content = TypeVar("Content")
 Parsed = TypeVar("Parsed")
 OnWait: TypeAlias = Callable[[IntrasplatError, float], None]
-"""Is told of each failure after which a call waits and is repeated, and of the seconds that it waits."""
+"""Called with each failure after which a call is repeated, and the seconds that it waits before that."""
 
 
 class Patience:
-    """Pauses that double, until their sum since the last success exceeds `total_s`."""
+    """Pauses that double until their sum since the last success exceeds `total_s`."""
 
     def __init__(self, total_s: float) -> None:
         self._total_s = total_s
@@ -58,8 +58,8 @@ class Patience:
 class Session:
     """One service over one connection.
 
-    url: as messages name the service.
-    patience_s: how long, in all, a call waits while the service is busy or the connection is lost.
+    url: the service's address in messages.
+    patience_s: how long, in total, a call waits while the service is busy or the connection is lost.
     """
 
     def __init__(self, connection: Connection, url: str, patience_s: float, on_wait: OnWait | None = None) -> None:
@@ -70,7 +70,7 @@ class Session:
         self.sleep = connection.sleep
 
     def patience(self) -> Patience:
-        """For a series of attempts that the caller makes itself."""
+        """A new Patience, for attempts that the caller repeats itself."""
         return Patience(self._patience_s)
 
     async def wait(self, patience: Patience, failure: IntrasplatError) -> None:
@@ -81,7 +81,7 @@ class Session:
         await self.sleep(pause_s)
 
     async def send(self, call: Call) -> httpx.Response:
-        """Send a call once; its answer, whatever the status.
+        """Send a call once. Returns its answer, whatever the status.
 
         Raises:
             Unreachable: the connection failed.
@@ -101,16 +101,16 @@ class Session:
             raise self._unreachable(error) from error
 
     async def request(self, call: Call, *, patience_s: float | None = None, is_there: bool = False) -> httpx.Response:
-        """Send a call, again while the service is busy (429, 503) or loses the connection; its successful answer.
+        """Send a call; repeat it while the service is busy (429, 503) or the connection is lost. Returns its success.
 
-        patience_s: another than the session's.
-        is_there: the service has answered before, so a refused connection is worth another attempt.
+        patience_s: replaces the session's.
+        is_there: the service has answered before, so a refused connection is tried again.
 
         Raises:
-            Unreachable: nobody is there; or the connection was lost and patience is used up, or the call may not be
-                repeated.
+            Unreachable: nothing listens there; or the connection was lost and patience is used up, or the call may not
+                be repeated.
             ServiceUnavailable, RateLimited: the service stayed busy.
-            RequestRefused, ServiceFault: it answered otherwise.
+            RequestRefused, ServiceFault: it answered with another error.
         """
         patience = self.patience() if patience_s is None else Patience(patience_s)
         while True:
@@ -125,7 +125,7 @@ class Session:
                 if response.is_success or response.status_code == httpx.codes.NOT_MODIFIED:
                     return response
                 failure = error_of(response)
-                # An answer that names a job accepted the clip: there is nothing to send again.
+                # An answer that names a job has accepted the clip: do not send it again.
                 if not isinstance(failure, ServiceUnavailable) or failure.job_id is not None:
                     raise failure
             is_there = True
@@ -141,7 +141,7 @@ def error_of(response: httpx.Response) -> IntrasplatError:
 
 
 def parsed(response: httpx.Response, parse: Callable[[Content], Parsed], content: Content) -> Parsed:
-    """What `parse` makes of the content of a successful response.
+    """The result of `parse` on the content of a successful response.
 
     Raises:
         ServiceFault: it cannot be parsed, so another server or another version answered.

@@ -1,4 +1,4 @@
-"""Sending a clip: small files in one form, large ones in pieces that survive a lost connection (tus 1.0.0, tus.io).
+"""Sends a clip: small files in one form, large ones in pieces that survive a lost connection (tus 1.0.0, tus.io).
 
 The service learns only the endings of file names, because a name may identify a patient.
 """
@@ -24,27 +24,26 @@ from intrasplat_client.models import EXCLUSIVE_OPTIONS, GivenOptions, JobView
 from intrasplat_client.session import Patience, Session, error_of, parsed
 
 IN_PIECES_FROM_BYTES = 64 * 2**20
-"""Losing a smaller upload costs seconds; a larger one resumes."""
+"""Uploads of this size are resumable. Losing a smaller one costs only seconds."""
 PIECE_BYTES = 32 * 2**20
-"""The size of one request: small enough for proxies, and all that a lost connection can cost."""
+"""The size of one request: small enough for proxies, and the most that a lost connection can cost."""
 READ_BYTES = 2**18
 
 TUS = {"Tus-Resumable": "1.0.0"}
 TUS_CONTENT_TYPE = "application/offset+octet-stream"
 
 RESUME_AFTER = frozenset({httpx.codes.REQUEST_TIMEOUT, httpx.codes.CONFLICT, httpx.codes.LOCKED})
-"""The request stalled; the offset differs; the service still holds the connection that was lost."""
+"""Statuses after which an upload resumes: it stalled, the offset differs, or the lost connection is still open."""
 
 OnUpload = Callable[[int, int], object]
-"""Called with the bytes sent and the bytes there are. After a lost connection the former can decrease."""
+"""Called with the bytes sent and the total. After a lost connection the bytes sent can decrease."""
 
 
 @dataclass(frozen=True)
 class Submission:
-    """A clip that is ready to go: files and their sizes by part, options and labels as JSON can have them.
+    """A clip that is ready to send: files and their sizes by part, options and labels as JSON values.
 
-    texts: what is sent as it is: the id of the job whose clip is used again, if there is no file of one, and where a
-    webhook goes.
+    texts: parts that are sent as text: clip_of, if there is no clip file, and callback_url.
     """
 
     paths: dict[str, Path]
@@ -107,7 +106,7 @@ def prepare_scene(
     idempotency_key: str | None,
     on_upload: OnUpload | None,
 ) -> Submission:
-    """As prepare(), of a scene that another installation exported; it is sent in one form.
+    """As prepare(), for a scene that another installation exported; it is sent in one form.
 
     Raises:
         InputError: the file cannot be read or is empty, or the option cannot be used.
@@ -118,18 +117,18 @@ def prepare_scene(
 
 
 def texts_of(**given: str | None) -> dict[str, str]:
-    """What is given of clip_of and callback_url, which are sent as they are."""
+    """The given ones of clip_of and callback_url, which are sent as text."""
     return {name: text for name, text in given.items() if text is not None}
 
 
 def labels_of(label: str | None, metadata: Mapping[str, str] | None) -> dict[str, Any]:
-    """What is given of a job's labels, as JSON can have it."""
+    """The given labels of a job, as JSON values."""
     given = {"label": label, "metadata": None if metadata is None else dict(metadata)}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options as JSON can have them.
+    """The options as JSON values.
 
     Raises:
         InputError: an option does not exist, is out of range, or excludes another.
@@ -150,7 +149,7 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 async def submit(session: Session, submission: Submission) -> JobView:
-    """Send the clip and get its job; the same job however often the connection is lost on the way."""
+    """Send the clip and get its job. Lost connections never create a second job."""
     headers = {"Idempotency-Key": submission.idempotency_key}
     try:
         if submission.in_pieces:
@@ -170,7 +169,7 @@ async def submit(session: Session, submission: Submission) -> JobView:
 
 
 async def _job_of_accepted_clip(session: Session, failure: ServiceUnavailable) -> JobView:
-    """The service has the clip on disk but cannot reach its queue; wait until it has queued the job."""
+    """Wait until a service that has the clip on disk, but cannot reach its queue, has queued the job."""
     patience = session.patience()
     while True:
         await session.wait(patience, failure)
@@ -180,7 +179,7 @@ async def _job_of_accepted_clip(session: Session, failure: ServiceUnavailable) -
 
 
 async def _upload_all(session: Session, submission: Submission) -> dict[str, str]:
-    """Send each file in pieces; the ids of the uploads by part."""
+    """Send each file in pieces. Returns the ids of the uploads by part."""
     uploads: dict[str, str] = {}
     sent_bytes = 0
     for part, size_bytes in submission.sizes.items():
@@ -190,7 +189,7 @@ async def _upload_all(session: Session, submission: Submission) -> dict[str, str
 
 
 async def _upload(session: Session, submission: Submission, part: str, sent_before: int) -> str:
-    """Send one file in pieces; the id of its upload."""
+    """Send one file in pieces. Returns the id of its upload."""
     path, size_bytes = submission.paths[part], submission.sizes[part]
     metadata = {"part": part, "suffix": path.suffix}
     encoded = ",".join(f"{name} {base64.b64encode(value.encode()).decode()}" for name, value in metadata.items())
@@ -209,7 +208,7 @@ async def _upload(session: Session, submission: Submission, part: str, sent_befo
 
 
 async def _append(session: Session, place: str, start: int, body: Body, patience: Patience) -> int:
-    """Send a piece that begins at byte `start`; how many bytes the service has afterwards, maybe fewer or more."""
+    """Send a piece that starts at byte `start`. Returns the service's new offset, which may be lower or higher."""
     headers = {**TUS, "Upload-Offset": str(start), "Content-Type": TUS_CONTENT_TYPE}
     failure: IntrasplatError
     try:
@@ -229,7 +228,7 @@ async def _append(session: Session, place: str, start: int, body: Body, patience
             failure = error
         else:
             if head.status_code not in (httpx.codes.TOO_MANY_REQUESTS, httpx.codes.SERVICE_UNAVAILABLE):
-                # An answer to HEAD has no body to say what is wrong; the next PATCH gets one that has.
+                # An error answer to HEAD has no body with a reason; the next PATCH gets one.
                 return parsed(head, _offset_of, head) if head.is_success else start
 
 
@@ -242,7 +241,7 @@ def _report_piece(submission: Submission, sent_before: int, sent_bytes: int) -> 
 
 
 def _form(submission: Submission, boundary: str) -> Body:
-    """multipart/form-data with the options and all files, never in memory as a whole."""
+    """multipart/form-data with the options and all files, never whole in memory."""
     texts = {**submission.texts, **submission.labels, "options": json.dumps(submission.options)}
     if "metadata" in texts:
         texts["metadata"] = json.dumps(texts["metadata"])
@@ -270,7 +269,7 @@ def _form(submission: Submission, boundary: str) -> Body:
 
 
 def _read(part: str, path: Path, start: int, end: int) -> Iterator[bytes]:
-    """The bytes of a file from start to end, and no others, even if the file has grown meanwhile."""
+    """The bytes of a file from start to end, even if the file has grown meanwhile."""
     with _readable(part, path), path.open("rb") as file:
         file.seek(start)
         while start < end:

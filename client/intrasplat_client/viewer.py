@@ -1,4 +1,4 @@
-"""One connection for many views of a scene: faster than a request each, and the newest wins."""
+"""One connection for many views of a scene: faster than a request each. Only the newest request is answered."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class StreamMessages:
         return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
-        """The view that was asked for last; None for the answer to an earlier request.
+        """The view of the last request; None for the answer to an earlier request.
 
         Raises:
             IntrasplatError: the service's refusal.
@@ -72,7 +72,7 @@ class StreamMessages:
 
 
 class Viewer:
-    """Client.stream(): use it as a context. One thread at a time may use it."""
+    """The result of Client.stream(), a context manager. One thread at a time may use it."""
 
     def __init__(self, messages: StreamMessages) -> None:
         from websockets.sync.client import connect
@@ -124,7 +124,8 @@ class Viewer:
 
 
 class AsyncViewer:
-    """AsyncClient.stream(): an asynchronous context. One task at a time may use it; asyncio only."""
+    """The result of AsyncClient.stream(), an asynchronous context manager. One task at a time may use it; asyncio
+    only."""
 
     def __init__(self, messages: StreamMessages) -> None:
         self._messages = messages

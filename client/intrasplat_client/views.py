@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 NPY = "application/x-npy"
 LENGTH_BYTES = 4
-"""A message of the stream begins with the length of its head, a number of this size."""
+"""Size of the number at the start of a stream message: the length of its head."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PictureCamera:
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any] | None) -> PictureCamera | None:
-        """As the service writes it; None: the service is too old to say."""
+        """The camera in the service's JSON; None: the service is too old to send it."""
         if document is None:
             return None
         known = {each.name: document[each.name] for each in fields(cls)}
@@ -50,8 +50,8 @@ class PictureCamera:
 class Image:
     """A rendered view: the encoded file, and what it shows.
 
-    state is "running" for a view of a job that still trains; iteration is then the step that is shown. unseen is the
-    share of the view that no training frame saw, and camera the picture's; None: the service is too old to say.
+    state is "running" for a view of a job that still trains; iteration is then the step of the snapshot. unseen is the
+    share of the view that no training frame saw, and camera the picture's; None: the service is too old to send them.
     """
 
     content: bytes
@@ -67,16 +67,16 @@ class Image:
     camera: PictureCamera | None = None
 
     def array(self) -> NDArray[Any]:
-        """The values of a view asked for with format="npy".
+        """The values of a view requested with format="npy".
 
         Raises:
-            InputError: it is of another format.
+            InputError: the view has another format.
             ImportError: numpy is not installed.
         """
         if self.media_type != NPY:
             raise InputError("format", f"this render is {self.media_type}.", 'Ask for it with format="npy".')
         try:
-            import numpy as np  # nothing else needs it
+            import numpy as np  # only this method needs it
         except ImportError as error:
             raise ImportError("Arrays need numpy: pip install 'intrasplat-client[numpy]'.") from error
 
@@ -95,14 +95,14 @@ def view_query(
     highlights: str | None,
     camera: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The parameters of a view, as GET /render and the messages of the stream have them."""
+    """The parameters of a view for GET /render and for messages of the stream."""
     values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
     shown = {"unseen": unseen, "highlights": highlights}
     return {name: value for name, value in {**values, **shown, **camera}.items() if value is not None}
 
 
 async def render(session: Session, query: Mapping[str, Any], known: Image | None) -> Image:
-    """One view; `known` itself if it is still what the service would send."""
+    """One view; `known` itself if it is still up to date."""
     headers = {"If-None-Match": known.etag} if known is not None and known.etag is not None else {}
     response = await session.request(Call("GET", "/render", query, headers, is_repeatable=True))
     if response.status_code == httpx.codes.NOT_MODIFIED and known is not None:
@@ -137,7 +137,7 @@ def _duration_ms(server_timing: str, name: str) -> float | None:
 
 
 def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatError]:
-    """The request's id, and the view or the error that the stream answers with."""
+    """The request's id, and the view or the error in an answer of the stream."""
     try:
         if isinstance(message, str):
             document = json.loads(message)

@@ -1,7 +1,7 @@
 """Shows a scene to OpenIGTLink peers: picture, depth, camera and status at one moment and pose, and the surface.
 
-Views are asked for only while a peer is there, one after the other, each of the newest moment and pose. While nothing
-changes, the service is asked every CHECK_S whether the scene is still there; it answers without a picture.
+Views are requested only while a peer is connected, one after the other, each at the newest moment and pose. While
+nothing changes, the bridge checks every CHECK_S that the scene still exists; the service answers without a picture.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ SurfaceWhen = Literal["standing", "always", "never"]
 CHECK_S = 5.0
 RETRY_S = 1.0
 FAREWELL_S = 3.0
-"""How long the last messages may take."""
+"""How long sending the last messages may take."""
 LOOK_S = 0.02
-"""How often a clip that plays is looked at for its next frame."""
+"""How often to check a playing clip for its next frame."""
 LOOK_AROUND_S = 1.0
-"""The median depth and the confidence are measured at the clip's own size, in which confidence is calibrated, when the
-pose changes and at most so often."""
+"""Minimum interval between measurements of median depth and confidence. They are measured when the pose changes, at the
+clip's own size, for which confidence is calibrated."""
 GONE = (NotFound, Unauthorized, Forbidden)
-"""What no waiting mends: the scene is deleted, or the key may not see it."""
+"""Permanent errors: the scene is deleted, or the key may not view it."""
 AWAY = (ServiceUnavailable, ServiceFault)
-"""What may pass."""
+"""Errors that may be temporary."""
 
 
 @dataclass(frozen=True)
 class ShownChoice:
-    """What the user chose. width: of the picture in pixels; None: the clip's."""
+    """The user's choices. width: of the picture in pixels; None: the clip's."""
 
     scene: str
     width: int | None = None
@@ -66,7 +66,7 @@ class ShownChoice:
 
 @dataclass(frozen=True)
 class _PeerView:
-    """What is asked for: a frame, and a pose as the API has it; None: the endoscope's own."""
+    """A requested view: a frame, and a pose in the API's form; None: the endoscope's own."""
 
     frame: int
     pose: str | None
@@ -74,7 +74,7 @@ class _PeerView:
 
 @dataclass(frozen=True)
 class _Shown:
-    """What peers have: a view, its picture and camera, and the depth in mm at which it is placed."""
+    """What peers show: a view, its picture and camera, and the depth in mm at which it is placed."""
 
     view: _PeerView
     image: Image
@@ -97,7 +97,7 @@ class Bridge:
         """Show the scene until `end` is set.
 
         Raises:
-            IntrasplatError: the scene is gone, or the key may not see it.
+            IntrasplatError: the scene is gone, or the key may not view it.
         """
         ended = await first_ended(self._show(), self._surfaces(), _until(end))
         errors = [error for task in ended if (error := task.exception()) is not None]
@@ -106,7 +106,7 @@ class Bridge:
             raise errors[0]
 
     def _hear(self, heard: messages.Heard) -> None:
-        """A peer's pose or command."""
+        """Handle a peer's pose or command."""
         if heard.device == self._choice.pose_device and heard.matrix is not None:
             try:
                 self._pose = _checked(turned(heard.matrix))
@@ -141,7 +141,7 @@ class Bridge:
         self.link.send(messages.STATUS, messages.text(messages.STATUS, self._status.words()))
 
     async def _show(self) -> None:
-        """Pictures, one after the other."""
+        """Send pictures, one after the other."""
         while True:
             wanted = await self._next_view()
             try:
@@ -152,7 +152,7 @@ class Bridge:
                 await asyncio.sleep(RETRY_S)
 
     async def _next_view(self) -> _PeerView:
-        """The view that is wanted, once a peer is there and it is a new one; or the one that is shown, to check it."""
+        """Wait for a peer and a new view. Returns that view, or the shown one when it is time to check the scene."""
         since_s = time.monotonic()
         while True:
             self._woken.clear()
@@ -167,7 +167,7 @@ class Bridge:
                     await self._woken.wait()
 
     async def _show_view(self, wanted: _PeerView) -> None:
-        """Render a view and send it with what belongs to it; nothing if it is the one that was sent."""
+        """Render a view and send it with camera, depth and status; nothing if it is unchanged."""
         before = self._shown
         known = before.image if before is not None and before.view == wanted else None
         image = await self._render(wanted, "rgb", self._choice.width, known)
@@ -187,7 +187,7 @@ class Bridge:
         self._moment.set()
 
     async def _plane_mm(self, view: _PeerView, camera: PictureCamera) -> float:
-        """Where the picture is placed: the median depth of what is seen. Also measures the confidence."""
+        """The depth in mm at which the picture is placed: the median of the seen pixels. Also measures confidence."""
         before = self._shown
         is_new = before is None or before.camera.world_from_camera != camera.world_from_camera
         if before is not None and not is_new and time.monotonic() - self._looked_at_s < LOOK_AROUND_S:
@@ -214,7 +214,7 @@ class Bridge:
         self.link.send(device, await asyncio.to_thread(messages.image, device, values, place))
 
     async def _surfaces(self) -> None:
-        """Surfaces, one after the other: of the moment that stands, or also of those that play."""
+        """Send surfaces, one after the other: of a paused moment, or also of the frames that play."""
         sent: int | None = None
         while self._choice.surface != "never":
             await self._moment.wait()
@@ -235,7 +235,7 @@ class Bridge:
         await asyncio.Event().wait()
 
     async def _send_surface(self, frame: int) -> None:
-        """Send a frame's surface, or say why there is none."""
+        """Send a frame's surface, or report why there is none."""
         try:
             content = await self._client.export(self._choice.scene, self._playback.t_of(frame), format="mesh-ply")
             surface = await asyncio.to_thread(SurfaceMesh.of_ply, content)
@@ -249,7 +249,7 @@ class Bridge:
         self._tell()
 
     async def _farewell(self, error: BaseException | None) -> None:
-        """Tell peers why nothing more comes; the picture of a scene that they may not see any more turns black."""
+        """Tell peers why the bridge ends. The picture of a scene that they may no longer see becomes black."""
         self._status.ended = "The bridge was ended." if error is None else str(error)
         if isinstance(error, GONE) and self._shown is not None:
             camera = self._shown.camera
@@ -265,7 +265,7 @@ def _camera_of(image: Image) -> PictureCamera:
     """The picture's camera.
 
     Raises:
-        SceneError: an older service does not tell it.
+        SceneError: an older service does not send it.
     """
     if image.camera is None:
         raise SceneError("The service does not tell the camera of its pictures; it is older than this program.")
@@ -273,7 +273,7 @@ def _camera_of(image: Image) -> PictureCamera:
 
 
 def _checked(pose: Matrix) -> str:
-    """The pose as the API has it: 12 numbers, row-major world_from_camera in mm.
+    """The pose in the API's form: 12 numbers, row-major world_from_camera in mm.
 
     Raises:
         InputError: it is not rigid, not finite or too far away.
@@ -284,7 +284,7 @@ def _checked(pose: Matrix) -> str:
 
 
 def _time_of(words: str) -> float | None:
-    """0.4 of t=0.4."""
+    """The time in a command such as t=0.4."""
     name, _, value = words.partition("=")
     try:
         t = float(value)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 18944
 PATIENCE_S = 2.0
-"""A call is repeated so long before peers are told that the service does not answer."""
+"""How long a call is repeated before the bridge reports to peers that the service does not answer."""
 MAX_DEVICE_CHARACTERS = 20
 
 
@@ -103,7 +103,7 @@ async def _run(options: argparse.Namespace, choice: ShownChoice, end: threading.
 
 
 async def _carry(bridge: Bridge, options: argparse.Namespace) -> None:
-    """Listen for peers, or reach the one that listens."""
+    """Listen for peers, or connect to a peer that listens."""
     if options.connect:
         say(f"connecting to OpenIGTLink at {options.host}:{options.port}")
         await bridge.link.reach(options.host, options.port)

@@ -1,7 +1,7 @@
-"""Our frames in Slicer's: where points, cameras and pictures of a scene lie in RAS, mm.
+"""Converts our coordinate frames to Slicer's: points, cameras and pictures of a scene in RAS, mm.
 
-Our world, and every camera, has OpenCV's axes (x right, y down, z forward). They are taken for LPS axes (x to the left,
-y to the posterior, z to the superior), so RAS is (-x, -y, z), as it is of the files that Slicer reads as LPS.
+Our world, and every camera, has OpenCV's axes (x right, y down, z forward). They are taken as LPS axes (x to the left,
+y to the posterior, z to the superior), so RAS is (-x, -y, z), as for the files that Slicer reads as LPS.
 
 Symbols: H W pixels (row i, column j), D depth of the plane on which a picture is shown (mm).
 """
@@ -16,24 +16,24 @@ from intrasplat_client.views import PictureCamera
 Matrix = NDArray[np.float64]
 
 RAS_FROM_WORLD: Matrix = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""A half turn about z, and its own inverse."""
+"""A rotation by 180 degrees about z, which is its own inverse."""
 
 SLICE_MM = 1.0
-"""Thickness of a picture, which is a volume of one slice."""
+"""Thickness of a picture, which is a volume of one slice, in mm."""
 
 
 def turned(pose: Matrix) -> Matrix:
-    """A rigid motion [4, 4] of ours as Slicer has it, and one of Slicer's as we have it."""
+    """Convert a rigid motion [4, 4] from our frame to Slicer's, or from Slicer's to ours."""
     return RAS_FROM_WORLD @ pose @ RAS_FROM_WORLD
 
 
 def points_in_ras(points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Points [N, 3] of our world in RAS."""
+    """Convert points [N, 3] from our world to RAS, mm."""
     return points_mm * RAS_FROM_WORLD.diagonal()[:3].astype(np.float32)
 
 
 def world_from_camera(camera: PictureCamera) -> Matrix:
-    """Where a picture was taken from, [4, 4]."""
+    """The pose of a picture's camera, [4, 4], mm."""
     return np.array([*camera.world_from_camera, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
 
 

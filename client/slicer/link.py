@@ -1,6 +1,6 @@
-"""Peers over TCP: each gets the newest message of every device, however slowly it reads.
+"""Connections to peers over TCP. Each peer gets the newest message of every device, however slowly it reads.
 
-pyigtl's own server keeps a queue of messages and drops a peer that is 10 ms late, so the connections are ours.
+pyigtl's own server queues messages and drops a peer that is 10 ms late, so this module has its own connections.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from intrasplat.errors import UnavailableError
 
 MAX_PEERS = 8
 MAX_HEARD_BYTES, MAX_SKIPPED_BYTES = 1 << 16, 1 << 28
-"""Of one message: of a kind that matters, and of another."""
+"""Maximum bytes of a message of a known kind, and of another kind, which is skipped."""
 PIECE_BYTES = 1 << 16
 SEND_TIMEOUT_S = 30.0
-"""A peer that takes this long to take in one message counts as gone."""
+"""A peer that takes this long to receive one message counts as gone."""
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 8.0
-"""Between attempts to reach a peer that listens."""
+"""First and longest pause between attempts to connect to a peer."""
 
 
 class Link:
     """All peers.
 
-    on_heard(message): is called for each transform and text that a peer sends.
-    on_come(): is called when a peer has come.
+    on_heard(message): called for each transform and text that a peer sends.
+    on_come(): called when a peer has connected.
     """
 
     def __init__(self, on_heard: Callable[[Heard], None], on_come: Callable[[], None]) -> None:
@@ -38,24 +38,24 @@ class Link:
 
     @property
     def has_peers(self) -> bool:
-        """Whether anybody is there."""
+        """Whether a peer is connected."""
         return bool(self._peers)
 
     def send(self, device: str, content: bytes) -> None:
-        """Send a message to every peer, now or later, unless a newer one of the device overtakes it."""
+        """Send a message to every peer as soon as possible. A newer message of the same device replaces it."""
         self._newest[device] = content
         for peer in self._peers:
             peer.offer(device, content)
 
     async def flush(self, within_s: float) -> None:
-        """Wait until every peer has taken all, at most so long."""
+        """Wait until every peer has received all messages, at most within_s."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 while any(peer.is_behind for peer in self._peers):
                     await asyncio.sleep(0.02)
 
     async def listen(self, host: str, port: int, on_open: Callable[[int], None]) -> None:
-        """Wait for peers, for ever. on_open(port) is called once they can come; port 0 takes a free one.
+        """Accept peers, for ever. on_open(port) is called once they can connect; port 0 chooses a free one.
 
         Raises:
             UnavailableError: the port cannot be opened.
@@ -73,7 +73,7 @@ class Link:
             self._hang_up()
 
     async def reach(self, host: str, port: int) -> None:
-        """Stay connected to a peer that listens, for ever."""
+        """Connect, and reconnect, to a peer that listens, for ever."""
         pause_s = FIRST_PAUSE_S
         try:
             while True:
@@ -94,7 +94,7 @@ class Link:
             peer.hang_up()
 
     async def _met(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a peer until it goes."""
+        """Serve a peer until it disconnects."""
         host, port = (writer.get_extra_info("peername") or ("somebody", 0))[:2]  # none if it has gone already
         name = f"{host}:{port}"
         if len(self._peers) >= MAX_PEERS:
@@ -114,7 +114,7 @@ class Link:
 
 
 async def first_ended(*work: Coroutine[Any, Any, None]) -> set[asyncio.Task[None]]:
-    """Run the coroutines side by side until one ends, and cancel the others; the tasks that have ended."""
+    """Run the coroutines concurrently until one ends, then cancel the others. Returns the ended tasks."""
     tasks = [asyncio.create_task(each) for each in work]
     try:
         ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -126,7 +126,7 @@ async def first_ended(*work: Coroutine[Any, Any, None]) -> set[asyncio.Task[None
 
 
 class _Peer:
-    """One connection: a task that reads, and one that writes the newest message of each device."""
+    """One connection: one task reads, another writes the newest message of each device."""
 
     def __init__(
         self,
@@ -140,27 +140,27 @@ class _Peer:
         self._is_sending = False
         self._offered = asyncio.Event()
         self._offered.set()
-        writer.transport.set_write_buffer_limits(high=0)  # drain() returns when the system has taken everything
+        writer.transport.set_write_buffer_limits(high=0)  # drain() then waits until the system has all bytes
 
     @property
     def is_behind(self) -> bool:
-        """Whether it has not taken everything yet."""
+        """Whether messages still wait for the peer."""
         return self._is_sending or bool(self._waiting)
 
     def offer(self, device: str, content: bytes) -> None:
-        """Send this as soon as it takes it, in place of what waits of the device."""
+        """Send the message as soon as the peer reads, in place of a waiting one of the same device."""
         self._waiting[device] = content
         self._offered.set()
 
     def hang_up(self) -> None:
-        """End the connection; what it has taken stays readable to the peer."""
+        """Close the connection; the peer can still read what was sent."""
         if self.is_behind:
             self._writer.transport.abort()
         else:
             self._writer.close()
 
     async def serve(self) -> str:
-        """Talk to it until it goes; why it went."""
+        """Serve the peer until it disconnects. Returns why."""
         for task in await first_ended(self._read(), self._write()):
             error = task.exception()
             if isinstance(error, DamagedError):

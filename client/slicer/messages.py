@@ -1,6 +1,6 @@
-"""OpenIGTLink messages, written and read with pyigtl: pictures, transforms, texts and coloured surfaces.
+"""Encodes and decodes OpenIGTLink messages with pyigtl: pictures, transforms, texts and coloured surfaces.
 
-Every message carries the name of a device, of at most 20 characters, which is the name of Slicer's node.
+Every message has the name of a device, at most 20 characters, which is the name of Slicer's node.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ PICTURE, DEPTH, SURFACE = "IntrasplatPicture", "IntrasplatDepth", "IntrasplatSur
 CAMERA, STATUS = "IntrasplatCamera", "IntrasplatStatus"
 """The devices that the bridge sends."""
 POSE, COMMAND = "IntrasplatPose", "IntrasplatCommand"
-"""The devices that it listens to: a TRANSFORM and a STRING."""
+"""The devices that the bridge receives: a TRANSFORM and a STRING."""
 
 HEADER_BYTES = MessageBase.IGTL_HEADER_SIZE
 CRC_AT = 50
-"""Where the header holds the checksum of the body, its last 8 bytes."""
+"""Offset of the body's checksum in the header: its last 8 bytes."""
 VERSIONS = (1, 2)
 MAX_TEXT = 8_000
-"""Characters of a text; the format ends at 65,535 bytes."""
+"""Maximum characters of a text; the format allows 65,535 bytes."""
 
 ATTRIBUTES_AT = 36
-"""Where the body of POLYDATA holds the number of its attributes."""
+"""Offset of the number of attributes in the body of POLYDATA."""
 POINT_SCALARS = 0
 COLOURS_NAME = b"RGB\0"
 
@@ -44,12 +44,12 @@ HEARD = ("TRANSFORM", "STRING")
 
 
 class DamagedError(Exception):
-    """What a peer sends is not OpenIGTLink, or was damaged on its way."""
+    """A peer's message is not OpenIGTLink, or was damaged in transit."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the first HEADER_BYTES of a message say; `fields` are pyigtl's."""
+    """The first HEADER_BYTES of a message, decoded; `fields` are pyigtl's."""
 
     kind: str
     body_bytes: int
@@ -59,7 +59,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Heard:
-    """A message from a peer: a transform [4, 4] as Slicer has it, or a text."""
+    """A message from a peer: a transform [4, 4] in Slicer's frame, or a text."""
 
     device: str
     matrix: Matrix | None = None
@@ -89,7 +89,7 @@ def image(name: str, values: NDArray[np.generic], ras_from_ijk: Matrix) -> bytes
 
 
 def transform(name: str, matrix: Matrix) -> bytes:
-    """TRANSFORM of a rigid motion [4, 4] as Slicer has it."""
+    """TRANSFORM of a rigid motion [4, 4] in Slicer's frame."""
     return _packed(TransformMessage(matrix, device_name=name))
 
 
@@ -104,10 +104,10 @@ def surface(name: str, mesh: SurfaceMesh) -> bytes:
 
 
 def read_header(content: bytes) -> Header:
-    """What a header says.
+    """Decode a header.
 
     Raises:
-        DamagedError: it is none.
+        DamagedError: it is not a header.
     """
     try:
         fields = MessageBase.parse_header(content)
@@ -121,7 +121,7 @@ def read_header(content: bytes) -> Header:
 
 
 def read(header: Header, body: bytes) -> Heard:
-    """A message of a kind in HEARD.
+    """Decode a message of a kind in HEARD.
 
     Raises:
         DamagedError: it is damaged.
@@ -131,7 +131,7 @@ def read(header: Header, body: bytes) -> Heard:
     message = MessageBase.create_message(header.kind)
     try:
         message.unpack(header.fields, body)
-    except Exception as error:  # pyigtl raises whatever its parts do
+    except Exception as error:  # pyigtl raises many types
         raise DamagedError(f"it sent a damaged {header.kind}") from error
     if header.kind == "TRANSFORM":
         return Heard(message.device_name, matrix=np.asarray(message.matrix, np.float64))

@@ -1,4 +1,4 @@
-"""Which frame is shown now: the clip plays in real seconds and begins again, or stands.
+"""Which frame is shown now: the clip plays in real time, in a loop, or is paused.
 
 Symbols: T frames.
 """
@@ -14,7 +14,7 @@ ONLY_FRAME_S = 0.1
 
 
 class Playback:
-    """The moment that is shown. times_s: of the T frames, from the first. t: stand at this model time; None: play."""
+    """The shown moment. times_s: times of the T frames since the first. t: pause at this model time; None: play."""
 
     def __init__(self, times_s: Sequence[float], t: float | None = None) -> None:
         self.times_s = tuple(times_s)
@@ -26,12 +26,12 @@ class Playback:
 
     @property
     def plays(self) -> bool:
-        """Whether time goes on."""
+        """Whether the clip plays."""
         return self._standing is None and self.frame_count > 1
 
     @property
     def duration_s(self) -> float:
-        """Of the clip, its last frame included."""
+        """The duration of the clip, including its last frame."""
         if self.frame_count == 1:
             return ONLY_FRAME_S
         return self.times_s[-1] * self.frame_count / (self.frame_count - 1)
@@ -42,7 +42,7 @@ class Playback:
         return self.frame_after(time.monotonic() - self._begin_s) if self._standing is None else self._standing
 
     def frame_after(self, seconds: float) -> int:
-        """The frame that is shown so long after the clip has begun to play."""
+        """The frame that is shown `seconds` after the clip has started to play."""
         return max(0, bisect.bisect_right(self.times_s, seconds % self.duration_s) - 1)
 
     def t_of(self, frame: int) -> float:
@@ -50,20 +50,20 @@ class Playback:
         return frame / self.frame_count
 
     def pause(self) -> None:
-        """Stay at the frame that is shown."""
+        """Pause at the shown frame."""
         self._standing = self.frame
 
     def play(self) -> None:
-        """Go on from the frame that is shown."""
+        """Play from the shown frame."""
         self._begin_s = time.monotonic() - self.times_s[self.frame]
         self._standing = None
 
     def stand_at(self, t: float) -> None:
-        """Show the frame nearest to a model time and stay there."""
+        """Pause at the frame nearest to a model time."""
         self._standing = min(max(round(t * self.frame_count), 0), self.frame_count - 1)
 
     def note_on(self, t: float) -> str:
-        """What to say of a model time that is asked for; empty where the clip has it."""
+        """A remark on a requested model time; empty if it lies within the clip."""
         if 0 <= t <= 1:
             return ""
         return (

@@ -1,4 +1,4 @@
-"""What the bridge tells on stderr, where its user reads."""
+"""Prints the bridge's messages to stderr."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The text that stands beside the picture in Slicer: what is shown, how far to trust it, what went wrong."""
+"""The text beside the picture in Slicer: what is shown, how far to trust it, what went wrong."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from intrasplat_client.views import Image
 
 
 class Status:
-    """What peers are told.
+    """The status that peers show.
 
-    trouble: why the picture is out of date. refused: what of the peers' wishes was not done, and why. surface: of which
-    frame it is. ended: why nothing more comes. confidence: mean over the view, in [0, 1]; None: it shows nothing.
+    trouble: why the picture is out of date. refused: which request of a peer was refused, and why. surface: the frame
+    of the surface. ended: why the bridge has ended. confidence: mean over the view, in [0, 1]; None: it shows nothing.
     """
 
     def __init__(self, playback: Playback, report: Report) -> None:
@@ -26,13 +26,13 @@ class Status:
         self.confidence: float | None = None
 
     def show(self, image: Image, frame: int, *, follows: bool) -> None:
-        """Note what the picture shows, which is up to date; follows: from a pose that a peer sent."""
+        """Note what the picture shows, which is up to date. follows: its pose came from a peer."""
         self._shown = image, frame, follows
         self._shown_at = time.strftime("%H:%M:%S")
         self.trouble = ""
 
     def words(self) -> str:
-        """All of it, a line each."""
+        """The whole text, one line for each part."""
         confidence = "not known" if self.confidence is None else f"{self.confidence:.0%} on average"
         image = None if self._shown is None else self._shown[0]
         unseen = "" if image is None or image.unseen is None else f"; {image.unseen:.0%} of the view was never seen"

@@ -32,7 +32,7 @@ class SurfaceMesh:
 
     @classmethod
     def of_ply(cls, content: bytes) -> SurfaceMesh:
-        """What an export of the format mesh-ply holds.
+        """Parse an export of the format mesh-ply.
 
         Raises:
             SceneError: it is cut off, or another version wrote it.

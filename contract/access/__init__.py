@@ -1,6 +1,6 @@
-"""A caller's key in, what it may do out, and a line for whoever asks later who did what.
+"""API keys, what each key may do, and the audit log.
 
-`KeyFile` creates, finds and revokes API keys, and `check_keys` refuses a service that others can reach without any
-(keys.py). `AuditLog.append` records an act before it goes on (audit.py). `service_keys` and `worker_keys` encrypt the
-render connection (render_keys.py).
+`KeyFile` creates, finds and revokes API keys. `check_keys` raises if other machines can reach a service without keys
+(keys.py). `AuditLog.append` records an action before it takes place (audit.py). `service_keys` and `worker_keys` give
+the key pairs that encrypt the render connection (render_keys.py).
 """

@@ -1,8 +1,8 @@
-"""The audit log: who did what to which job, one JSON line for each act. Lines are only appended.
+"""The audit log: who did what to which job, one JSON line for each action. Lines are only appended.
 
-A line names keys, tenants and jobs by their ids, and never a file, a person or a picture. It is on disk before the act
-goes on, so an act that cannot be recorded does not happen. A reserve file of zeros shrinks piece by piece when the disk
-is full. Without it, nobody could then look at a scene or delete one.
+A line names keys, tenants and jobs by their ids, and never a file, a person or a picture. It is on disk before the
+action takes place, so an action that cannot be recorded does not happen. When the disk is full, a reserve file of zeros
+shrinks piece by piece to free space for lines. Without the reserve, nobody could then view or delete a scene.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from intrasplat.files.durable import flush
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"
 RESERVE_BYTES = 4 * 2**20
-"""About 18,000 lines."""
+"""The size of the reserve file: about 18,000 lines."""
 RESERVE_PIECE_BYTES = 64 * 2**10
 
 
@@ -86,7 +86,7 @@ def utc_text(at_s: float) -> str:
 class AuditLog:
     """The audit log of one data directory. Any number of processes may append to it.
 
-    It is opened for each line, so it may be moved away at any time, as logrotate does.
+    The file is opened for each line, so logrotate may move it away at any time.
     """
 
     def __init__(self, data_dir: Path) -> None:
@@ -110,7 +110,7 @@ class AuditLog:
                     raise
 
     def fill_reserve(self) -> None:
-        """Fill the reserve file as far as the disk has room now."""
+        """Fill the reserve file as far as the free space on the disk allows."""
         with contextlib.suppress(OSError):
             descriptor = os.open(self._reserve, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
@@ -127,7 +127,7 @@ class AuditLog:
                 line = b"\n" + line  # a crash cut off the last line; this one starts on its own line
             if os.write(descriptor, line) < len(line):
                 with contextlib.suppress(OSError):
-                    os.ftruncate(descriptor, size)  # safe under the lock: nobody else has appended since
+                    os.ftruncate(descriptor, size)  # safe under the lock: no other process has appended since
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(descriptor)
             if size == 0:

@@ -1,11 +1,11 @@
 """API keys: who may do what, kept as hashes in one file that every service of an installation reads.
 
-A key reads isp_<id>_<secret>. The id names it in lists, logs and the audit. The secret is 256 random bits, and the file
-holds only its SHA-256 (no salt and no slow hash, because nobody can guess 256 bits). The file is replaced whole. Every
-service reads it again when it has changed, and so refuses a revoked key at once. A key may expire.
+The text of a key is isp_<id>_<secret>. Lists, logs and the audit log show the id. The secret is 256 random bits. The
+file stores only its SHA-256 (no salt and no slow hash, because nobody can guess 256 bits). The file is replaced whole.
+Every service reads it again when it has changed, and so refuses a revoked key at once. A key may expire.
 
-Earlier versions refuse a file with a field that they do not know, and so let nobody in. What a later one must keep
-beyond the fields of ApiKey goes into a file beside it: which keys were rotated is in keys.rotated.json.
+Earlier versions refuse a file with a field that they do not know, and then accept no key. So a later version stores
+what goes beyond the fields of ApiKey in a second file: keys.rotated.json lists the rotated keys.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SECRET_BYTES = 32
 MAX_LABEL_CHARACTERS = 60
 DAY_S = 24 * 3600.0
 WARN_BEFORE_S = 14 * DAY_S
-"""A key that expires within this time is told to whoever runs the service."""
+"""The metrics and `intrasplat doctor` warn of a key that expires within this time."""
 
 
 class KeyScope(StrEnum):
@@ -90,7 +90,7 @@ def new_key(
     label: str | None = None,
     expires_at_s: float | None = None,
 ) -> tuple[ApiKey, str]:
-    """A key that no file holds yet, and its text, which is kept nowhere.
+    """A new key that is not in a file yet, and its text, which is stored nowhere.
 
     Raises:
         InputError: the tenant, the scopes or the label is not accepted.
@@ -156,7 +156,7 @@ class KeyFile:
         label: str | None = None,
         expires_at_s: float | None = None,
     ) -> tuple[ApiKey, str]:
-        """A new key that is accepted from now on, and its text. Raises as new_key() and add()."""
+        """Create a key that is accepted from now on. Returns it and its text. Raises as new_key() and add()."""
         key, text = new_key(tenant, scopes, label, expires_at_s)
         self.add(key)
         return key, text
@@ -171,10 +171,10 @@ class KeyFile:
             self._write((*keys, key))
 
     def successor(self, key_id: str, expires_at_s: float | None = None) -> tuple[ApiKey, str]:
-        """A new key with that one's tenant, scopes and label, which no file holds yet, and its text.
+        """A new key with the tenant, scopes and label of `key_id`, and its text. The key is not in a file yet.
 
         Args:
-            expires_at_s: of the new key; None: it lasts as long as that one was made to last.
+            expires_at_s: when the new key expires, UNIX time; None: it lasts as long as the old key was created for.
 
         Raises:
             InputError: no key has that id.
@@ -187,8 +187,9 @@ class KeyFile:
         return new_key(key.tenant, key.scopes, key.label, expires_at_s)
 
     def rotate(self, key_id: str, successor: ApiKey, ends_at_s: float) -> ApiKey:
-        """Accept the successor of a key, and let that key end at that UNIX time, unless it does so before: both or
-        neither. Returns the key that ends.
+        """Accept the successor of a key, and let the old key expire at `ends_at_s` (UNIX time) at the latest.
+
+        Both happen, or neither. Returns the old key.
 
         Raises:
             InputError: no key has that id.
@@ -199,7 +200,7 @@ class KeyFile:
             ending = key.ending(ends_at_s)
             rotated = _Rotated(successor=successor.key_id, made_until_s=self._made_until_s(key))
             by_id = {each: kept for each, kept in self._rotated().items() if each in self._by_id} | {key_id: rotated}
-            # First, because a note of a successor that is not there says nothing.
+            # Write the rotation first: an entry whose successor does not exist has no effect.
             replace_file(self._rotated_path, _RotatedKeys(keys=by_id).model_dump_json(indent=1).encode())
             self._write((*(ending if key.key_id == key_id else key for key in keys), successor))
         return ending
@@ -226,7 +227,7 @@ class KeyFile:
         return tuple(self._by_id.values())
 
     def revoke(self, key_id: str) -> ApiKey:
-        """Remove a key, which is refused from now on; the key that it was.
+        """Remove a key, which is refused from now on. Returns the removed key.
 
         Raises:
             InputError: no key has that id.
@@ -238,13 +239,13 @@ class KeyFile:
         return revoked
 
     def expiring(self, now_s: float) -> tuple[ApiKey, ...]:
-        """The keys without a successor that expire within WARN_BEFORE_S after that UNIX time, and have not yet.
+        """The keys without a successor that are valid at `now_s` (UNIX time) and expire within WARN_BEFORE_S of it.
 
         Raises:
             UnavailableError: the file is damaged.
         """
         keys, rotated = self.list(), {}
-        with contextlib.suppress(UnavailableError):  # rather too many are told
+        with contextlib.suppress(UnavailableError):  # without the file, rotated keys are listed too
             rotated = self._rotated()
         there = {key.key_id for key in keys}
         followed = {key_id for key_id, each in rotated.items() if each.successor in there}
@@ -252,7 +253,7 @@ class KeyFile:
         return tuple(key for key in lasting if key.has_expired(now_s + WARN_BEFORE_S))
 
     def find(self, text: str) -> ApiKey | None:
-        """The key that this text belongs to, be it expired; None if there is none. Costs one stat and one hash.
+        """The key with this text, even if it has expired; None if there is none. Costs one stat and one hash.
 
         Raises:
             UnavailableError: the file is damaged; no key is accepted.
@@ -266,7 +267,7 @@ class KeyFile:
         return key
 
     def _refresh(self) -> None:
-        """Read the file if it has changed since it was read last."""
+        """Read the file again if it has changed."""
         try:
             status = self._path.stat()
         except FileNotFoundError:
@@ -303,7 +304,7 @@ class KeyFile:
 
     @contextlib.contextmanager
     def _changing(self) -> Iterator[tuple[ApiKey, ...]]:
-        """The present keys, while this process holds the lock."""
+        """Yield the present keys while this process holds the lock."""
         with disk_errors():
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             with held(self._path.with_name("keys.lock"), "the keys"):
@@ -322,7 +323,7 @@ def check_keys(settings: Settings) -> None:
     """Return if the service has keys, or needs none because only this machine's user may reach it.
 
     Raises:
-        UnavailableError: nobody could get in without a key, and there are none.
+        UnavailableError: every caller needs a key, and there are none.
     """
     if needs_keys(settings) and not KeyFile(settings.data_dir).list():
         at = settings.host if settings.host not in LOOPBACK_NAMES else ", ".join(sorted(settings.hosts))

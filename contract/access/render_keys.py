@@ -1,7 +1,7 @@
-"""Key pairs of the encrypted render connection between services and workers, made from the one secret both are given.
+"""Key pairs of the encrypted render connection between services and workers, derived from their shared secret.
 
-ZeroMQ's CURVE encryption needs a pair of Curve25519 keys on each side. Whoever knows INTRASPLAT_RENDER_SECRET can make
-both pairs, so nothing else has to be handed around. Whoever does not can neither ask a worker nor pass for one.
+ZeroMQ's CURVE encryption needs a pair of Curve25519 keys on each side. Both pairs follow from INTRASPLAT_RENDER_SECRET,
+so no other key has to be distributed. Without the secret, nobody can send a request to a worker or pose as one.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Secrets with which webhooks are signed, one a tenant, and the signature of Standard Webhooks.
+"""Secrets with which webhooks are signed, one per tenant, and the signature of Standard Webhooks.
 
-All are made from INTRASPLAT_WEBHOOK_SECRET, so nothing else is stored. A tenant that knows its own secret can forge no
-webhook for the receiver of another.
+All secrets are derived from INTRASPLAT_WEBHOOK_SECRET, so nothing else is stored. A tenant that knows its own secret
+cannot forge a webhook for the receiver of another tenant.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def tenant_secret(webhook_secret: str, tenant: str) -> str:
 
 
 def signature(secret: str, event_id: str, timestamp_s: int, body: bytes) -> str:
-    """The header webhook-signature: HMAC-SHA-256 of `id.timestamp.body`. timestamp_s: UNIX s of this try."""
+    """The header webhook-signature: HMAC-SHA-256 of `id.timestamp.body`. timestamp_s: time of this attempt, UNIX s."""
     key = base64.b64decode(secret.removeprefix(SECRET_PREFIX))
     signed = hmac.digest(key, f"{event_id}.{timestamp_s}.".encode() + body, hashlib.sha256)
     return f"{SIGNATURE_VERSION},{base64.b64encode(signed).decode()}"

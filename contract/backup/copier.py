@@ -1,4 +1,4 @@
-"""Copies files of a data directory into a backup, with their hashes; a folder that changes as one of its states."""
+"""Copies files of a data directory into a backup, with their hashes. A folder is copied in one consistent state."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from contract.store.local import remove_tree
 from intrasplat.errors import UnavailableError
 
 MAX_TRIES = 10
-"""A folder's files change at most a few times: when its scores, its labels and its thumbnail come."""
+"""A folder's files change only a few times: when its scores, its labels and its thumbnail are added."""
 READ_REMEDY = "Run the backup as the user of the service, and look into the system's log if the disk fails."
 
 State = dict[str, tuple[int, int, int]]
-"""Of a folder: inode, size and time of change (ns) of each file."""
+"""The state of a folder: inode, size and time of change (ns) of each file, by name."""
 
 
 class Copier:
-    """Fills the folder of a backup. Names are paths in both folders, with slashes.
+    """Fills the folder of a backup. Names are paths relative to both folders, with slashes.
 
     Methods raise UnavailableError where the data directory cannot be read, and OSError where the backup cannot be
     written.
@@ -33,16 +33,16 @@ class Copier:
         self._earlier: tuple[Path, Mapping[str, BackedUpFile]] = (target, {})
         self._states: dict[str, State] = {}
         self.files: dict[str, BackedUpFile] = {}
-        """What was copied."""
+        """The copied files, by name."""
         self.linked = 0
-        """How many files are those of an earlier backup."""
+        """How many files are hard links to those of an earlier backup."""
 
     def link_to(self, backup: Path, files: Mapping[str, BackedUpFile]) -> None:
-        """From now on, use the files of an earlier backup that have not changed."""
+        """From now on, link to the files of an earlier backup that have not changed."""
         self._earlier = (backup, files)
 
     def copy(self, name: str) -> None:
-        """Copy one file; nothing if there is none."""
+        """Copy one file, if it exists."""
         path = self._source / name
         try:
             with _reading(path):
@@ -55,11 +55,11 @@ class Copier:
                 self._put(name, _pieces(file.read, path), status.st_mtime_ns)
 
     def write(self, name: str, content: bytes) -> None:
-        """Put a file into the backup that the data directory does not have in this form."""
+        """Write a file into the backup that is not a copy of one in the data directory."""
         self._put(name, iter((content,)), 0)
 
     def copy_folder(self, name: str, marker: str) -> None:
-        """Bring the copy of a folder to its present state. Without its marker it is being removed; so is the copy."""
+        """Update the copy of a folder. A folder without its marker is being removed, so its copy is removed too."""
         for _ in range(MAX_TRIES):
             state = self._state(name)
             if f"{name}/{marker}" not in state:
@@ -77,11 +77,11 @@ class Copier:
         raise UnavailableError(problem, "Look which process writes there; only workers and services may.")
 
     def keep_folders(self, areas: Collection[str], names: Collection[str]) -> None:
-        """Drop the copies of all other folders in these areas."""
+        """Remove the copies of all folders in these areas but those named."""
         self.drop(lambda each: each.split("/")[0] in areas and "/".join(each.split("/")[:2]) not in names)
 
     def drop(self, is_unwanted: Callable[[str], bool]) -> None:
-        """Remove copies again."""
+        """Remove the copies for which `is_unwanted` is true."""
         for name in [name for name in self.files if is_unwanted(name)]:
             remove_tree(self._target / name)
             del self.files[name]
@@ -89,7 +89,7 @@ class Copier:
                 (self._target / name).parent.rmdir()  # the last file of a folder is gone
 
     def _state(self, name: str) -> State:
-        """What a folder holds now, without files that are about to take their place."""
+        """The present state of a folder, without temporary files that are about to be renamed."""
         found: State = {}
         with _reading(self._source / name):
             for path in sorted((self._source / name).rglob("[!.]*")):
@@ -101,7 +101,7 @@ class Copier:
         return found
 
     def _link(self, name: str, status: os.stat_result) -> bool:
-        """Take the file of the earlier backup, if it is of the same size and time, and the file system can."""
+        """Hard-link the earlier backup's file if its size and time are the same; False if that cannot be done."""
         backup, files = self._earlier
         file = files.get(name)
         if file is None or (file.bytes, file.changed_ns) != (status.st_size, status.st_mtime_ns):
@@ -123,7 +123,7 @@ class Copier:
 
 
 def place_for(root: Path, name: str) -> Path:
-    """The path root/name, whose folders are made, for their owner alone. Raises OSError."""
+    """The path root/name. Creates its folders, for their owner alone. Raises OSError."""
     *folders, file = name.split("/")
     for folder in folders:
         root /= folder
@@ -132,7 +132,7 @@ def place_for(root: Path, name: str) -> Path:
 
 
 def write_hashed(target: Path, pieces: Iterator[bytes]) -> tuple[int, str]:
-    """Write a file for its owner alone; its size and SHA-256. Raises OSError."""
+    """Write a file for its owner alone. Returns its size and SHA-256. Raises OSError."""
     digest, size = hashlib.sha256(), 0
     descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
     with open(descriptor, "wb") as file:
@@ -153,7 +153,7 @@ def _pieces(read: Callable[[int], bytes], path: Path) -> Iterator[bytes]:
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Raise an OSError of the body, but FileNotFoundError, as an UnavailableError that names the file."""
+    """Raise an OSError of the body as an UnavailableError that names the file; FileNotFoundError passes unchanged."""
     try:
         yield
     except FileNotFoundError:

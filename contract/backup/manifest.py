@@ -1,4 +1,4 @@
-"""The format of a backup: one folder in the folder of all backups, named by the time at which it was begun.
+"""The format of a backup: one folder in the folder of all backups, named by the time at which the backup started.
 
     DEST/
     ├── .lock                       held while a backup is written
@@ -8,7 +8,7 @@
         ├── jobs.jsonl              a JobRecord a line: ended jobs, then live ones in the order in which they are to run
         └── backup.json             the manifest: size, SHA-256 and time of change of each other file
 
-With a store in a bucket, spool/ and scenes/ are missing: clips and scenes are the bucket's own matter.
+With a store in a bucket, spool/ and scenes/ are missing: the bucket keeps clips and scenes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NAME = re.compile(r"\d{4}-\d\d-\d\dT\d{6}\.\d{3}Z", re.ASCII)
 PIECE_BYTES = 1 << 20
 FOLDERS = frozenset({str(Area.SPOOL), str(Area.SCENES), UNSCORED, PURGING})
 FILES = frozenset({KEYS_FILE, ROTATED_FILE, AUDIT_FILE, "audit.head", JOBS_FILE})
-"""What a backup may hold beside the folders. Builds before 0.3.0 wrote audit.head, which nothing reads now."""
+"""The files that may lie beside the folders. Builds before 0.3.0 wrote audit.head, which nothing reads now."""
 FIELD = "SOURCE"
 ANOTHER = "Restore another backup; this one is not whole."
 
@@ -67,7 +67,7 @@ class Manifest(BaseModel):
     @field_validator("files")
     @classmethod
     def _are_ours(cls, files: dict[str, BackedUpFile]) -> dict[str, BackedUpFile]:
-        """Refuse a path that leads out of the data directory, or to what no backup holds."""
+        """Refuse a path that leads out of the data directory, or that is not part of a backup."""
         for name in files:
             parts = PurePosixPath(name).parts
             is_ours = parts[0] in FOLDERS if len(parts) > 1 else name in FILES
@@ -77,7 +77,7 @@ class Manifest(BaseModel):
 
 
 def finished_backups(folder: Path) -> list[Path]:
-    """The whole backups in the folder of all backups, the newest first."""
+    """The finished backups in the folder of all backups, newest first."""
     names = [each.name for each in folder.iterdir() if NAME.fullmatch(each.name)] if folder.is_dir() else []
     return [folder / name for name in sorted(names, reverse=True) if (folder / name / MANIFEST_FILE).is_file()]
 
@@ -118,7 +118,7 @@ def digest_of(path: Path) -> str:
 
 
 def job_of(name: str) -> str | None:
-    """The id of the job to which a file of a backup belongs; None: to the installation."""
+    """The id of the job to which a file of a backup belongs; None: the file belongs to the installation."""
     parts = PurePosixPath(name).parts
     if len(parts) == 1:
         return None

@@ -1,9 +1,9 @@
 """Fill an empty data directory and an empty queue from a backup.
 
 Files come first, each compared with its hash, then the records. While a file `restoring` lies in the data directory,
-neither service nor worker starts on it. It says which records are being entered into which queue, so that a restore
-that failed or was cut off there can be run again: files are copied anew, and records that the queue has stay. What was
-purged since, as the given audits tell, does not come back; nor do keys that were revoked since.
+neither service nor worker starts on it. That file says which records are being entered into which queue. So a restore
+that failed or was cut off can be run again: it copies the files anew and keeps the records that the queue already has.
+Jobs that were purged after the backup, according to the given audit logs, do not come back; nor do revoked keys.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from intrasplat.files.disk_errors import NO_ROOM
 from intrasplat.files.durable import flush
 
 NO_CONTENT = frozenset({"lost+found"})
-"""What may lie in an empty folder: the root of a disk has it."""
+"""Names that may lie in an empty folder: the root of a disk has lost+found."""
 EMBEDDED_QUEUE = frozenset({"valkey"})
-"""Its server may still run after a restore was killed."""
+"""The embedded queue's folder may exist: its server may still run after a restore was killed."""
 
 
 @dataclass
 class Restored:
-    """What came back. purged: jobs that did not, because they were purged. lost: jobs with neither clip nor scene."""
+    """What was restored. purged: jobs skipped because they were purged. lost: jobs with neither clip nor scene."""
 
     backup: Path
     created_at: str
@@ -81,7 +81,7 @@ class _Entering(BaseModel):
 
 @dataclass(frozen=True)
 class _Since:
-    """What audits tell of the time after a backup, and before."""
+    """What the audit logs report: purged jobs and revoked keys."""
 
     purged: frozenset[str]
     revoked_keys: frozenset[str]
@@ -90,19 +90,19 @@ class _Since:
 def restore_backup(
     settings: Settings, open_queue: AbstractContextManager[Queue], source: Path, audits: Sequence[Path] = ()
 ) -> Restored:
-    """Restore a backup: `source` itself, or the newest in it. All of it is on disk and in the queue when this returns.
+    """Restore a backup: `source` itself, or the newest one in it. When this returns, all is on disk and in the queue.
 
     Args:
         open_queue: entered once the data directory is known to be empty.
-        audits: of the time after the backup.
+        audits: audit logs that cover the time after the backup.
 
     Raises:
         InputError: there is no whole backup, it does not fit the settings, or an audit cannot be read.
         UnavailableError: the data directory or the queue is not empty, cannot be written, or is full; or another
             restore fills them.
 
-    After an error the data directory is empty again, unless it was not empty before, or a queue elsewhere may have some
-    of the records: then the file `restoring` is left, and the same restore goes on when it is run again.
+    After an error the data directory is empty again if it was empty before. If a queue elsewhere may have some of the
+    records, the file `restoring` stays instead, and the same restore continues when it is run again.
     """
     backup = _backup_in(source.expanduser().resolve())
     manifest = read_manifest(backup)
@@ -112,7 +112,7 @@ def restore_backup(
     with _writing(data_dir):
         data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         _check_empty(data_dir)
-        if data_dir.stat().st_uid == os.geteuid():  # else a volume that is its group's, and its modes another's to set
+        if data_dir.stat().st_uid == os.geteuid():  # only the owner may set modes; a volume may belong to its group
             data_dir.chmod(0o700)
         marker, lock = data_dir / RESTORING, FolderLock(data_dir / RESTORING)
         if not lock.take():
@@ -130,7 +130,7 @@ def restore_backup(
                 restored = Restored(backup, manifest.created_at, unreadable=manifest.unreadable)
                 restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
                 records = list(read_jobs(backup))
-                if begun != entering:  # else the queue has records, and the marker must not be empty for a moment
+                if begun != entering:  # when equal, the queue has records, and the marker must never be empty
                     marker.write_text(entering.model_dump_json())
                     flush(marker)
                 _fill_queue(queue, Store(data_dir, settings.store_url), records, since.purged, restored)
@@ -148,7 +148,7 @@ def restore_backup(
 
 
 def _begun(marker: Path) -> _Entering | None:
-    """What an earlier restore was entering when it failed or was cut off; None: nothing yet."""
+    """What an earlier restore was entering into the queue when it failed or was cut off; None: nothing yet."""
     try:
         return _Entering.model_validate_json(marker.read_bytes())
     except ValidationError:
@@ -156,7 +156,7 @@ def _begun(marker: Path) -> _Entering | None:
 
 
 def _check_queue(queue: Queue, begun: _Entering | None, entering: _Entering, backup: Path) -> None:
-    """Refuse a queue that has other records than a restore that goes on has entered."""
+    """Refuse a queue with records other than those that the same restore has already entered."""
     goes_on = begun == entering
     found = queue.records(None, None) if goes_on else queue.records(limit=1)
     own = {record.job_id for record in read_jobs(backup)} if goes_on else set()
@@ -171,7 +171,7 @@ def _check_queue(queue: Queue, begun: _Entering | None, entering: _Entering, bac
 
 
 def _backup_in(source: Path) -> Path:
-    """The backup that is meant."""
+    """The backup to restore: `source` itself, or the newest one in it."""
     if (source / MANIFEST_FILE).is_file():
         return source
     if found := finished_backups(source):
@@ -190,7 +190,7 @@ def _check_store(manifest: Manifest, settings: Settings) -> None:
 
 
 def _since(audits: Sequence[Path]) -> _Since:
-    """What these audits say was purged, or was begun to be, and which keys were revoked."""
+    """The jobs whose purge has started or ended, and the revoked keys, according to these audit logs."""
     told: dict[str, set[str]] = {AuditAction.PURGED: set(), AuditAction.KEY_REVOKED: set()}
     for path in audits:
         for entry in _acts(path):
@@ -201,10 +201,10 @@ def _since(audits: Sequence[Path]) -> _Since:
 
 
 def _acts(audit: Path) -> Iterator[dict[str, str]]:
-    """The entries of an audit, without lines that a crash has cut off.
+    """The entries of an audit log, without lines that a crash has cut off.
 
     Raises:
-        InputError: it cannot be read, or has lines and none is of an audit.
+        InputError: it cannot be read, or it has lines and none is an audit entry.
     """
     line, acts = None, 0
     for line in _lines(audit):
@@ -218,7 +218,7 @@ def _acts(audit: Path) -> Iterator[dict[str, str]]:
 
 
 def _lines(audit: Path) -> Iterator[bytes]:
-    """The lines of an audit, of a compressed one (.gz) too. Raises InputError if it cannot be read."""
+    """The lines of an audit log, which may be compressed (.gz). Raises InputError if it cannot be read."""
     try:
         with gzip.open(audit) if audit.suffix == ".gz" else audit.open("rb") as file:
             yield from file
@@ -228,7 +228,7 @@ def _lines(audit: Path) -> Iterator[bytes]:
 
 
 def _check_empty(data_dir: Path) -> None:
-    """Refuse a folder with anything in it but what a restore has left that failed or was cut off."""
+    """Refuse a folder that is not empty, unless only an unfinished restore's files lie in it."""
     found = sorted(each.name for each in data_dir.iterdir() if each.name not in NO_CONTENT)
     if found and RESTORING not in found:
         problem = f"{data_dir} is not empty: it holds {', '.join(found[:5])}."
@@ -236,7 +236,7 @@ def _check_empty(data_dir: Path) -> None:
 
 
 def _copy_files(backup: Path, manifest: Manifest, data_dir: Path, purged: frozenset[str]) -> None:
-    """Copy all files but those of purged jobs, whose hashes are compared all the same."""
+    """Copy all files but those of purged jobs. The hashes of all files are compared."""
     folders: set[Path] = set()
     for name, file in manifest.files.items():
         target = None
@@ -267,7 +267,7 @@ def _revoke(data_dir: Path, key_ids: frozenset[str]) -> list[str]:
 def _fill_queue(
     queue: Queue, store: Store, records: Sequence[JobRecord], purged: frozenset[str], restored: Restored
 ) -> None:
-    """Give the queue the jobs, in their order. A bucket may hold what was purged since: that is removed from it."""
+    """Enter the jobs into the queue, in their order. Purge from a bucket what was purged after the backup."""
     scenes: Mapping[str, list[int]] = store.finished_scenes()
     clips = set(store.spooled_ids())
     for job_id in sorted(purged & (scenes.keys() | clips)):
@@ -284,7 +284,7 @@ def _fill_queue(
 
 
 def _as_found(record: JobRecord, attempts: Sequence[int], has_clip: bool) -> JobRecord | None:
-    """The record as its files allow: done if its scene is there, else to be run; None without clip and scene."""
+    """The record to enter: done if its scene exists, else queued; None without clip and scene."""
     if record.state in TERMINAL_STATES and record.state is not JobState.DONE:
         return record
     if record.state is JobState.DONE and record.attempt in attempts:
@@ -297,12 +297,12 @@ def _as_found(record: JobRecord, attempts: Sequence[int], has_clip: bool) -> Job
     waits = {"state": JobState.QUEUED, "released": record.attempt, "owner": None, "progress": None}
     waits |= {"started_at_s": None, "finished_at_s": None}
     if record.created_at_s + IDEMPOTENCY_S < time.time():
-        waits["idempotency_key"] = None  # it stands for no job any more, and another may have had it since
+        waits["idempotency_key"] = None  # it has expired, and another job may have used it since
     return record.model_copy(update=waits)
 
 
 def _put(queue: Queue, record: JobRecord) -> JobState:
-    """Enter a job into the queue; its state there."""
+    """Enter a job into the queue. Returns its state there."""
     if record.state in TERMINAL_STATES:
         queue.restore(record)
         return record.state

@@ -1,9 +1,9 @@
-"""Take a backup of an installation while it works.
+"""Take a backup of an installation while it runs.
 
-The order makes it whole: clips and scenes are copied, which may take long; then the queue's
-records are read; then the files once more, which are few by now. So the files of every record are there, unless the job
-was purged meanwhile. A last look at the queue and at the notes of removals tells which jobs those are, and they are
-left out. The audit comes last: it names every removal that had begun.
+The order makes the backup consistent. Clips and scenes are copied first, which may take long; then the queue's records
+are read; then the files that changed meanwhile are copied, which are few. So the files of every record are present,
+unless the job was purged meanwhile. A second read of the queue and of the notes of removals finds such jobs, which are
+skipped. The audit log comes last, so it names every removal that had started.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ COPIED = (Area.SPOOL, Area.SCENES)
 
 @dataclass(frozen=True)
 class Taken:
-    """A finished backup. purged: jobs that were left out because they were removed meanwhile. without_files: jobs that
-    were left out because this machine has neither clip nor scene of them. unreadable: jobs whose records cannot be read
-    and were left out; their files are in the backup."""
+    """A finished backup. purged: jobs skipped because they were removed meanwhile. without_files: jobs skipped because
+    this machine has neither their clip nor their scene. unreadable: jobs whose records cannot be read and are missing;
+    their files are in the backup."""
 
     path: Path
     jobs: Mapping[JobState, int]
@@ -61,15 +61,15 @@ class Taken:
 
 
 def take_backup(settings: Settings, queue: Queue, destination: Path, *, full: bool = False) -> Taken:
-    """Write a backup into a new folder in `destination`. It is whole and on disk when this returns.
+    """Write a backup into a new folder in `destination`. It is complete and on disk when this returns.
 
     Args:
-        full: copy every file; else those that are as in the newest backup there become hard links to its files.
+        full: copy every file; else files that have not changed since the newest backup there become hard links to it.
 
     Raises:
         InputError: the destination lies in the data directory.
         UnavailableError: a file cannot be read, the destination cannot be written or is full, another backup is being
-            written there, or the queue or the audit does not answer. Nothing of the backup is left.
+            written there, or the queue or the audit log does not answer. Nothing of the new backup is left.
     """
     data_dir = settings.data_dir.expanduser().resolve()
     destination = destination.expanduser().resolve()
@@ -99,7 +99,7 @@ def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) ->
     try:
         copier = Copier(settings.data_dir, folder)
         before = [] if full else finished_backups(destination)[:1]
-        with contextlib.suppress(InputError):  # a damaged one lends nothing
+        with contextlib.suppress(InputError):  # no links to a damaged backup
             for backup in before:
                 copier.link_to(backup, read_manifest(backup).files)
         jobs, purged, without_files, unreadable = _copy_all(settings, queue, copier)
@@ -128,8 +128,8 @@ def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) ->
 def _copy_all(
     settings: Settings, queue: Queue, copier: Copier
 ) -> tuple[list[JobRecord], tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Copy what a restore needs; the records in their order, the jobs purged meanwhile, those without files, and those
-    whose records cannot be read."""
+    """Copy what a restore needs. Returns the records in their order, the jobs purged meanwhile, the jobs without files,
+    and the jobs whose records cannot be read."""
     shelf = LocalShelf(settings.data_dir) if settings.store_url is None else None
     _copy_entries(shelf, copier)
     first = {record.job_id: record for record in queue.records(None, None)}
@@ -162,7 +162,7 @@ def _copy_all(
 
 
 def _copy_entries(shelf: LocalShelf | None, copier: Copier) -> None:
-    """Bring the backup's clips and scenes to those that are there now."""
+    """Update the backup's clips and scenes to the present ones."""
     if shelf is None:
         return
     entries = [entry for area in COPIED for entry in shelf.entries(area)]
@@ -172,14 +172,14 @@ def _copy_entries(shelf: LocalShelf | None, copier: Copier) -> None:
 
 
 def _has_files(copier: Copier, record: JobRecord) -> bool:
-    """Whether the backup holds what a record speaks of."""
+    """Whether the backup has the files of a job."""
     clip, scene = ShelfEntry(Area.SPOOL, record.job_id), ShelfEntry(Area.SCENES, record.job_id, record.attempt)
     needed = {JobState.DONE: scene, JobState.CANCELLED: None}.get(record.state, clip)
     return needed is None or f"{needed.area}/{needed.name}/{needed.marker}" in copier.files
 
 
 def _noted(data_dir: Path) -> set[str]:
-    """The jobs whose removal has begun and not ended."""
+    """The jobs whose removal has started and not ended."""
     return {path.name for path in (data_dir / PURGING).glob("*") if is_job_id(path.name)}
 
 

@@ -1,4 +1,4 @@
-"""Jobs in, claims out: the queue that every service and worker shares.
+"""The queue that all services and workers share: services submit jobs, workers claim them.
 
 `Queue` (interface.py) states what submit, claim, beat, finish, fail, release and cancel guarantee. RedisQueue
 implements it. scripts/ holds each atomic change on Redis; claim.lua and beat.lua are the lease. `EmbeddedServer` starts

@@ -1,8 +1,9 @@
-"""The part of the queue that remembers which webhooks are owed (`Deliveries`, a Protocol).
+"""The part of the queue that stores which webhooks have yet to be delivered (`Deliveries`, a Protocol).
 
-A job's end and the delivery that it owes are one step, so neither a killed worker nor a killed service loses one.
-Services lend deliveries that are due. A loan is a lease: if nothing is noted before it runs out, another service is
-lent the delivery. So each is made at least once, and twice only if a service died, or lost the queue, in between.
+A job's end and its delivery are written in one step, so neither a killed worker nor a killed service loses a delivery.
+A service borrows a delivery that is due. A loan is a lease: if the service reports no result before the loan expires,
+another service may borrow the delivery. So each webhook is sent at least once, and twice only if a service died, or
+lost the queue, in between.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from contract.wire.job import JobRecord
 from contract.wire.webhooks import Delivery
 
 LOAN_S = 30.0
-"""Longer than a try takes (service/webhooks.py)."""
+"""The length of a loan; longer than an attempt takes (service/webhooks.py)."""
 
 
 OWED_FOR_S = 26 * 3600.0
-"""A webhook that the queue has lost is owed again, unless its job ended longer ago than tries usually go on."""
+"""A webhook that the queue has lost becomes due again, unless its job ended longer ago than this: attempts have
+usually stopped by then."""
 
 
 @dataclass(frozen=True)
 class Loan:
-    """A delivery that a service is to try now; `mark` tells this loan from earlier and later ones."""
+    """A delivery that a service has to attempt now; `mark` distinguishes this loan from earlier and later ones."""
 
     delivery: Delivery
     url: str
@@ -38,40 +40,40 @@ class Deliveries(Protocol):
     """Every method is atomic, and may be repeated when its answer was lost; all raise UnavailableError."""
 
     def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
-        """The delivery that has been due for longest, which is lent to nobody else for LOAN_S; None if none is due.
+        """Borrow the delivery that has been due for longest, for LOAN_S; None if none is due.
 
-        What cannot be read is given up, and logged once.
+        A delivery that cannot be read is given up, and logged once.
 
-        token: of this call; the same token gets the same delivery again. passed: tenants whose deliveries have to wait.
+        token: identifies this call; the same token gets the same delivery again. passed: tenants to skip for now.
         """
         ...
 
     def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
-        """Keep what became of a loan: the delivery with one more try. False if the loan no longer holds.
+        """Store the result of a loan: the delivery with one more attempt. False if the loan has expired.
 
-        wait_s: until it is due again; None: it is owed no more.
+        wait_s: seconds until it is due again; None: it is finished.
         """
         ...
 
     def send_again(self, record: JobRecord) -> None:
-        """Make the delivery about a job's last end due now, whatever became of it, with its tries forgiven.
+        """Make the delivery about a job's last end due now, whatever its status, and reset its count of attempts.
 
-        It stays as it is while a try is under way, and if the job has gone or gone on meanwhile.
+        Nothing changes during an attempt, or if the job has been removed or queued again meanwhile.
 
-        record: of a job that has ended and has a callback.
+        record: the record of a job that has ended and has a callback.
         """
         ...
 
     def deliveries(self, job_id: str) -> list[Delivery]:
-        """What a job's ends owe and owed, the first end first, without what cannot be read; nothing without a callback.
+        """The deliveries of a job, one per end, oldest first; empty without a callback. Skips what cannot be read.
 
-        While one is lent, it has no next_try_at_s.
+        A delivery on loan has no next_try_at_s.
         """
         ...
 
 
 def delivery_of(document: str) -> Delivery | None:
-    """The delivery in a document of the queue; None if it cannot be read, as one of a later version."""
+    """The delivery in a document of the queue; None if it cannot be read, such as one that a later version wrote."""
     try:
         return Delivery.model_validate_json(document)
     except ValueError:

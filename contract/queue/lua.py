@@ -1,8 +1,8 @@
 """Loads the scripts that change the queue on Redis: contract/queue/scripts/*.lua, one for each atomic change.
 
-Each script goes by the server's clock. When it runs again because its answer was lost, it answers as before and changes
-nothing more. Its first line says whether it may run while the server's memory is full, which those may that bring work
-to its end; its header lists its arguments, the keys it touches, and its answer.
+Each script uses the server's clock. When it runs again because its answer was lost, it gives the same answer and
+changes nothing. Its first line says whether it may run while the server's memory is full: scripts that finish work may.
+Its header lists its arguments, the keys it touches, and its answer.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Scripts:
     """The scripts on one server, for one queue.
 
     Args:
-        prefix: of the queue's keys.
+        prefix: the prefix of the queue's keys.
         lease_s, preempt_after_s: as in contract/queue/interface.py.
     """
 

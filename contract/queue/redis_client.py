@@ -1,4 +1,4 @@
-"""The connection to the queue's server, and its errors with what to do about them."""
+"""The connection to the queue's server, and its errors with their remedies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from contract.runtime.queue_url import VARIABLE, parse_queue_url
 from intrasplat.errors import InputError, UnavailableError
 
 PATIENCE_S = 12.0
-"""How long to try, in all, until the server counts as away."""
+"""How long to retry, in total, before the server counts as unreachable."""
 QUEUE_REMEDY = "See whether its server runs, reachable at REDIS_URL; without REDIS_URL, `intrasplat up` starts it."
 SENTINELS_REMEDY = "See whether one runs, and monitors a server that is up by the name that stands last in REDIS_URL."
 REFUSED_REMEDY = (
@@ -42,12 +42,12 @@ REFUSALS = (
 
 
 def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
-    """A client of that server, or of the one that its Sentinels name whenever a connection is made.
+    """A client of the server at `url`. With Sentinels, each new connection goes to the primary that they name.
 
     It states every default that has changed between releases of redis-py.
 
     Raises:
-        InputError: the URL is of no kind that the queue can be on.
+        InputError: the queue does not support this kind of URL.
     """
     where = parse_queue_url(url)
     timeout_s = patience_s / (RETRIES + 1)
@@ -61,7 +61,7 @@ def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
     try:
         client: Any = primary_of(where, options) if where.sentinels else redis.Redis.from_url(where.url, **options)
         pool = client.connection_pool
-        pool.connection_class(**pool.connection_kwargs)  # connects to nothing, and refuses unknown options
+        pool.connection_class(**pool.connection_kwargs)  # raises for unknown options; opens no connection
     except (ValueError, TypeError) as error:  # its text may quote a part of the password
         remedy = "Write / : @ # % in a password as %2F %3A %40 %23 %25, and check the options after the `?`."
         raise InputError(VARIABLE, "it cannot be read.", remedy) from error
@@ -70,7 +70,7 @@ def connect(url: str, patience_s: float = PATIENCE_S) -> Any:
 
 @contextmanager
 def reachable() -> Iterator[None]:
-    """Raise errors of the connection or the server as UnavailableError with the remedy."""
+    """Raise errors of the connection or of the server as UnavailableError with a remedy."""
     try:
         yield
     except redis.exceptions.AuthenticationError as error:

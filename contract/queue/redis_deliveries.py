@@ -16,7 +16,7 @@ logger = logging.getLogger("intrasplat.queue")
 
 
 class RedisDeliveries:
-    """The part of RedisQueue that is Deliveries."""
+    """The methods of RedisQueue that implement Deliveries."""
 
     def __init__(self, client: Any, scripts: Scripts, prefix: str) -> None:
         self._client = client
@@ -63,5 +63,5 @@ class RedisDeliveries:
 
 
 def _document(delivery: Delivery) -> str:
-    """As it is kept: when it is due stands elsewhere."""
+    """The delivery as stored; the sorted set of its tenant holds the time at which it is due."""
     return delivery.model_dump_json(exclude={"next_try_at_s"})

@@ -14,13 +14,13 @@ EVENT_FIELDS = ("state", "attempt", "released", "owner", "cancel", "progress", "
 """The fields that change. Together with the document and the labels they make the record."""
 
 LABEL_FIELDS = (LABEL_FIELD, METADATA_FIELD)
-"""They change too, and no event has them: whoever removes a text finds it in no earlier event."""
+"""They change too. No event stores them, so a removed text is not left in an earlier event."""
 
 CALLBACK_FIELD = "callback"
-"""Never changes. It stands beside the document for the scripts, and for readers of an earlier version."""
+"""Never changes. It has a field of its own for the scripts, and for readers of an earlier version."""
 
 BESIDE_EVENTS = ("document", CALLBACK_FIELD, *LABEL_FIELDS)
-"""What the record of an event is made of, besides the event."""
+"""The fields that complete the record of an event, besides those of the event itself."""
 
 Model = TypeVar("Model", JobProgress, JobError)
 
@@ -51,7 +51,7 @@ def new_record(record: JobRecord) -> tuple[str, str, str, str]:
 
 
 def label_fields(change: LabelChange) -> dict[str, str]:
-    """The fields of a job's hash that a change of its labels sets; those that become empty are to be removed."""
+    """The fields of a job's hash that a change of its labels sets; the caller removes those that become empty."""
     fields = {LABEL_FIELD: change.label or "", METADATA_FIELD: json.dumps(change.metadata) if change.metadata else ""}
     return {name: fields[name] for name in LABEL_FIELDS if name in change.model_fields_set}
 
@@ -92,5 +92,5 @@ def _changed(fields: Mapping[str, str]) -> dict[str, object]:
 
 
 def _parsed(model: type[Model], document: str | None) -> Model | None:
-    """What a worker reported. One of a later version may tell more than this one knows."""
+    """What a worker reported. Fields that only a later version knows are ignored."""
     return model.model_validate_json(document, extra="ignore") if document else None

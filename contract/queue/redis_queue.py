@@ -97,10 +97,10 @@ WORKERS = PREFIX + "workers"
 OWED = PREFIX + "owed-by"
 
 BLOCK_S = 2.0
-"""How long one read may block. The client notices a cut connection within this and the socket's timeout."""
+"""How long one read may block. The client notices a cut connection within this plus the socket's timeout."""
 
 LEASE_CHECK_S = 0.5
-"""The same while jobs run: a lease that runs out writes nothing that would end the read."""
+"""The same while jobs run: a lease that expires writes nothing that would end the read."""
 
 logger = logging.getLogger("intrasplat.queue")
 
@@ -108,8 +108,8 @@ logger = logging.getLogger("intrasplat.queue")
 class RedisQueue(RedisDeliveries):
     """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
 
-    patience_s: how long, in all, a call waits for a server that does not answer. Who claims needs more than BLOCK_S for
-    each of the client's tries, which is what the default allows.
+    patience_s: how long, in total, a call waits for a server that does not answer. A claim needs more than BLOCK_S for
+    each of the client's attempts; the default allows that.
     lease_s and preempt_after_s are for tests that cannot wait. All clients of one queue must agree on them.
     """
 
@@ -286,7 +286,7 @@ class RedisQueue(RedisDeliveries):
         self._client.close()
 
     def _places(self, index: str, limit: int | None, before: ListingPosition | None) -> list[ListingPosition]:
-        """At most `limit` places of an index, newest first, that come after a place."""
+        """At most `limit` positions of an index, newest first, that follow `before`."""
         if limit == 0:
             return []
         most = -1 if limit is None else limit
@@ -304,7 +304,7 @@ class RedisQueue(RedisDeliveries):
         return bool(self._scripts.run("settle", claim.job_id, claim.owner, claim.attempt, target.value, error))
 
     def _waiting(self, job_ids: list[str]) -> list[Waiting]:
-        """What decides when these jobs, all queued, will be claimed."""
+        """These queued jobs with what decides the order of their claims."""
         with reachable(), self._client.pipeline(transaction=False) as batch:
             for job_id in job_ids:
                 batch.hmget(_job_key(job_id), "tenant", "returned")

@@ -1,4 +1,4 @@
-"""Sentinels are asked which server is the primary; that they refuse is told apart from that they are away."""
+"""Asks Sentinels which server is the primary, and distinguishes a refusal from Sentinels that cannot be reached."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from contract.runtime.queue_url import QueueUrl
 
 
 class SentinelsRefuseError(redis.RedisError):
-    """No Sentinel says where the primary is, and at least one refuses this user or password."""
+    """No Sentinel names the primary, and at least one refuses this user or password."""
 
 
 class Sentinels(Sentinel):
-    """As redis-py's, which takes a refusal for a Sentinel that is away."""
+    """redis-py's Sentinel, which treats a refusal as an unreachable Sentinel; this class does not."""
 
     def discover_master(self, service_name: str) -> tuple[str, int]:
-        """Host and port of the primary, from the first Sentinel that knows one that is up.
+        """Host and port of the primary, from the first Sentinel that knows a live one.
 
         Raises:
             SentinelsRefuseError: none answers, and at least one refuses this user or password.
@@ -48,7 +48,7 @@ class Sentinels(Sentinel):
 
 
 def primary_of(where: QueueUrl, options: dict[str, Any]) -> Any:
-    """A client of the primary. Sentinels share the URL's TLS; `sentinel_username`, `sentinel_password` are for them."""
+    """A client of the primary. Sentinels use the URL's TLS settings, `sentinel_username` and `sentinel_password`."""
     untyped: Any = redis
     told = untyped.connection.parse_url(where.url)
     for name in ("host", "port"):

@@ -1,4 +1,4 @@
-"""The option --data-dir of the commands that work on an installation."""
+"""The option --data-dir of the commands that use an installation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def add_data_dir(parser: argparse.ArgumentParser) -> None:
 
 
 def settings_of(namespace: argparse.Namespace) -> Settings:
-    """The settings of the environment, with the data directory of --data-dir if that is given. Raises InputError."""
+    """The settings of the environment, with the data directory of --data-dir if given. Raises InputError."""
     settings = Settings.from_environment()
     chosen: Path | None = namespace.data_dir
     return settings if chosen is None else settings.model_copy(update={"data_dir": chosen})

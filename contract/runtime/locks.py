@@ -1,4 +1,4 @@
-"""A lock that ends with the process that holds it: one process of a kind for each data directory."""
+"""A file lock that the system releases when its process ends: one process of a kind for each data directory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from intrasplat.errors import UnavailableError
 
 HELD_TIMEOUT_S = 5.0
-"""Whoever holds a lock by held() does so for milliseconds only."""
+"""How long held() waits for the lock. Others hold it for milliseconds only."""
 TRY_PERIOD_S = 0.005
 
 
@@ -45,13 +45,13 @@ class FolderLock:
 
 @contextmanager
 def held(path: Path, what: str) -> Iterator[None]:
-    """The time in which nobody else, no other thread either, holds the lock of this file.
+    """Hold the lock of this file during the context; no other process or thread has it meanwhile.
 
     Args:
-        what: is changed meanwhile, for people.
+        what: what is changed meanwhile, for the error message.
 
     Raises:
-        UnavailableError: somebody else holds it for longer than HELD_TIMEOUT_S.
+        UnavailableError: another process or thread holds it for longer than HELD_TIMEOUT_S.
         OSError: the file cannot be opened.
     """
     lock = FolderLock(path)

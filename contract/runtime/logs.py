@@ -22,7 +22,7 @@ from contract.runtime import traces
 from contract.runtime.settings import Settings
 
 OURS = "intrasplat"
-"""Loggers of this name and below are ours."""
+"""The name of our logger; all our loggers are below it."""
 
 FIELDS = (
     *("request_id", "trace_id", "job_id", "attempt", "stage", "worker"),
@@ -73,7 +73,7 @@ def configure(settings: Settings, process: str) -> None:
 
 
 class TextLines(logging.Formatter):
-    """For people: time, level, process, message, fields."""
+    """Lines for people: time, level, process, message, fields."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class TextLines(logging.Formatter):
 
 
 class JsonLines(logging.Formatter):
-    """For collectors: one JSON object a line."""
+    """Lines for collectors: one JSON object each."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ class JsonLines(logging.Formatter):
 
 
 def message_of(record: logging.LogRecord) -> str:
-    """Our own message on one line; of another library's message the first line of its template."""
+    """Our own message on one line, or the first line of the template of another library's message."""
     if _is_ours(record):
         return " ".join(record.getMessage().split())
     if record.name == "py.warnings":
@@ -116,7 +116,7 @@ def message_of(record: logging.LogRecord) -> str:
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
-    """The fields of a line that are allowed and there; the error's kind if the line tells of one."""
+    """The allowed fields that a line has, and the kind of its error if it reports one."""
     given = {name: getattr(record, name, None) for name in FIELDS} if _is_ours(record) else {}
     given["request_id"] = given.get("request_id") or current_request_id()
     given["trace_id"] = traces.trace_id()

@@ -1,4 +1,4 @@
-"""Records spans (traces.py) by OpenTelemetry's SDK and sends them to a collector by OTLP over HTTP; extra `otel`."""
+"""Records spans (traces.py) with OpenTelemetry's SDK and sends them to a collector by OTLP over HTTP; extra `otel`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from intrasplat.version import version
 
 FLUSH_LOOK_S = 0.01
 AT_EXIT_MS = 2000
-"""How long the end of a process waits for spans that are not sent yet."""
+"""How long a process waits at its end for spans that are not sent yet."""
 
 logger = logging.getLogger("intrasplat.traces")
 
 
 class Recorder:
-    """A tracer, and what sends its spans; the standard OTEL_ variables say where to, how often, and which share."""
+    """A tracer and the sender of its spans. The standard OTEL_ variables set destination, interval and sampling."""
 
     def __init__(self, process: str, instance: str | None = None, exporter: SpanExporter | None = None) -> None:
         told = {"service.name": os.environ.get("OTEL_SERVICE_NAME") or f"intrasplat-{process}"}
@@ -34,12 +34,12 @@ class Recorder:
         provider = TracerProvider(resource=Resource.create(told), shutdown_on_exit=False)
         provider.add_span_processor(self.sender)
         self.tracer = provider.get_tracer("intrasplat", version())
-        logging.getLogger("opentelemetry").setLevel(logging.CRITICAL)  # the sender says it once
+        logging.getLogger("opentelemetry").setLevel(logging.CRITICAL)  # Sender logs a failure once itself
         atexit.register(self.sender.force_flush, AT_EXIT_MS)
 
 
 class Sender(SpanProcessor):
-    """Sends ended spans in batches, in a thread of its own. Nobody waits for it: what finds no room is dropped.
+    """Sends ended spans in batches, in its own thread. It never blocks: spans are dropped when its buffer is full.
 
     The SDK's own processor counts no losses, and starts a thread in every forked child.
     """
@@ -67,7 +67,7 @@ class Sender(SpanProcessor):
             self._hurry.set()
 
     def force_flush(self, timeout_millis: int = 30000) -> bool:
-        """Send what waits now; False if that is not done in time."""
+        """Send the waiting spans now; False if that takes too long."""
         until_s = time.monotonic() + timeout_millis / 1000
         while self._waiting.unfinished_tasks and time.monotonic() < until_s and not self._away:
             self._hurry.set()
@@ -84,7 +84,7 @@ class Sender(SpanProcessor):
                     self._waiting.task_done()
 
     def _batch(self) -> list[ReadableSpan]:
-        """What waits, as much of it as may be sent at once."""
+        """The next waiting spans, at most as many as one request may carry."""
         batch: list[ReadableSpan] = []
         while len(batch) < self._max_batch and not self._waiting.empty():
             batch.append(self._waiting.get_nowait())
@@ -107,6 +107,6 @@ class Sender(SpanProcessor):
 
 
 def _number(variable: str, default: int) -> int:
-    """A whole number above 0 from a variable; the default if it holds something else."""
+    """A whole number above 0 from a variable; the default if the variable has another value."""
     text = os.environ.get(variable, "")
     return int(text) if text.isdecimal() and int(text) > 0 else default

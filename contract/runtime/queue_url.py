@@ -19,9 +19,9 @@ SENTINEL_REMEDY = "Write redis+sentinel://USER:PASSWORD@HOST:26379,HOST:26379/NA
 class QueueUrl:
     """Where the queue is.
 
-    url         of the server; with Sentinels of the first of them, with what else the URL says: user, password, options
-    sentinels   host and port of each; none: the URL names the server itself
-    primary     by which name the Sentinels know the server
+    url         of the server, or of the first Sentinel; with user, password and options
+    sentinels   host and port of each Sentinel; empty: the URL names the server itself
+    primary     the name under which the Sentinels know the server
     """
 
     url: str
@@ -30,10 +30,10 @@ class QueueUrl:
 
 
 def parse_queue_url(url: str) -> QueueUrl:
-    """What REDIS_URL says. No message repeats it, for it may hold a password.
+    """Parse REDIS_URL. No error message repeats it, because it may contain a password.
 
     Raises:
-        InputError: it is of no kind that the queue can be on.
+        InputError: the queue does not support this kind of URL.
     """
     scheme, _, rest = url.partition("://")
     plain = scheme.removesuffix(SENTINEL)

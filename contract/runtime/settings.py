@@ -1,4 +1,4 @@
-"""What a deployment may set, read from the environment. Every process of an installation sees the same values."""
+"""The settings of a deployment, read from the environment. All processes of an installation use the same values."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from intrasplat.names import DeviceName
 GIB = 2**30
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
 OTHER_VARIABLES = frozenset({"API_KEY", "CACHE", "CHAOS_FOLDER", "DATA", "LAST_WORDS", "THREADS", "URL"})
-"""Of commands, tests and processes among themselves."""
+"""INTRASPLAT_ variables that are not settings: commands, tests and processes use them."""
 MISSPELT = 0.75
-"""How alike a name and a setting's are, from 0 to 1, if the one is taken for the other."""
+"""From this similarity on, in [0, 1], a variable's name counts as a misspelt setting."""
 WEBHOOK_HOST_PATTERN = r"(https?://)?([A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\])(:[0-9]{1,5})?"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """Only this machine can reach a service at one of these."""
 
 
 def default_data_dir() -> Path:
-    """Where clips and scenes lie by default: the XDG state directory of this user."""
+    """The default folder of clips and scenes: the XDG state directory of this user."""
     state_home = os.environ.get("XDG_STATE_HOME")
     return (Path(state_home) if state_home else Path.home() / ".local" / "state") / "intrasplat"
 
@@ -52,10 +52,10 @@ def _value(source: Mapping[str, str], variable: str) -> str:
 
 
 def _check_names(source: Mapping[str, str], fields: Collection[str]) -> None:
-    """Return if no variable looks like a misspelt setting; others are ignored, for Kubernetes adds some of its own.
+    """Raise if a variable looks like a misspelt setting. Others are ignored, because Kubernetes adds some of its own.
 
     Raises:
-        InputError: names the first such variable, and the one that is meant.
+        InputError: names the first such variable and the likely setting.
     """
     known = [name.upper() for name in fields]
     settings = {*known, *(f"{name}_FILE" for name in known), *OTHER_VARIABLES}

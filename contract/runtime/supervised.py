@@ -1,4 +1,4 @@
-"""One child process that this process starts, watches, starts again and ends: `Supervised`."""
+"""`Supervised`: one child process that this process starts, watches, restarts and stops."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from intrasplat.machine.processes import die_with_parent
 
 FIRST_PAUSE_S = 0.5
 MAX_PAUSE_S = 30.0
-"""Between the end of a process that was never healthy and the start of the next; the pause doubles each time."""
+"""The longest pause before a process that was never healthy is started again; the pause doubles each time."""
 
 
 @dataclass(frozen=True)
 class ProcessEnd:
-    """How a child ended. pause_s: until the next one starts; 0 when it has started already."""
+    """How a child ended. pause_s: seconds until the next one starts; 0 when it has started already."""
 
     status: int
     cause: str
@@ -39,13 +39,12 @@ class Supervised:
     session of its own: Ctrl-C reaches this process alone, which then ends the child in order.
 
     Args:
-        name: of the child, for messages.
+        name: the child's name in messages.
         command: the program and its arguments.
-        environment: of the child; None: the environment of this process.
-        last_words: the file in which the child leaves the UnavailableError that ended it
-        (intrasplat/commands/exits.py);
-            None: its status alone is looked at.
-        log: the file that receives stdout and stderr; None: the child writes where this process does.
+        environment: the child's environment; None: that of this process.
+        last_words: the file to which the child writes the UnavailableError that ended it
+            (intrasplat/commands/exits.py); None: only its exit status counts.
+        log: the file that receives stdout and stderr; None: the child uses those of this process.
         pipes: connect stdin and stdout to this process. The child is asked to end by closing its stdin, not by SIGTERM.
         dies_with_parent: kill the child when the thread that started it ends (Linux only).
         grace_s: how long the child may take to end before it is killed.
@@ -100,11 +99,11 @@ class Supervised:
         return time.monotonic() - self._started_s
 
     def watch(self) -> ProcessEnd | None:
-        """Start the child unless it runs or a pause lasts; how the last one ended, if that is new. Call it often.
+        """Start the child unless it runs or a pause lasts. Returns how the last one ended, once. Call it often.
 
         Raises:
-            UnavailableError: the child ended because it lacks something, and none was ever healthy. Carries the
-                child's last words. It is not raised for what may come back by itself (may_return).
+            UnavailableError: the child ended because it lacks something, and no child was ever healthy. It is the error
+                that the child wrote. It is not raised for what may come back by itself (may_return).
         """
         ended = self._end_of_process()
         if self._process is None and time.monotonic() >= self._start_at_s:
@@ -112,7 +111,7 @@ class Supervised:
         return ended
 
     def mark_healthy(self) -> None:
-        """Say that the running process works: if it ends, another takes its place at once."""
+        """Mark the running process as healthy: if it ends, the next one starts at once."""
         self._healthy = self._was_healthy = True
         self._pause_s = FIRST_PAUSE_S
 
@@ -126,7 +125,7 @@ class Supervised:
             _close(self._process.stdin)
 
     def kill(self) -> None:
-        """Kill the child and wait until it is gone; watch() then tells how it ended."""
+        """Kill the child and wait until it is gone; watch() then returns how it ended."""
         if self._process is not None:
             self._killed = True
             self._process.kill()
@@ -161,7 +160,7 @@ class Supervised:
         self._healthy = self._killed = False
 
     def _end_of_process(self) -> ProcessEnd | None:
-        """How the process ended, if it has; sets when the next one starts."""
+        """How the process ended, None if it has not. Sets when the next one starts."""
         status = self._process.poll() if self._process else None
         if self._process is None or status is None:
             return None
@@ -180,7 +179,7 @@ class Supervised:
         return ProcessEnd(status, cause, pause_s)
 
     def _raise_if_it_cannot_work(self, lack: UnavailableError | None) -> None:
-        """Raise what the child lacks, unless it may come back; None: the child did not say."""
+        """Raise the child's error, unless what it lacks may come back. lack: None if the child wrote no error."""
         if lack is None:
             problem = (
                 f"The {self.name} ended with status {ExitCode.UNAVAILABLE:d}: something that it needs is not there."

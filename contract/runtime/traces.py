@@ -1,8 +1,8 @@
-"""Spans of requests and jobs, for OpenTelemetry; off unless its variables ask for it.
+"""Spans of requests and jobs, for OpenTelemetry; off unless its environment variables turn them on.
 
-A span holds Attributes: ids, codes, sizes and durations, and nothing of a patient. Of an error it holds the type, for
-texts may name files. While traces are off, every span is INVALID_SPAN, whose methods do nothing. The SDK, which records
-spans and sends them, is an extra; configure() imports it (otlp.py) where traces are on.
+A span has Attributes: ids, codes, sizes and durations, and nothing about a patient. Of an error it records only the
+type, because messages may name files. While traces are off, every span is INVALID_SPAN, whose methods do nothing. The
+SDK, which records and sends spans, is an extra; configure() imports it (otlp.py) when traces are on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TRACEPARENT = "traceparent"
 """The header of W3C Trace Context."""
 NEW = ""
-"""As a parent: the span begins a trace of its own."""
+"""As a parent: the span starts a new trace."""
 
 NAMES = {
     "method": "http.request.method",
@@ -31,7 +31,7 @@ NAMES = {
     "status": "http.response.status_code",
     "host": "server.address",
 }
-"""Attributes that OpenTelemetry has names for; all others have ours."""
+"""Attributes that OpenTelemetry has names for; all others use our names."""
 MAX_CHARACTERS = 200
 
 EXPORTER, DISABLED = "OTEL_TRACES_EXPORTER", "OTEL_SDK_DISABLED"
@@ -44,7 +44,7 @@ logger = logging.getLogger("intrasplat.traces")
 
 
 class Attributes(TypedDict, total=False):
-    """All that a span may hold besides its name and its times."""
+    """The attributes that a span may have."""
 
     request_id: str
     job_id: str
@@ -70,9 +70,9 @@ _recorder: Recorder | None = None
 
 
 def configure(process: str, instance: str | None = None, environment: Mapping[str, str] | None = None) -> None:
-    """Turn traces on if the variables ask for it; a line in the log says so, or why not.
+    """Turn traces on if the environment variables request it. The log says so, or why not.
 
-    process: what it is, such as "service". instance: its name among those of its kind; None: a random one.
+    process: the kind of process, such as "service". instance: its name among those; None: a random one.
     """
     variables = os.environ if environment is None else environment
     if not _is_asked_for(variables):
@@ -94,7 +94,7 @@ def configure(process: str, instance: str | None = None, environment: Mapping[st
 
 
 def use(recorder: Recorder | None) -> None:
-    """Let this recorder make the spans of this process; None: turn traces off."""
+    """Create the spans of this process with this recorder; None: turn traces off."""
     global _recorder
     _recorder = recorder
 
@@ -107,10 +107,10 @@ def begin(
     since_s: float | None = None,
     **attributes: Unpack[Attributes],
 ) -> Span:
-    """A span that has begun; the caller must end it.
+    """Start a span, which the caller must end.
 
-    parent: the traceparent of another span, which may be of another process; one that is not valid counts as NEW.
-    None: the current span of this context. since_s: UNIX s; None: now.
+    parent: the traceparent of another span, maybe in another process; an invalid one counts as NEW. None: the current
+    span of this context. since_s: when the span started, UNIX s; None: now.
     """
     if _recorder is None:
         return INVALID_SPAN
@@ -157,7 +157,7 @@ def fail(span: Span, error: str) -> None:
 
 
 def traceparent() -> str | None:
-    """The name of the current span for another process; None: there is no span."""
+    """The traceparent of the current span, to pass to another process; None: there is no span."""
     carrier: dict[str, str] = {}
     _propagator.inject(carrier)
     return carrier.get(TRACEPARENT)
@@ -175,7 +175,7 @@ def dropped() -> int | None:
 
 
 def flush(timeout_s: float = 2.0) -> None:
-    """Send the spans that wait, before this process ends."""
+    """Send the waiting spans before this process ends."""
     if _recorder is not None:
         _recorder.sender.force_flush(round(timeout_s * 1000))
 
@@ -188,7 +188,7 @@ def _is_asked_for(variables: Mapping[str, str]) -> bool:
 
 
 def _lack(variables: Mapping[str, str]) -> str | None:
-    """What the variables ask for that this program cannot do."""
+    """What the variables request and this program cannot do."""
     exporter = variables.get(EXPORTER, "").strip().lower()
     if exporter not in ("", OTLP):
         return f"{EXPORTER} names another exporter than {OTLP}. Set it to {OTLP}, or to none."

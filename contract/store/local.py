@@ -14,7 +14,7 @@ from intrasplat.files.durable import flush, move_folder, replace_file
 
 
 class LocalShelf:
-    """A Shelf in one data directory, whose folders this makes if need be."""
+    """A Shelf in one data directory. Creates the folders that are missing."""
 
     @disk_errors()
     def __init__(self, data_dir: Path) -> None:
@@ -64,8 +64,8 @@ class LocalShelf:
 
     @disk_errors()
     def folders(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
-        """As entries(), with folders that lack their marker."""
-        # Not by glob: Python keeps each pattern it has seen, and every job would be another.
+        """As entries(), including folders that lack their marker."""
+        # No glob: Python caches each pattern, and every job would add one.
         start = checked(job_id) if job_id is not None else ""
         names = [each.name for each in os.scandir(self.data_dir / area) if each.name.startswith(start)]
         found = [entry for entry in (entry_of(area, name) for name in names) if entry is not None]
@@ -100,7 +100,7 @@ class LocalShelf:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it; nothing if it is not there."""
+    """Remove a file or a folder with its content, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, onerror=_unless_gone)
     else:
@@ -108,12 +108,12 @@ def remove_tree(path: Path) -> None:
 
 
 def _remove_folder(folder: Path, marker: str) -> None:
-    """Remove a folder, its marker first, so that nobody takes the rest for an entry."""
+    """Remove a folder, its marker first, so that the rest does not count as an entry."""
     (folder / marker).unlink(missing_ok=True)
     remove_tree(folder)
 
 
 def _unless_gone(_: object, __: object, failure: tuple[type[BaseException], BaseException, object]) -> None:
-    """For rmtree: ignore what another process has removed meanwhile."""
+    """Error handler of rmtree: ignore what another process has removed meanwhile."""
     if not isinstance(failure[1], FileNotFoundError):
         raise failure[1]

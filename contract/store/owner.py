@@ -1,4 +1,4 @@
-"""Whose a data directory is: what another user writes into it, its service can neither read nor change."""
+"""Checks the owner of a data directory: its service can neither read nor change what another user writes into it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def check_owner(data_dir: Path) -> None:
     owner = os.getuid()
     with contextlib.suppress(FileNotFoundError):
         owner = folder.stat().st_uid
-        if owner == 0:  # a volume may be its group's: then its first folder tells
+        if owner == 0:  # root may own a volume that belongs to a group: then its first folder names the user
             owner = os.getuid()
         with contextlib.suppress(PermissionError):
             owner = (folder / Area.SPOOL).stat().st_uid

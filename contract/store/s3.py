@@ -2,7 +2,7 @@
 
     s3://bucket/prefix/
     ├── spool/<job>/        as on disk; submission.json is written last and removed first: without it there is no clip
-    ├── scenes/<job>.<n>/   as on disk; the same holds of manifest.json
+    ├── scenes/<job>.<n>/   as on disk; manifest.json is likewise written last and removed first
     └── resume/<job>.<n>/   the state from which attempt n can be continued, put there when its worker released the job
 
 The customary AWS_* variables give address and credentials (AWS_ENDPOINT_URL for a server that is not Amazon's). Uploads
@@ -40,18 +40,18 @@ from intrasplat.names import MANIFEST
 from intrasplat.scene.results import listed_files
 
 SEEN_FOR_S = 2.0
-"""How long an entry that was found counts as there. A purge on another machine takes effect with this delay."""
+"""How long an entry that was found counts as present. A purge on another machine takes effect with this delay."""
 
 FOLDERS = {Area.SPOOL: "spool", Area.KEPT: "resume", Area.SCENES: "scenes"}
-"""The areas that a bucket keeps, and what their keys begin with.
+"""The areas that a bucket stores, and the prefixes of their keys.
 
-Of KEPT it keeps the marker alone: a clip is prepared anew in seconds, and its frames are some ten times as large.
+Of KEPT it stores only the marker: a clip is prepared anew in seconds, and its frames are some ten times as large.
 """
 
 CONNECT_TIMEOUT_S = 5
 READ_TIMEOUT_S = 60
 RETRIES = {"mode": "standard", "total_max_attempts": 2}
-"""Callers retry by themselves, or tell their own caller to."""
+"""Few retries here: callers retry themselves, or ask their own caller to."""
 LISTING_PAGE = 1000
 """How many objects S3 lists with one call."""
 
@@ -60,7 +60,7 @@ BUCKET_REMEDY = "Check INTRASPLAT_STORE_URL, the AWS_* variables and the bucket 
 
 @dataclass(frozen=True)
 class Stored:
-    """An object of the bucket. Its key is without the prefix."""
+    """An object of the bucket. The key lacks the prefix."""
 
     key: str
     written_at_s: float
@@ -85,12 +85,12 @@ class Bucket:
         self._call("head_bucket")  # the bucket exists: from here on, "not found" means an object
 
     def put(self, path: Path, key: str) -> None:
-        """Upload a file; the object appears whole or not at all."""
+        """Upload a file; the object appears complete or not at all."""
         with _bucket_errors():
             self._files.put_file(str(path), self._path(key))
 
     def write(self, key: str, content: bytes) -> None:
-        """Make an object of a few bytes."""
+        """Write an object of a few bytes."""
         with _bucket_errors():
             self._files.pipe_file(self._path(key), content)
 
@@ -100,14 +100,14 @@ class Bucket:
             self._files.get_file(self._path(key), str(path))
 
     def read(self, key: str) -> bytes | None:
-        """An object's content; None if it is not there."""
+        """An object's content; None if it does not exist."""
         with _bucket_errors(), contextlib.suppress(FileNotFoundError):
             content: bytes = self._files.cat_file(self._path(key))
             return content
         return None
 
     def holds(self, key: str) -> bool:
-        """Whether the object is there."""
+        """Whether the object exists."""
         with _bucket_errors():
             return bool(self._files.exists(self._path(key)))
 
@@ -163,19 +163,19 @@ def _bucket_errors() -> Iterator[None]:
         yield
     except (OSError, botocore.BotoCoreError, botocore.ClientError) as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
-            raise  # this machine's disk has no room for the copy
+            raise  # this machine's disk has no space for the copy
         problem = f"The bucket does not answer ({type(error).__name__})."
         raise UnavailableError(problem, BUCKET_REMEDY, may_return=True) from error
 
 
 class S3Shelf:
-    """A Shelf in a bucket; `here` keeps this machine's copies."""
+    """A Shelf in a bucket; `here` stores this machine's copies."""
 
     def __init__(self, here: LocalShelf, url: str) -> None:
         self._here = here
         self._bucket = Bucket(url)
         self._seen_s: dict[ShelfEntry, float] = {}
-        """When, on the monotonic clock, an entry was last known to be there."""
+        """When, on the monotonic clock, an entry was last known to exist."""
 
     def put(self, folder: Path, entry: ShelfEntry) -> None:
         self._seen_s.pop(entry, None)
@@ -213,7 +213,7 @@ class S3Shelf:
         if copy is None:
             self._fetch(entry)
             return self._here.get(entry)
-        os.utime(copy)  # tidy() sees that it is in use
+        os.utime(copy)  # shows tidy() that the copy is in use
         return copy
 
     def holds(self, entry: ShelfEntry) -> bool:
@@ -269,14 +269,14 @@ class S3Shelf:
                         self._here.remove(entry.area, entry.job_id, entry.attempt)
 
     def _fetch(self, entry: ShelfEntry) -> None:
-        """Copy the entry to this machine; once more if it does not fit, as its scores may just have been added."""
+        """Copy the entry to this machine. Try again if its hashes differ: its scores may just have been added."""
         try:
             self._fetch_once(entry)
         except SceneError:
             self._fetch_once(entry)
 
     def _fetch_once(self, entry: ShelfEntry) -> None:
-        """Copy the entry to a folder aside, check it, and put it in its place on this machine."""
+        """Copy the entry to a temporary folder, check it, and move it to its path on this machine."""
         aside = self._here.path(ShelfEntry(Area.INCOMING, new_job_id()))
         aside.mkdir(mode=0o700)
         try:
@@ -297,12 +297,12 @@ class S3Shelf:
 
 
 def _key(entry: ShelfEntry) -> str:
-    """What the keys of the entry's files begin with."""
+    """The prefix of the keys of the entry's files."""
     return f"{FOLDERS[entry.area]}/{entry.name}/"
 
 
 def _files_to_put(folder: Path, entry: ShelfEntry) -> list[Path]:
-    """The files that a bucket keeps of the entry, the marker last."""
+    """The files of the entry that a bucket stores, the marker last."""
     if entry.area is Area.KEPT:
         return [folder / entry.marker]
     files = sorted(path for path in folder.rglob("*") if path.is_file())

@@ -1,4 +1,4 @@
-"""Where a store keeps clips and scenes: `Shelf`, on the disk (local.py) or in a bucket (s3.py)."""
+"""`Shelf`: where a store keeps clips and scenes, on the disk (local.py) or in a bucket (s3.py)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Protocol
 from intrasplat.names import JOB_ID_PATTERN, MANIFEST, RESUME, SUBMISSION
 
 ABANDONED_AFTER_S = 24 * 3600.0
-"""What has not changed for this long belongs to a process that has ended."""
+"""A file that has not changed for this long is assumed to belong to a process that has ended."""
 
 
 class Area(StrEnum):
-    """What kind of entry it is; each kind has a folder of this name."""
+    """The kind of an entry; each kind has a folder of this name."""
 
     INCOMING = "incoming"
     SPOOL = "spool"
@@ -42,15 +42,15 @@ def new_job_id() -> str:
 
 
 def is_job_id(text: str) -> bool:
-    """Whether `text` may be a part of a path in the store."""
+    """Whether `text` is a job id and so safe as part of a path in the store."""
     return re.fullmatch(JOB_ID_PATTERN, text) is not None
 
 
 def checked(job_id: str) -> str:
-    """The id itself.
+    """Return the id if it is safe as part of a path.
 
     Raises:
-        ValueError: it is not one of ours, so it must not become a part of a path.
+        ValueError: it is not a job id.
     """
     if not is_job_id(job_id):
         raise ValueError(f"not a job id: {job_id!r}")
@@ -59,7 +59,7 @@ def checked(job_id: str) -> str:
 
 @dataclass(frozen=True)
 class ShelfEntry:
-    """The name of a folder in the store; ValueError if job_id is none. attempt: None in INCOMING and SPOOL."""
+    """The name of a folder in the store. attempt: None in INCOMING and SPOOL. Raises ValueError for a bad job_id."""
 
     area: Area
     job_id: str
@@ -90,7 +90,7 @@ def entry_of(area: Area, name: str) -> ShelfEntry | None:
 
 @dataclass(frozen=True)
 class Removed:
-    """How many files and bytes a removal took away, by the place they were in."""
+    """How many files and bytes a removal deleted, by their location."""
 
     files: dict[str, int]
     bytes: dict[str, int]
@@ -104,42 +104,42 @@ def _sum(first: dict[str, int], second: dict[str, int]) -> dict[str, int]:
 
 
 class Shelf(Protocol):
-    """Keeps entries for every process of an installation; an entry is there with all of its files or not at all.
+    """Stores entries for every process of an installation. An entry exists with all of its files or not at all.
 
-    All methods raise UnavailableError when the disk or the bucket cannot do what is asked.
+    All methods raise UnavailableError when the disk or the bucket fails.
     """
 
     def put(self, folder: Path, entry: ShelfEntry) -> None:
-        """Keep a folder of this machine as the entry, in place of an earlier one; the folder moves to path(entry).
+        """Store a folder of this machine as the entry, replacing an earlier one; the folder moves to path(entry).
 
-        After an error the entry is not there, and the folder is where it was.
+        After an error the entry does not exist, and the folder is where it was.
         """
         ...
 
     def put_files(self, entry: ShelfEntry, names: Sequence[str]) -> None:
-        """Keep these files of the entry's folder on this machine in place of the entry's own, one after the other.
+        """Replace these files of the entry by those in its folder on this machine, one after the other.
 
-        names: not all of the entry's. An entry that has been removed, or is being removed, does not come back.
+        names: some of the entry's files. An entry that has been removed, or is being removed, does not come back.
         """
         ...
 
     def put_text(self, entry: ShelfEntry, name: str, content: bytes) -> None:
-        """Keep one small file of the entry, which is not its marker, in place of an earlier one.
+        """Store one small file of the entry, replacing an earlier one; not its marker.
 
         Nothing happens if the entry has been removed, or is being removed.
         """
         ...
 
     def get(self, entry: ShelfEntry) -> Path | None:
-        """The entry's folder on this machine, fetched if need be; None if there is no such entry.
+        """The entry's folder on this machine, downloaded if necessary; None if there is no such entry.
 
         Raises:
-            SceneError: what was fetched is not what was put.
+            SceneError: the downloaded files differ from their hashes.
         """
         ...
 
     def holds(self, entry: ShelfEntry) -> bool:
-        """Whether the entry is there."""
+        """Whether the entry exists."""
         ...
 
     def read_marker(self, entry: ShelfEntry) -> bytes | None:
@@ -151,17 +151,17 @@ class Shelf(Protocol):
         ...
 
     def entries(self, area: Area, job_id: str | None = None) -> list[ShelfEntry]:
-        """The entries of an area, of one job or of all, in the order of their names and attempts."""
+        """The entries of an area, of one job or of all, ordered by name and attempt."""
         ...
 
     def remove(self, area: Area, job_id: str, attempt: int | None = None) -> Removed:
-        """Remove a job's entries in an area, also incomplete ones; only that of `attempt` if it is given."""
+        """Remove a job's entries in an area, incomplete ones too; only that of `attempt` if it is given."""
         ...
 
     def drop_copy(self, entry: ShelfEntry) -> None:
-        """Say that this machine needs the entry no more; the entry itself stays."""
+        """Declare that this machine no longer needs its copy; the entry itself stays."""
         ...
 
     def tidy(self) -> None:
-        """Remove what interrupted processes have left, and copies that nobody uses."""
+        """Remove what interrupted processes have left, and unused copies."""
         ...

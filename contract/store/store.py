@@ -5,7 +5,7 @@
     ├── spool/<job>/        an accepted clip: clip.mp4, calibration.json, ..., submission.json (the first JobRecord),
     │                       and labels.json if its caller has labelled the job
     ├── work/<job>.<n>/     what attempt n has written of its scene so far
-    ├── kept/<job>.<n>/     what goes on from attempt n: resume.safetensors, and prepared/, the clip with depth
+    ├── kept/<job>.<n>/     what a later attempt resumes from: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
     │                       and, of a clip whose masks were found, masks.zip, recorded.zip; thumbnail.jpg once asked for
@@ -13,10 +13,10 @@
     ├── run/                sockets of live workers
     └── valkey/             the embedded queue's log
 
-A folder in spool/ or scenes/ that is there is complete. The job's record in the queue says which attempt's scene is THE
-scene of the job. An attempt writes only to folders of its own number, and removes those of earlier attempts; the one
-that the queue has accepted removes all others. So a worker that was thought dead cannot damage a later attempt. Only
-its owner can read the data directory.
+A folder in spool/ or scenes/ is always complete. The job's record in the queue says which attempt's scene is THE scene
+of the job. An attempt writes only to folders of its own number, and removes those of earlier attempts; the attempt that
+the queue has accepted removes all others. So a worker that was assumed dead cannot damage a later attempt. Only its
+owner can read the data directory.
 
 Every method raises UnavailableError when the disk is full (StoreFullError), read-only, missing or failing, and when the
 bucket does not answer.
@@ -47,16 +47,16 @@ from intrasplat.scene.results import RESULTS, add_scores
 
 UNSCORED = "unscored"
 PURGING = "purging"
-"""Of notes, each named by a job whose removal has begun and not ended (service/purge.py)."""
+"""The folder of notes, each named by a job whose removal has started and not ended (service/purge.py)."""
 RESTORING = "restoring"
-"""A file that is there while a data directory is filled from a backup: it is not whole yet."""
+"""A file that exists while a data directory is being filled from a backup."""
 
 
 def open_store(settings: Settings) -> Store:
     """The store that the settings name.
 
     Raises:
-        UnavailableError: the data directory cannot be made or was not restored to its end, the bucket does not answer,
+        UnavailableError: the data directory cannot be created or its restore is unfinished, the bucket does not answer,
             or the package for buckets is not installed.
     """
     if (settings.data_dir.expanduser() / RESTORING).exists():
@@ -78,25 +78,25 @@ class Store:
 
     @property
     def run_dir(self) -> Path:
-        """Where live workers put their sockets."""
+        """The folder of live workers' sockets."""
         return self.data_dir / "run"
 
     @disk_errors()
     def free_bytes(self) -> int:
-        """How much room is left on the data directory's disk."""
+        """Free space on the data directory's disk, bytes."""
         return shutil.disk_usage(self.data_dir).free
 
     # what comes in
 
     @disk_errors()
     def open_incoming(self, job_id: str) -> Path:
-        """A new empty folder to receive an upload."""
+        """Create an empty folder for an upload."""
         folder = self.incoming_folder(job_id)
         folder.mkdir(mode=0o700)
         return folder
 
     def incoming_folder(self, job_id: str) -> Path:
-        """Where the upload of that id lies, or would lie."""
+        """The folder of the upload with that id, which need not exist."""
         return self._here.path(ShelfEntry(Area.INCOMING, job_id))
 
     @disk_errors()
@@ -105,13 +105,13 @@ class Store:
         remove_tree(self.incoming_folder(job_id))
 
     def accept(self, record: JobRecord) -> None:
-        """Make an upload an accepted clip, which survives a crash and a loss of power when this returns.
+        """Turn an upload into an accepted clip. When this returns, the clip survives a crash and a power failure.
 
         After an error nothing is accepted, and the upload is still there.
         """
         folder, clip = self.incoming_folder(record.job_id), ShelfEntry(Area.SPOOL, record.job_id)
         with disk_errors():
-            # A reader of an earlier version refuses fields that it does not know.
+            # An earlier version that reads this file refuses fields that it does not know.
             absent = {"labels"} if record.callback_url else {"labels", "callback_url"}
             (folder / SUBMISSION).write_text(record.model_dump_json(indent=1, exclude=absent))
             if record.labels != Labels():
@@ -125,34 +125,34 @@ class Store:
         return [entry.job_id for entry in self._shelf.entries(Area.SPOOL)]
 
     def submission(self, job_id: str) -> JobRecord | None:
-        """The record with which a clip was accepted; None if it is gone, or cannot be read as one."""
+        """The record with which a clip was accepted; None if it does not exist or cannot be read."""
         content = self._shelf.read_marker(ShelfEntry(Area.SPOOL, job_id))
         with contextlib.suppress(ValidationError):
             return JobRecord.model_validate_json(content) if content is not None else None
         return None
 
     def labels(self, job_id: str) -> Labels:
-        """What the caller has written on a job; nothing if its clip is gone, or if it cannot be read."""
+        """The labels of a job; empty if its clip is gone or they cannot be read."""
         content = self._shelf.read(ShelfEntry(Area.SPOOL, job_id), LABELS)
         with contextlib.suppress(ValidationError):
             return Labels.model_validate_json(content) if content is not None else Labels()
         return Labels()
 
     def keep_labels(self, job_id: str, labels: Labels) -> None:
-        """Put other labels into the spool; nothing happens if the clip is gone."""
+        """Replace a job's labels in the spool; nothing happens if the clip is gone."""
         self._shelf.put_text(ShelfEntry(Area.SPOOL, job_id), LABELS, labels.model_dump_json().encode())
 
     def labelled_submission(self, job_id: str) -> JobRecord | None:
-        """submission(), with the labels that the job has now."""
+        """submission() with the job's present labels."""
         record = self.submission(job_id)
         return record and record.model_copy(update={"labels": self.labels(job_id)})
 
     def spool_folder(self, job_id: str) -> Path:
-        """Where the job's clip lies, or would lie, on this machine."""
+        """The folder of the job's clip on this machine, which need not exist."""
         return self._here.path(ShelfEntry(Area.SPOOL, job_id))
 
     def fetch_clip(self, job_id: str) -> Path:
-        """The folder with the job's clip, which is downloaded if need be.
+        """The folder with the job's clip, downloaded if necessary.
 
         Raises:
             UnavailableError: there is no such clip.
@@ -165,10 +165,7 @@ class Store:
     # attempts
 
     def work_folder(self, job_id: str, attempt: int) -> Path:
-        """An empty folder for the scene of one attempt.
-
-        Those of earlier attempts are removed; a later attempt's is not touched.
-        """
+        """Create an empty folder for the scene of one attempt. Removes those of earlier attempts, not later ones."""
         folder = self._here.path(ShelfEntry(Area.WORK, job_id, attempt))
         with disk_errors():
             remove_tree(folder)
@@ -178,7 +175,7 @@ class Store:
         return folder
 
     def kept_folder(self, job_id: str, attempt: int) -> Path:
-        """The folder for what goes on from an attempt, with the newest that this or an earlier one has kept.
+        """The folder from which a later attempt resumes, with the newest state that this or an earlier attempt stored.
 
         The folders of earlier attempts are removed; a later attempt's is not touched.
         """
@@ -199,7 +196,7 @@ class Store:
     def hand_over(self, job_id: str, attempt: int) -> None:
         """Let an attempt on any machine continue from this one's resume state; call it before releasing the job.
 
-        On this machine nothing has to be done for that, and a prepared clip stays on it.
+        A store on this machine's disk needs nothing for that. A prepared clip stays on this machine.
         """
         entry = ShelfEntry(Area.KEPT, job_id, attempt)
         if self._here.holds(entry):
@@ -218,21 +215,21 @@ class Store:
 
     @disk_errors()
     def expect_scores(self, worker_name: str, job_id: str, attempt: int) -> None:
-        """Remember that the worker is to score a scene that it publishes."""
+        """Note that the worker has to score a scene that it publishes."""
         folder = self.data_dir / UNSCORED / worker_name
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         replace_file(folder / ShelfEntry(Area.SCENES, job_id, attempt).name, b"")
 
     @disk_errors()
     def unscored(self, worker_name: str) -> list[tuple[str, int]]:
-        """Job and attempt of the scenes that the worker is to score."""
+        """Job and attempt of the scenes that the worker has to score."""
         folder = self.data_dir / UNSCORED / worker_name
         names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
         found = (entry_of(Area.SCENES, name) for name in names)
         return [(entry.job_id, entry.attempt) for entry in found if entry is not None and entry.attempt is not None]
 
     def add_scores(self, worker_name: str, job_id: str, attempt: int, report: Report) -> None:
-        """Put the scored report into a published scene. One that has been removed stays so."""
+        """Put the scored report into a published scene. A removed scene does not come back."""
         entry = ShelfEntry(Area.SCENES, job_id, attempt)
         if (folder := self._shelf.get(entry)) is not None:
             with disk_errors(), contextlib.suppress(FileNotFoundError):
@@ -242,7 +239,7 @@ class Store:
 
     @disk_errors()
     def expect_no_scores(self, worker_name: str, job_id: str, attempt: int) -> None:
-        """Forget expect_scores()."""
+        """Remove the note of expect_scores()."""
         name = ShelfEntry(Area.SCENES, job_id, attempt).name
         (self.data_dir / UNSCORED / worker_name / name).unlink(missing_ok=True)
 
@@ -255,19 +252,19 @@ class Store:
         report, entry = self._report(job_id, attempt), ShelfEntry(Area.SCENES, job_id, attempt)
         if report.scored or self._here.read_marker(entry) == self._shelf.read_marker(entry):
             return report
-        self._shelf.drop_copy(entry)  # another machine has added the scores to the bucket's since it was made
+        self._shelf.drop_copy(entry)  # the copy is older than the scores that another machine has added in the bucket
         return self._report(job_id, attempt)
 
     def _report(self, job_id: str, attempt: int) -> Report:
         path = self.scene_folder(job_id, attempt) / REPORT
         try:
-            # a worker of a later version may tell more than this one knows
+            # a worker of a later version may report fields that this version does not know
             return Report.model_validate_json(path.read_bytes(), extra="ignore")
         except (OSError, ValidationError) as error:
             raise SceneError(f"The report of scene {job_id} cannot be read ({type(error).__name__}).") from error
 
     def scene_folder(self, job_id: str, attempt: int) -> Path:
-        """The folder of the attempt's finished scene, which is downloaded if need be.
+        """The folder of the attempt's finished scene, downloaded if necessary.
 
         Raises:
             SceneError: the scene does not exist, or the bucket's copy is damaged.
@@ -278,7 +275,7 @@ class Store:
         return folder
 
     def thumbnail(self, job_id: str, attempt: int) -> bytes | None:
-        """The small picture that is kept of the attempt's scene; None if there is none yet.
+        """The stored thumbnail of the attempt's scene; None if there is none yet.
 
         Raises:
             SceneError: the scene does not exist, or the bucket's copy is damaged.
@@ -289,23 +286,23 @@ class Store:
         return None
 
     def keep_thumbnail(self, job_id: str, attempt: int, content: bytes) -> None:
-        """Keep a small picture beside a published scene, with which it is removed. One that is gone stays so."""
+        """Store a thumbnail in a published scene. A removed scene does not come back."""
         entry = ShelfEntry(Area.SCENES, job_id, attempt)
         if (folder := self._shelf.get(entry)) is not None:
             with self._keeping, disk_errors(), contextlib.suppress(FileNotFoundError, FileExistsError):
-                replace_file(folder / THUMBNAIL, content)  # another process may be about to keep the same
+                replace_file(folder / THUMBNAIL, content)  # another process may write the same file now
                 self._shelf.put_files(entry, (THUMBNAIL,))
 
     def has_scene(self, job_id: str, attempt: int) -> bool:
-        """Whether the attempt's scene is there."""
+        """Whether the attempt's scene exists."""
         return self._shelf.holds(ShelfEntry(Area.SCENES, job_id, attempt))
 
     def scene_attempts(self, job_id: str) -> list[int]:
-        """The attempts whose scenes are there. There may be several until remove_other_attempts()."""
+        """The attempts whose scenes exist. There may be several until remove_other_attempts()."""
         return [entry.attempt for entry in self._shelf.entries(Area.SCENES, job_id) if entry.attempt is not None]
 
     def finished_scenes(self) -> dict[str, list[int]]:
-        """The attempts whose scenes are there, by job, of all jobs; see scene_attempts()."""
+        """The attempts whose scenes exist, by job; see scene_attempts()."""
         found: dict[str, list[int]] = {}
         for entry in self._shelf.entries(Area.SCENES):
             if entry.attempt is not None:
@@ -313,7 +310,7 @@ class Store:
         return found
 
     def published_attempt(self, job_id: str) -> int | None:
-        """The last attempt whose scene is there; None if there is no scene. For a job whose record was lost."""
+        """The last attempt whose scene exists; None if there is no scene. For a job whose record was lost."""
         return max(self.scene_attempts(job_id), default=None)
 
     def remove_attempt(self, job_id: str, attempt: int) -> None:
@@ -322,14 +319,14 @@ class Store:
             self._shelf.remove(area, job_id, attempt)
 
     def remove_failed(self, job_id: str, attempt: int) -> None:
-        """Remove what this attempt and earlier ones of a failed job have left on this machine."""
+        """Remove the files of this attempt and earlier ones of a failed job on this machine."""
         for area in (Area.WORK, Area.KEPT, Area.SCENES):
             for entry in self._here.folders(area, job_id):
                 if entry.attempt is not None and entry.attempt <= attempt:
                     self._shelf.remove(area, job_id, entry.attempt)
 
     def has_left_work(self, job_id: str) -> bool:
-        """Whether work on the job lies on this machine, or a state that an attempt could go on from."""
+        """Whether this machine has work on the job, or a state from which an attempt could resume."""
         return any(self._here.folders(area, job_id) for area in (Area.WORK, Area.KEPT))
 
     def remove_other_attempts(self, job_id: str, attempt: int) -> None:
@@ -363,7 +360,7 @@ class Store:
         for area in Area:
             removed += self._shelf.remove(area, job_id)
         with disk_errors():
-            # no pattern with the id in it, for Python remembers hundreds of patterns
+            # no pattern with the id in it, because Python caches hundreds of patterns
             for path in (each for each in (self.data_dir / UNSCORED).glob("*/*") if each.name.startswith(f"{job_id}.")):
                 path.unlink(missing_ok=True)
         left = sum(len(self._here.folders(area, job_id)) for area in Area)
@@ -372,10 +369,10 @@ class Store:
         return removed
 
     def tidy(self) -> None:
-        """Remove what belongs to processes that have ended.
+        """Remove the files of processes that have ended.
 
-        That is uploads and unpacked clips that have not changed for ABANDONED_AFTER_S, the rest of interrupted
-        removals, and copies that are out of use or whose original is gone.
+        These are uploads and unpacked clips that have not changed for ABANDONED_AFTER_S, the rest of interrupted
+        removals, unused copies, and copies whose original is gone.
         """
         with disk_errors():
             for path in [*(self.data_dir / Area.INCOMING).iterdir(), *(self.data_dir / Area.WORK).glob("tmp-*/*")]:
@@ -386,7 +383,7 @@ class Store:
         self._shelf.tidy()
 
     def _fetch_resume(self, job_id: str, attempt: int) -> None:
-        """Bring the resume state here that an earlier attempt handed over, if none as new lies here."""
+        """Download the resume state that an earlier attempt handed over, unless this machine has one as new."""
         here = [entry.attempt for entry in self._here.entries(Area.KEPT, job_id) if entry.attempt is not None]
         for entry in reversed(self._shelf.entries(Area.KEPT, job_id)):
             if entry.attempt is not None and entry.attempt < attempt:
@@ -395,6 +392,6 @@ class Store:
                 return
 
     def _earlier(self, area: Area, job_id: str, attempt: int) -> list[ShelfEntry]:
-        """The folders of earlier attempts on this machine, the newest first."""
+        """The folders of earlier attempts on this machine, newest first."""
         found = self._here.folders(area, job_id)
         return [entry for entry in reversed(found) if entry.attempt is not None and entry.attempt < attempt]

@@ -1,1 +1,1 @@
-"""Programs that measure: bm_*.py time one thing each, gpu/ checks a GPU, pages/ writes lab/rows/index.md."""
+"""Benchmarks: each bm_*.py measures one thing and prints a table; most also write a CSV file for lab/rows/."""

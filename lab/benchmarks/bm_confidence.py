@@ -46,7 +46,7 @@ MOTIONS = ("still", "breathing", "pull", "cut")
 FITTED_ON = ("still", "cut")
 CLIP, ITERATIONS = "phantom:{}:160x128:24frames:stereo", 200
 PIXELS_FITTED = 20_000
-"""Of a clip, drawn by chance."""
+"""Pixels of each clip that the fit uses, drawn at random."""
 FIELDS = ("clip", "views", "low", "high", "pixels", "confidence", "depth_right", "colour_right", "right")
 LOOKS = dict(zip(MOTIONS, (("#0072B2", "o"), ("#E69F00", "^"), ("#009E73", "s"), ("#D55E00", "D")), strict=True))
 
@@ -86,8 +86,8 @@ def measured(motion: str) -> Iterator[dict[str, Any]]:
 
 
 def evidence_of(run: Trained, rng: np.random.Generator) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Of some pixels that show what was seen: [P, 5] the numbers that confidence is made of, the last one 1, and
-    [P] whether the pixel is right. The two of the Gaussians are blended as logarithms.
+    """The evidence [P, 5] from which confidence is computed (the last column is 1), and [P] whether the pixel is right,
+    at random pixels that show seen tissue. The two values of the Gaussians are blended as logarithms.
     """
     scene, model = run.scene, model_of(run.scene)
     found = trust.logarithms(trust.evidence(model, run.eyes))

@@ -9,7 +9,7 @@ docs/method.md and the lines "Gain" of intrasplat/methods/fast.py are written fr
 The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
 of preparing and training, all cores together, without scoring. Early stopping alone is measured in runs of
 STOPPING_ITERATIONS planned iterations, with it and without. What concerns two eyes is measured on clips of two eyes,
-everything else on clips of one. A clip that is not there is left out.
+everything else on clips of one. A missing clip is skipped.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ FIELDS = (
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#CC79A7", "#D55E00")
 BAR = 0.36
-"""The height of a bar; two stand beside each other."""
+"""The height of a bar; bars come in pairs."""
 
 Row = Mapping[str, str]
 
@@ -105,7 +105,7 @@ def main() -> None:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One training: its name in rows, the preset, how long, whether it may stop early."""
+    """One training: its name in rows, the preset, its length, and whether it may stop early."""
 
     name: str
     preset: Preset
@@ -115,7 +115,7 @@ class PlannedRun:
 
 
 def planned(names: Iterable[str], iterations: int, seeds: int) -> list[PlannedRun]:
-    """The runs that the gains of these departures are made of."""
+    """The runs from which the gains of these departures are computed."""
     runs = []
     for seed in range(seeds):
         runs += [PlannedRun("fast", FAST, iterations, seed), PlannedRun("paper", PAPER, iterations, seed)]
@@ -206,12 +206,12 @@ class Gain:
 
 
 def signed(value: float, digits: int) -> str:
-    """The value with its sign and so many digits."""
+    """The value with its sign and `digits` decimals."""
     return f"{round(value, digits) + 0.0:+.{digits}f}"  # adding 0.0 turns -0.0 into 0.0
 
 
 def gains_of(rows: Sequence[Row], clip: str) -> dict[str, Gain]:
-    """The gains on a clip by departure; those without rows are left out."""
+    """The gains on a clip by departure; departures without rows are skipped."""
     found = {}
     for departure in DEPARTURES:
         name = departure.name

@@ -17,9 +17,9 @@ from lab.phantom import Phantom, PhantomSettings, make_phantom
 
 HEIGHT_PER_WIDTH = 0.8
 ASIDE_MM = 4000.0
-"""From so far beside the endoscope no mirrored light is seen."""
+"""From this far beside the endoscope no mirrored light is seen."""
 GLARES = 0.1
-"""Least brightness that the mirrored light adds to all three colours, of 1."""
+"""A pixel glares if the mirrored light adds at least this much to all three colours, which are in [0, 1]."""
 MOMENTS = (0.0, 0.5)
 
 

@@ -1,4 +1,4 @@
-"""How well is tissue shown that comes into view later, and how well do poses that were found do beside true ones?
+"""How well is tissue rendered that comes into view later, and how good are estimated poses compared with true ones?
 
     python -m lab.benchmarks.bm_keyframes [--motions breathing pull] [--paths still pan ...] [--frames 128] [--seeds 0
         1]
@@ -42,11 +42,11 @@ from lab.phantom import Phantom
 
 HOLDOUT = "every8"
 EVERY = 4
-"""Frames between those in which coverage is judged."""
+"""Coverage is measured in every fourth frame."""
 LEFT_AFTER = 0.25
-"""Of the clip: from a pose so long ago, what is out of view now is judged as tissue that has left."""
+"""Share of the clip: tissue seen from the pose this long ago, and out of view now, counts as tissue that has left."""
 MIN_LEFT_SHARE = 0.05
-"""Of a view, which has to show so much that has left."""
+"""A view is measured if at least this share of it shows tissue that has left."""
 
 
 def main() -> None:
@@ -99,7 +99,7 @@ def measured(opened: OpenClip, poses: str, iterations: int) -> dict[str, object]
 
 
 def seconds(report: Report) -> dict[str, str]:
-    """Of the poses, the tracks, the points and the start."""
+    """Seconds of the stages poses, tracks, points and start."""
     return {name: f"{report.seconds.get(name, 0):.1f}" for name in ("poses_s", "motion_s", "fusion_s", "start_s")}
 
 
@@ -113,9 +113,9 @@ def covered(scene: TrainedScene, opened: OpenClip) -> float:
 
 
 def gone(scene: TrainedScene, phantom: Phantom) -> dict[str, str]:
-    """What the scene shows of tissue that has left the view, and how sure it is. Nothing if too little has left.
+    """Depth error and confidence of tissue that has left the view. Empty if too little has left.
 
-    The lamp went with the camera, so colours are not judged.
+    The lamp moves with the camera, so colours are not compared.
     """
     count, before = scene.frame_count, round(LEFT_AFTER * scene.frame_count)
     found: dict[str, list[float]] = {name: [] for name in ("rest_mm", "gone_mm", "gone_confidence", "confidence")}
@@ -138,7 +138,7 @@ def gone(scene: TrainedScene, phantom: Phantom) -> dict[str, str]:
 def in_view(
     phantom: Phantom, frame: int, depth_mm: NDArray[np.float32], world_from_camera: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """[H, W] whether the endoscope has in view at a frame what another view shows."""
+    """[H, W] whether the endoscope sees, at a frame, the tissue that the pixels of another view show."""
     places = cells_of(
         unproject(np.arange(depth_mm.size), depth_mm.ravel(), phantom.settings.intrinsics, world_from_camera),
         phantom.settings.intrinsics,

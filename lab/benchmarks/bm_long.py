@@ -42,10 +42,10 @@ from lab.phantom import PhantomSettings, make_phantom
 from lab.phantom.writers import write_stereomis_frames
 
 PULL_FRAMES = 250.0
-"""Of a slow pull: 10 s."""
+"""Frames of a slow pull: 10 s."""
 KEY = ("clip", "preset", "iterations")
 WHOLE = ("whole_psnr_db", "whole_right_db")
-"""What the whole clip's scene scores on a part's frames."""
+"""Columns with the scores of the whole clip's scene on a part's frames."""
 STAGES = ("decode", "stereo", "motion", "fusion", "start", "train", "finish", "score")
 SECONDS = ("finish_s", "shrink_s", "score_s")
 FIELDS = (
@@ -82,13 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _alone(path: Path, options: argparse.Namespace, parts: Sequence[range] = ()) -> tuple[Row, list[Score]]:
-    """As measured(), in a new process."""
+    """Run measured() in a new process."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measured, path, options.preset, options.steps_a_frame, parts).result()
 
 
 def measured(path: Path, preset: str, steps_a_frame: int, parts: Sequence[range]) -> tuple[Row, list[Score]]:
-    """Reconstruct and score a clip; what was measured, as a row, and the scores of the held-out frames in each part."""
+    """Reconstruct and score a clip. Returns its row, and the scores of the held-out frames in each part."""
     iterations = steps_a_frame * len(list(path.glob("*l.png")))
     memory = StageMemory()
     hooks = TrainingHooks(on_progress=memory.on_progress)
@@ -131,7 +131,7 @@ def _decibels(value: float | None) -> str:
 
 
 def _drawn(settings: PhantomSettings, cache: Path) -> Path:
-    """The folder of the clip; every core draws some of its frames if it is not there."""
+    """The folder of the clip. If it does not exist, all cores draw its frames."""
     name = f"phantom-{settings.motion}-{settings.width}x{settings.height}-{settings.frames}frames-stereo"
     folder = cache / (name + f"-seed{settings.seed}" * bool(settings.seed))
     if not folder.exists():
@@ -148,7 +148,7 @@ def _draw(settings: PhantomSettings, folder: Path, frames: range) -> None:
 
 
 def _part(clip: Path, part: range) -> Path:
-    """The folder of some of the clip's frames, links to the clip's files."""
+    """A folder with links to some of the clip's frames."""
     folder = clip.with_name(f"{clip.name}-{part.start}to{part.stop}")
     for file in [*clip.glob("*.*"), *clip.glob("masks/*")]:
         if file.name[:6].isdigit() and int(file.name[:6]) not in part:

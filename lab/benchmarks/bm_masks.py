@@ -53,7 +53,7 @@ TELLING = (NoticeCode.MASKS_UNSURE, NoticeCode.NO_INSTRUMENT_MASKED)
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A clip with its own masks, or None if it has none, and with those found; and what finding takes."""
+    """A clip with its own masks (None if it has none), the same with found masks, and the seconds of finding them."""
 
     given: DepthClip | None
     found: DepthClip
@@ -104,7 +104,7 @@ def main() -> None:
 
 
 def _at(u_mm: float, v_mm: float, above_mm: float) -> Callable[..., tuple[NDArray[np.float64], float]]:
-    """An instrument whose tip stays so far above one place of the tissue."""
+    """An instrument whose tip stays above_mm above one point of the tissue."""
     return lambda surface, frame, settings: (surface.point_mm(u_mm, v_mm, 0.0) - (0.0, 0.0, above_mm), 0.2)
 
 
@@ -130,7 +130,7 @@ PLACES: Mapping[str, Callable[[PhantomSettings], dict[str, object]]] = {
     },
     "small": _peeping,
 }
-"""What of the phantom's first instrument is changed, by where it is."""
+"""Changes to the phantom's first instrument, by the name of its position."""
 
 
 def recorded(folder: Path) -> dict[str, ClipPaths]:
@@ -178,7 +178,7 @@ def opened_files(paths: ClipPaths) -> Opened:
 
 @contextmanager
 def finding_timed() -> Iterator[list[float]]:
-    """The processor's seconds of each frame's finding, while the with statement lasts."""
+    """Collect the CPU seconds of finding instruments in each frame, during the context."""
     spent_s: list[float] = []
     find = Finder.__call__
 
@@ -195,7 +195,7 @@ def finding_timed() -> Iterator[list[float]]:
 
 
 def measured(opened: Opened) -> dict[str, object]:
-    """The found masks against the given ones."""
+    """Compare the found masks with the given ones."""
     found = opened.found
     assert found.masks is not None
     used = [i for i in range(found.frame_count) if i not in found.left_out]
@@ -223,7 +223,7 @@ def measured(opened: Opened) -> dict[str, object]:
 
 
 def doubts_of(clip: DepthClip) -> Sequence[Notice]:
-    """What the report of the clip would warn of."""
+    """The warnings of the clip's report."""
     split = sorted(set(training_frames(clip.frame_count, HOLDOUT)) - set(clip.left_out))
     return [*clip.warnings, *clip_warnings(clip, split)]
 
@@ -252,7 +252,7 @@ def compared(opened: Opened, iterations: int) -> dict[str, object]:
 
 
 def trained(clip: DepthClip, truths: Sequence[DepthClip], iterations: int) -> list[Report]:
-    """The report of a model of `clip`, judged on the pixels that are tissue in each of `truths`."""
+    """The report of a model of `clip`, scored on the pixels that are tissue in each of `truths`."""
     options = ReconstructionOptions(holdout=HOLDOUT, iterations=iterations)
     with tempfile.TemporaryDirectory() as folder:
         made = make(ReconstructionRequest(clip, options, device="cpu"), Path(folder), TrainingHooks())

@@ -1,4 +1,4 @@
-"""Are measured distances true within what they state?
+"""Are measured distances true within their stated uncertainties?
 
     python -m lab.benchmarks.bm_measure [--fit] [--scenes DIR] [--csv lab/rows/measure.csv]
 
@@ -53,7 +53,7 @@ CLIPS = {
 FITTED_ON = ("still", "cut")
 SHOWN_FRAMES = (3, 12, 20)
 ORBITS = (None, OrbitPose(yaw_deg=10, pitch_deg=0, zoom=1), OrbitPose(yaw_deg=0, pitch_deg=-12, zoom=1))
-"""None: the endoscope's own pose."""
+"""The poses of the views; None: the endoscope's own pose."""
 POINTS_A_SIDE = 10
 ALLOWED_MM = 0.5
 
@@ -80,7 +80,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class SeenPoint:
-    """The places of one view that are not refused; which of all points they are, and the truth of these.
+    """The measured points of one view that were not refused, their indices, and their true values.
 
     depth_mm [P], paths_mm [T, P, 3]
     """
@@ -93,7 +93,7 @@ class SeenPoint:
 
 
 def trained(clip: str, scenes: Path) -> tuple[TrainedScene, Phantom]:
-    """The scene of a clip, in its folder of scenes, where it is made if it is not there."""
+    """The scene of a clip in the folder of scenes. Trains it if it does not exist."""
     opened = open_source(source_of(f"phantom:{clip}:{FRAMES}frames:stereo"), "every8", TrainingHooks())
     folder = scenes / clip.replace(":", "-")
     if not (folder / MANIFEST).is_file():
@@ -104,7 +104,7 @@ def trained(clip: str, scenes: Path) -> tuple[TrainedScene, Phantom]:
 
 
 def views(scene: TrainedScene, phantom: Phantom) -> Iterator[SeenPoint]:
-    """What is measured: points of a grid in views of several frames and poses."""
+    """Measure the points of a grid in views of several frames and poses."""
     median_mm = MEDIAN_DEPTH_UNITS / scene.units_per_mm
     for frame in SHOWN_FRAMES:
         for orbit in ORBITS:
@@ -119,7 +119,7 @@ def views(scene: TrainedScene, phantom: Phantom) -> Iterator[SeenPoint]:
 
 
 def row_of(clip: str, seen: list[SeenPoint], scene: TrainedScene) -> Row:
-    """Of each view, points are joined in pairs by chance."""
+    """The row of a clip. Distances are those of random pairs of points in each view."""
     rng, errors, sigmas = np.random.default_rng(0), [], []
     for view in seen:
         pairs = rng.permutation(len(view.places))[: len(view.places) // 2 * 2].reshape(-1, 2)
@@ -155,8 +155,8 @@ def depths_of(seen: list[SeenPoint]) -> NDArray[np.float64]:
 
 
 def fit(scenes: Path) -> None:
-    """Print the two factors for which 95 % of the depths lie within two uncertainties, and 68 % within one, as nearly
-    as both can be had: the least pinball losses of both quantiles, each clip alike.
+    """Print the two factors with which 95 % of the depths lie within two uncertainties and 68 % within one. They
+    minimise the sum of both quantiles' pinball losses, with equal weights of the clips.
     """
     clips = []
     for clip in (each for each in CLIPS if each.startswith(FITTED_ON)):
@@ -179,7 +179,7 @@ def fit(scenes: Path) -> None:
 
 
 def parts_of(scene: TrainedScene, seen: list[SeenPoint]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The uncertainties of all places that a pixel of disparity alone and the spread alone would give."""
+    """The uncertainties of all points from one pixel of disparity alone, and from the spread alone."""
     places = [each for view in seen for each in view.places]
     both = np.array([each.uncertainty_mm for each in places])
     only_px = np.array([uncertainty_mm(scene, each.own_depth_mm, 0.0, each.confidence) for each in places])

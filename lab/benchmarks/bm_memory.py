@@ -1,4 +1,4 @@
-"""How much memory each stage of a reconstruction takes at most.
+"""The peak memory of each stage of a reconstruction.
 
     python -m lab.benchmarks.bm_memory [--motion pull] [--frames 150] [--width 640] [--height 512] [--preset fast]
         [--iterations 60 | --budget-s S] [--cache FOLDER] [--csv lab/rows/memory.csv]
@@ -31,11 +31,11 @@ KEY = ("clip", "preset", "limit", "stage")
 FIELDS = (*KEY, "peak_mib", "end_mib", "decoder_mib", "gaussians", "bases", "machine", "commit")
 """peak_mib and end_mib are of this process, in the stage and at its end; decoder_mib is the decoding process's peak."""
 STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-RESET_PEAK = "5"  # what makes the kernel measure the peak anew
+RESET_PEAK = "5"  # written to /proc, it makes the kernel measure the peak anew
 
 
 class StageMemory:
-    """The peak of this process's resident memory in each stage, in MiB; a stage begins with its first report."""
+    """The peak of this process's resident memory in each stage, in MiB. A stage starts with its first report."""
 
     def __init__(self) -> None:
         self.peaks_mib: dict[str, float] = {}
@@ -43,13 +43,13 @@ class StageMemory:
         self._stage = "import"
 
     def on_progress(self, now: Progress) -> None:
-        """A stage's report."""
+        """Handle a stage's report."""
         if now.stage != self._stage:
             self.end_stage()
             self._stage = now.stage
 
     def end_stage(self) -> None:
-        """Note the stage's peak, and begin to measure the next one's."""
+        """Store the stage's peak, and reset it for the next stage."""
         status = dict(line.split(":\t", 1) for line in STATUS.read_text().splitlines() if ":\t" in line)
         peak_mib, end_mib = (int(status[name].split()[0]) / 1024 for name in ("VmHWM", "VmRSS"))
         self.peaks_mib[self._stage] = max(peak_mib, self.peaks_mib.get(self._stage, 0.0))
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _is_of(row: dict[str, str], rows: Sequence[dict[str, object]]) -> bool:
-    """Whether the rows measure the same run anew."""
+    """Whether the rows repeat the run of this row."""
     return all(row[name] == rows[0][name] for name in KEY if name != "stage")
 
 

@@ -48,7 +48,7 @@ POSES_DEG = ((12, 0), (-12, 0), (0, 12), (0, -12), (20, 0), (-20, 0), (0, 20), (
 """Yaw and pitch of the sheet's rows."""
 PICTURE_WIDTH = 320
 MIRRORED = 0.06
-"""Of white: a difference between a highlight here and where the endoscope sees it."""
+"""Brightness (white is 1) by which a highlight here differs from the endoscope's view of the same tissue."""
 EDGE_PX, STEP_MM = 4, 3.0
 
 
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def trained(opened: OpenClip, eyes: Eyes, iterations: int) -> TrainedScene:
-    """The scene of `fast` after so many iterations on one eye or both."""
+    """The scene of `fast` after `iterations` iterations on one eye or both."""
     options = ReconstructionOptions(iterations=iterations, eyes=eyes, holdout=HOLDOUT)
     setup = Setup(opened.clip, split_frames(opened.clip, HOLDOUT), preset_named("fast"), options)
     run = prepare(setup)
@@ -102,7 +102,7 @@ def parts(opened: OpenClip, scene: TrainedScene, views: list[Expected]) -> str:
 
 
 def near_steps(depth_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[H, W] pixels within EDGE_PX of which depth differs by more than STEP_MM."""
+    """[H, W] whether depth within EDGE_PX of a pixel differs by more than STEP_MM."""
     box = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
     return np.asarray(cv2.dilate(depth_mm, box) - cv2.erode(depth_mm, box) > STEP_MM)
 

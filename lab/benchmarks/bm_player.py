@@ -26,7 +26,7 @@ LOADS = 3
 
 
 def views(count: int) -> Iterator[Seen]:
-    """The first is the endoscope's at the start, every fourth its right eye's, every other one hatched."""
+    """Random views. The first is the endoscope's at the start, every fourth the right eye's, every second hatched."""
     random = np.random.default_rng(0)
     yield Seen()
     for number in range(1, count):
@@ -66,7 +66,7 @@ def _load(page: PlayerPage, folder: Path, browser_pid: int) -> None:
 
 
 def _cpu_s(process_id: int) -> float:
-    """CPU seconds of a process and of all that descend from it (Linux)."""
+    """CPU seconds of a process and all its descendants (Linux)."""
     try:
         fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
         tasks = list(Path(f"/proc/{process_id}/task").iterdir())

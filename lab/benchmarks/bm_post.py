@@ -1,4 +1,4 @@
-"""What a caller waits for after POST /reconstruct: the first view, the finished scene, its scores.
+"""How long a caller waits after POST /reconstruct for the first view, the finished scene and its scores.
 
     python -m lab.benchmarks.bm_post [--clip d4d_stereo] [--presets instant fast] [--budget-s S] [--repeats 5] [--shell]
         [--csv lab/rows/post.csv]
@@ -39,7 +39,7 @@ GOOD_DB = 33.0
 LOOK_PERIOD_S = 0.05
 CLOCKS = ("first_view_s", "good_view_s", "done_s", "scored_s")
 EARLY = 0.1
-"""Share of a job in which nobody can tell how long it takes."""
+"""Share of a job at its start in which its duration cannot be estimated."""
 FIELDS = ("clip", "preset", "budget_s", "way", "repeat", *CLOCKS, "eta_off", "psnr_db", "psnr_right_db", "stages",
           "load_1min", "device", "machine", "commit")  # fmt: skip
 
@@ -62,7 +62,7 @@ def main() -> None:
 
         with started_service(folder / "data", folder / "service.log") as client:
             warm = client.wait(client.reconstruct(clip, **files, iterations=3).id)
-            client.report(warm.id)  # no scoring is left to do
+            client.report(warm.id)  # waits until scoring has ended
             for repeat in range(options.repeats):
                 for preset in options.presets:
                     keep(_sent(client, clip, files, preset, options.budget_s) | {"repeat": repeat})
@@ -85,7 +85,7 @@ def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Path]]:
 
 
 def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | None) -> Row:
-    """The clip over HTTP to the warm worker."""
+    """Send the clip over HTTP to the warm worker."""
     row: Row = {"preset": preset, "budget_s": budget_s or "", "way": "http", "load_1min": round(os.getloadavg()[0], 2)}
     chosen = {"preset": preset, **({"budget_s": budget_s} if budget_s else {})}
     start_s = time.perf_counter()
@@ -113,19 +113,19 @@ def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, bu
 
 
 def _look(url: str, job_id: str, start_s: float, row: Row) -> None:
-    """Ask for a view until there is one."""
+    """Request a view until there is one."""
     with Client(url, patience_s=0.0) as viewer:
         while "first_view_s" not in row:
             try:
                 viewer.render(0.0, scene=job_id, pose="orbit:8,0,1", format="jpeg")
-            except (Conflict, ServiceUnavailable):  # it waits, or has nothing to show yet
+            except (Conflict, ServiceUnavailable):  # the job waits, or has no snapshot yet
                 time.sleep(LOOK_PERIOD_S)
             else:
                 row["first_view_s"] = round(time.perf_counter() - start_s, 2)
 
 
 def _run(clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | None, out: Path) -> Row:
-    """The clip through the command line."""
+    """Reconstruct the clip by the command line."""
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     given += ["--preset", preset, *(["--budget-s", str(budget_s)] if budget_s else [])]
     command = [sys.executable, "-m", "intrasplat", "reconstruct", str(clip), *given, "--out", str(out)]

@@ -54,19 +54,19 @@ WIDTH, HEIGHT, GRID_STEP_PX = 640, 512, 2.86
 SPREAD, OPACITY, DEPTH = 0.6, 0.88, 60.0
 BASES = 17
 EYES_APART, EYES_TURNED_DEG = 3.0, 0.04
-"""Units: 4 mm at a depth of 80 mm. So much registration turns a right eye."""
+"""Distance in units (4 mm at a depth of 80 mm), and a typical rotation of the right eye after registration."""
 TIME = 0.4
-RATES = StepRates(*[1e-7] * 13)  # so small that the scene stays what it is
+RATES = StepRates(*[1e-7] * 13)  # so small that the scene does not change
 TARGET_MS = {"render": 1000 / 60, "step": 25.0, "two-eyed step": 45.0}
 PAIR_FMA = {"render": 8, "step": 8 + 15}
-"""Multiply-adds (or single products and sums) for a pixel and a Gaussian it blends: alpha and its ratio, w, T and four
-channels; on the way back the score, B, four channels, dL/dpower and three moments."""
+"""Multiply-adds (or single products and sums) per pixel and blended Gaussian: alpha and its ratio, w, T and four
+channels; in the backward pass the score, B, four channels, dL/dpower and three moments."""
 GAUSSIAN_FMA = {"render": 300, "step": 1000}
-"""Those of a Gaussian's projection, and its way back."""
+"""Multiply-adds of a Gaussian's projection, and of its backward pass."""
 MOVES = {"render": 1, "step": 1 + 6}
-"""Times a parameter is moved: read to deform; by Adam, it and both moments read and written."""
+"""Memory accesses per parameter: read once to deform; Adam reads and writes it and both moments."""
 PIXEL_BYTES = {"render": 5 * 4, "step": 3 + 1 + 4}
-"""The image written; the target read."""
+"""Bytes per pixel: the image is written; the target is read."""
 PARTS = {"place": "project", "bin": "bin", "sort": "sort", "blend": "blend", "carry_back": "project_backward"}
 
 
@@ -125,7 +125,7 @@ def _stored(folder: Path, repeats: int, peak: Row) -> list[Row]:
 
 
 def _against_sizes(repeats: int, peak: Row) -> list[Row]:
-    """Four sizes of image with the same Gaussians on them, then four numbers of Gaussians on the same image."""
+    """Measure four image sizes with the same Gaussians, then four numbers of Gaussians on the same image."""
     rows = []
     for width, height in ((160, 128), (320, 256), (640, 512), (1280, 1024)):
         gaussians, camera = grid_scene(width, height, GRID_STEP_PX * width / WIDTH)
@@ -200,7 +200,7 @@ def measure(
 
 
 def _right_eye(camera: Camera) -> NDArray[np.float64]:
-    """camera_from_world of an eye that lies EYES_APART to the right, turned as a registered eye is."""
+    """camera_from_world of an eye EYES_APART to the right, rotated by EYES_TURNED_DEG."""
     moved, turn = np.array(camera.camera_from_world), np.eye(4)
     moved[0, 3] -= EYES_APART
     turn[:3, :3] = Rotation.from_euler("y", EYES_TURNED_DEG, degrees=True).as_matrix()
@@ -208,7 +208,7 @@ def _right_eye(camera: Camera) -> NDArray[np.float64]:
 
 
 def _floor_ms(work: str, model: CpuModel, blended: float, peak: Row) -> float:
-    """Multiply-adds and bytes of a work over the machine's peaks, one after the other."""
+    """The floor of a work in ms: its multiply-adds and bytes, each divided by the machine's peak, summed."""
     pixels = model.rasterizer.width * model.rasterizer.height
     moved = model.canonical.nbytes + model.opacity_logit.nbytes
     if isinstance(model.motion, LinearMotion):
@@ -223,7 +223,7 @@ def _floor_ms(work: str, model: CpuModel, blended: float, peak: Row) -> float:
 
 
 def _timed(model: CpuModel, call: Callable[[], object], repeats: int) -> tuple[float, float, dict[str, float]]:
-    """Median and least ms of call, median ms of its parts, by wrapping the model's own methods while it runs."""
+    """Median and minimum ms of call, and median ms of its parts, by wrapping the model's methods."""
     spent: dict[str, float] = {}
 
     def wrapped(part: str, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -259,7 +259,7 @@ def _listed(part_ms: dict[str, float], total_ms: float) -> str:
 
 
 def _target(rasterizer: Rasterizer) -> Target:
-    """Noise: every pixel has a gradient."""
+    """A target of noise, so that every pixel has a gradient."""
     pixels = rasterizer.height * rasterizer.stride
     random = np.random.default_rng(0)
     rgb = random.integers(0, 256, 3 * pixels, dtype=np.uint8)
@@ -267,7 +267,7 @@ def _target(rasterizer: Rasterizer) -> Target:
 
 
 def blended_per_pixel(model: CpuModel, view: NDArray[np.float64]) -> float:
-    """Mean number of Gaussians that a pixel takes before it is full, by the contract's rules."""
+    """Mean number of Gaussians that a pixel blends before it is opaque, by the contract's rules."""
     model.project(view, TIME, model.sh_degree)
     raster = model.rasterizer
     transmittance = np.ones((raster.height, raster.width))
@@ -312,7 +312,7 @@ def _read(thread, threads, values, out):  # type: ignore[no-untyped-def]
 
 
 def _peak_rows() -> list[Row]:
-    """Multiply-adds and bytes a second of one thread and of all, printed."""
+    """Measure and print multiply-adds and bytes per second, of one thread and of all."""
     out = np.zeros(thread_count(), np.float32)
     values = np.ones(1 << 26, np.float32)  # 256 MiB: far beyond the caches
     rounds = 2_000_000
@@ -330,7 +330,7 @@ def _peak_rows() -> list[Row]:
 
 
 def _fastest(call: Callable[..., object], *arguments: Any) -> float:
-    """Least seconds of a few calls, after one that compiles."""
+    """Minimum seconds of a few calls, after one that compiles."""
     seconds = []
     for _ in range(6):
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What rasterize() costs beside its own reference and beside gsplat's plain-torch path, on the same Gaussians.
+"""Times rasterize() against its own reference and against gsplat's plain-torch path, on the same Gaussians.
 
     python lab/benchmarks/bm_rasterize.py [--gsplat FOLDER] [--repeats 9] [--csv docs/results/rasterize.csv]
 
@@ -46,7 +46,7 @@ WIDE_PX = 0.9
 """Standard deviation of an average Gaussian as a share of the mean distance between Gaussians on the image."""
 TILE = 16
 MAX_SECONDS = 30.0
-"""No further round of a size begins after this long, once there are three."""
+"""No further round of a size starts after this long, once there are three."""
 FIELDS = (
     "renderer", "gaussians", "width", "height", "forward_ms", "least_forward_ms", "stand_ins_ms", "both_ms",
     "least_both_ms", "clock", "threads", "load_1min", "machine", "commit",
@@ -111,7 +111,7 @@ def random_scene(count: int, width: int, height: int) -> Scene:
 
 
 def by(backend: BackendName) -> Render:
-    """rasterize() with this backend."""
+    """A Render that calls rasterize() with this backend."""
 
     def render(scene: Scene) -> Tensor:
         seen = rasterize(**scene, backend=backend)
@@ -121,7 +121,7 @@ def by(backend: BackendName) -> Render:
 
 
 def measure(scene: Scene, renderers: dict[str, Render], repeats: int, origin: dict[str, object]) -> list[Scene]:
-    """A row a renderer, printed with what its image and gradients differ from those of the reference."""
+    """Measure each renderer and print its row, with its differences in image and gradients from the reference."""
     size = {"gaussians": len(scene["means"]), "width": scene["width"], "height": scene["height"]}
     print(f"\n{size['gaussians']} Gaussians, {size['width']} x {size['height']}")
     cotangent = torch.randn(1, scene["height"], scene["width"], 5, generator=torch.Generator().manual_seed(1))
@@ -155,7 +155,7 @@ def measure(scene: Scene, renderers: dict[str, Render], repeats: int, origin: di
 
 
 def timed(call: Callable[[], object]) -> float:
-    """Seconds that it takes."""
+    """The seconds of a call."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
@@ -172,14 +172,14 @@ def image_and_gradients(render: Render, scene: Scene, cotangent: Tensor) -> list
 
 
 def compared(found: list[Tensor], wanted: list[Tensor]) -> str:
-    """Of the image the largest difference, of the gradients the largest relative norm of one."""
+    """The largest difference of the image, and the largest relative norm of a gradient's difference."""
     image = float((found[0] - wanted[0]).abs().max())
     gradients = [float((a - b).norm() / b.norm()) for a, b in zip(found[1:], wanted[1:], strict=True)]
     return f"image {image:.1e}, gradients {max(gradients):.1e}"
 
 
 def find_gsplat(folder: Path | None) -> ModuleType | None:
-    """The package, or None and a line that says why not."""
+    """The gsplat package, or None after printing why it cannot be used."""
     if folder is not None:
         sys.path.append(str(folder))
     try:
@@ -204,7 +204,7 @@ class GsplatTorch:
         sys.modules["nerfacc"] = nerfacc
 
     def _watched(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, whose time is added to stand_ins_s."""
+        """Wrap a function so that its time is added to stand_ins_s."""
 
         def watched(*arguments: Any, **named: Any) -> Any:
             start = time.perf_counter()

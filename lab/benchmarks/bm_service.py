@@ -1,4 +1,4 @@
-"""What a whole installation answers under load, idle and while a job trains, side by side in one run.
+"""Latency and throughput of a whole installation under load, idle and while a job trains, in one run.
 
     python -m lab.benchmarks.bm_service [--seconds 10] [--queue-stop-s 60] [--upload-gib 1] [--job-only]
         [--csv lab/rows/service.csv]
@@ -56,7 +56,7 @@ CHUNK_BYTES = 1 << 20
 VIDEO = Path(__file__).parents[2] / "tests" / "data" / "stereo_sbs_h264.mp4"
 
 PARTS = ("worker", "service", "viewers")
-"""Whose CPU seconds a second are counted while a job trains."""
+"""Processes whose CPU seconds per second are measured while a job trains."""
 
 Row = dict[str, Any]
 
@@ -123,7 +123,7 @@ def trained(client: Client, clip: PhantomClip, **options: Any) -> str:
 
 
 def wait_for_stage(client: Client, job_id: str, stage: str) -> None:
-    """Until the job has come to the stage."""
+    """Wait until the job has reached the stage."""
     for job in client.watch(job_id):
         if job.stage == stage:
             return
@@ -159,7 +159,7 @@ def _first_view(scene: str) -> Query:
 async def _viewing(
     http: httpx.AsyncClient, query: Query, viewers: int, worker: str, seconds: float, what: str = ""
 ) -> Row:
-    """Each viewer asks again as soon as it is answered."""
+    """Run viewers, each of which sends its next request as soon as it is answered."""
     end_s = time.perf_counter() + seconds
     spent_ms: list[list[float]] = [[] for _ in range(viewers)]
 
@@ -182,7 +182,7 @@ async def _viewing(
 
 
 async def _beside_large(url: str, scene: str, other: str, worker: str) -> list[Row]:
-    """Small views of another scene while six large renders are asked for at once."""
+    """Time small views of another scene during six simultaneous large renders."""
     async with httpx.AsyncClient(base_url=url, timeout=60) as http:
 
         async def view(of: str, size: dict[str, str]) -> tuple[int, float]:
@@ -209,7 +209,7 @@ async def _beside_large(url: str, scene: str, other: str, worker: str) -> list[R
 
 
 def _without_queue(url: str, data_dir: Path, seen: str, unseen: str, seconds: float) -> list[Row]:
-    """Views while the queue's server is stopped: it takes connections and answers nothing."""
+    """Time views while the queue's server is stopped: it accepts connections and does not answer."""
     server = process(lambda command, _: str(data_dir / "valkey").encode() in command)
     spent_ms: list[float] = []
     os.kill(server, signal.SIGSTOP)
@@ -231,7 +231,7 @@ def _without_queue(url: str, data_dir: Path, seen: str, unseen: str, seconds: fl
 
 
 def _watched(url: str, job_id: str, seconds: float) -> list[Row]:
-    """Viewers of a job that trains, and how fast it trains with them and between."""
+    """Measure viewers of a training job, and its iterations per second with them and without."""
     rows: list[Row] = []
     parts = (
         process(lambda command, _: command.endswith(b"\0-m\0worker\0device\0")),
@@ -269,7 +269,7 @@ async def _view_for(url: str, query: Query, viewers: int, seconds: float, what: 
 
 @contextmanager
 def _followed(url: str, job_id: str) -> Iterator[Callable[[Callable[[], None]], float]]:
-    """A function that gives the job's iterations a second while another function runs."""
+    """Yield a function that returns the job's iterations per second while another function runs."""
     points: list[tuple[float, int]] = []
 
     def follow() -> None:
@@ -291,7 +291,7 @@ def _followed(url: str, job_id: str) -> Iterator[Callable[[Callable[[], None]], 
 
 
 async def _open_loop(ask: Callable[[], Awaitable[httpx.Response]], a_second: int, seconds: float) -> list[float]:
-    """As many requests a second as said, whether answered or not; ms from when each was due."""
+    """Send a fixed number of requests per second, answered or not. Measures ms from when each was due."""
     start_s = time.perf_counter()
     spent_ms: list[float] = []
 
@@ -315,7 +315,7 @@ def _row(work: str, worker: str, spent_ms: list[float], a_second: float) -> Row:
 
 
 def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
-    """A video with so much padding behind it: received, hashed and stored like any other."""
+    """Upload a video with `gib` GiB of padding, which is received, hashed and stored like any other."""
     video = folder / "large.mp4"
     padding = round(gib * 2**30)
     with video.open("wb") as file:
@@ -342,7 +342,7 @@ def _uploads(url: str, folder: Path, gib: float) -> list[Row]:
 
 
 def _service_process(url: str) -> int:
-    """The process id of the service at this address, told by its environment (Linux)."""
+    """The process id of the service at this address, found by its environment (Linux)."""
     sign = f"INTRASPLAT_PORT={httpx.URL(url).port}\0".encode()
     return process(lambda command, entry: command.endswith(b"\0-m\0service\0") and sign in _environment(entry))
 
@@ -352,9 +352,9 @@ def _environment(entry: Path) -> bytes:
 
 
 def process(is_it: Callable[[bytes, Path], bool]) -> int:
-    """The id of the process whose command line and entry in /proc are those (Linux)."""
+    """The id of the process whose command line and /proc folder satisfy `is_it` (Linux)."""
     for entry in Path("/proc").iterdir():
-        with suppress(OSError):  # it has just ended, or is another user's
+        with suppress(OSError):  # the process has just ended, or belongs to another user
             command = (entry / "cmdline").read_bytes() if entry.name.isdigit() else b""
             if command and is_it(command, entry):
                 return int(entry.name)
@@ -362,7 +362,7 @@ def process(is_it: Callable[[bytes, Path], bool]) -> int:
 
 
 def memory_mib(process_id: int, field: str = "VmRSS") -> float:
-    """Resident memory of a process now, or with field VmHWM at its peak (Linux)."""
+    """Resident memory of a process in MiB; with field VmHWM its peak (Linux)."""
     for line in Path(f"/proc/{process_id}/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) / 1024

@@ -1,12 +1,12 @@
-"""What it costs to be watched: copies of the model while it trains, and how soon the first one is on the screen.
+"""The cost of viewers during training: snapshots of the model, and how soon the first view is there.
 
     python -m lab.benchmarks.bm_snapshot [--iterations 150]
 
-Trains `fast` on a synthetic clip of 640x512, so many iterations each time: alone, with a viewer who asks for one JPEG
-after the other as fast as they come, and with one who is held to the share that a worker gives to renders; the three in
-turn, --rounds times. Prints of each the median seconds of training and the process's CPU time, what a copy took the
-loop, what a view took to make, how many came a second, and when the first was there, counted from the start of the
-loop. Kernels are compiled before.
+Trains `fast` on a synthetic clip of 640x512 for --iterations iterations: alone, with a viewer who requests one JPEG
+after the other without a pause, and with one who is limited to the share that a worker gives to renders; the three in
+order, --rounds times. Prints for each the median seconds of training and of CPU time, the time of a snapshot in the
+loop, the time to render a view, views per second, and the time of the first view since the start of the loop. Kernels
+are compiled before.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ JOB = "0" * 32
 
 @dataclass
 class Figures:
-    """Of one run."""
+    """The figures of one run."""
 
     train_s: float = 0.0
     cpu_s: float = 0.0
@@ -67,7 +67,7 @@ def main() -> None:
     arguments = parser.parse_args()
     clip = make_phantom(CLIP).depth_clip()
     compile_kernels()
-    trained(clip, 10, None)  # the first run reads what the others find in caches
+    trained(clip, 10, None)  # an untimed run that fills caches
     paces: dict[str, Callable[[], RenderPace] | None] = {
         "alone": None,
         "unpaced": _Unpaced,
@@ -82,14 +82,14 @@ def main() -> None:
 
 
 class _Unpaced(RenderPace):
-    """Lets every view begin at once."""
+    """Lets every view start at once."""
 
     def rest_s(self) -> float:
         return 0.0
 
 
 def line_of(name: str, runs: list[Figures]) -> str:
-    """What is printed of one way to be watched."""
+    """The printed line of one kind of viewer."""
     train_s = median(each.train_s for each in runs)
     line = f"{name:8} {runs[0].gaussians} Gaussians  training {train_s:.2f} s"
     line += f" and {median(each.cpu_s for each in runs):.2f} s of CPU time"
@@ -132,7 +132,7 @@ def trained(clip: DepthClip, iterations: int, pace: RenderPace | None) -> Figure
 
 
 def watch(snapshots: Snapshots, pace: RenderPace, figures: Figures, began: float, end: threading.Event) -> None:
-    """Ask for one view after the other, and rest in between as a worker does."""
+    """Render one view after the other, with a worker's pauses in between."""
     with tempfile.TemporaryDirectory() as folder:
         views = Views(Store(Path(folder)), snapshots)
         while not end.wait(pace.rest_s()):

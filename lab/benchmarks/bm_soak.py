@@ -1,4 +1,4 @@
-"""Whether a whole installation stays as large as it is: an hour of clips, views, listeners, cancels and purges.
+"""Whether an installation leaks memory, files or threads in an hour of clips, views, listeners, cancels and purges.
 
     python -m lab.benchmarks.bm_soak [--minutes 60] [--csv lab/rows/soak.csv]
 
@@ -69,7 +69,7 @@ def main() -> int:
 
 def _soak(url: str, clip: PhantomClip, data_dir: Path, minutes: float) -> tuple[list[Row], int, Counter[str]]:
     end = threading.Event()
-    shown: list[str] = []  # the scene that is looked at now, if any
+    shown: list[str] = []  # the scene that is viewed now, if any
     counts: Counter[str] = Counter()
     rows: list[Row] = []
     rounds = 0
@@ -85,7 +85,7 @@ def _soak(url: str, clip: PhantomClip, data_dir: Path, minutes: float) -> tuple[
         finally:
             end.set()
     for each in beside:
-        each.result()  # raises what ended it too early
+        each.result()  # raises the error that ended it too early
     return rows, rounds, counts
 
 
@@ -132,7 +132,7 @@ def _look_through_socket(url: str, shown: list[str], end: threading.Event, count
 
 @contextmanager
 def _counting(what: str, counts: Counter[str]) -> Iterator[None]:
-    """Counts what came; also the refusals by their kind: there may be nothing to see yet, or no longer."""
+    """Count answers, and refusals by type: the scene may not exist yet, or no longer."""
     try:
         yield
         counts[what] += 1
@@ -143,7 +143,7 @@ def _counting(what: str, counts: Counter[str]) -> Iterator[None]:
 
 
 def _break_off(url: str, clip: PhantomClip) -> None:
-    """An upload that ends in the middle."""
+    """Start an upload and break it off in the middle."""
     address = urlsplit(url)
     body = clip.video.read_bytes()
     head = (
@@ -169,7 +169,7 @@ def _sample(data_dir: Path, end: threading.Event, rows: list[Row]) -> None:
 
 
 def _processes(data_dir: Path) -> dict[str, int]:
-    """The installation's processes by what they are, told by their command lines and environments."""
+    """The installation's processes by role, found by their command lines and environments."""
     kinds = {"-m service": "service", "-m worker consume": "supervisor", "-m worker device": "device child"}
     found = {}
     for entry in Path("/proc").iterdir():
@@ -195,7 +195,7 @@ def _figures(process_id: int) -> Row:
 
 
 def _judge(rows: list[Row], minutes: float) -> int:
-    """Print before, after and slope for every process and measure; 1 if one has grown by more than is allowed."""
+    """Print before, after and slope for every process and measure. Returns 1 if one has grown too much."""
     grown = 0
     for process in dict.fromkeys(row["process"] for row in rows):
         for measure in MEASURES:

@@ -86,7 +86,7 @@ def _rectified(video: Path, calibration: Path, masks: Path | None) -> RectifiedC
 
 
 def thinned(clip: RectifiedClip, every: int) -> RectifiedClip:
-    """Each so manieth frame of a clip."""
+    """Every `every`-th frame of a clip."""
     kept = range(0, clip.frame_count, every)
     return replace(
         clip,

@@ -40,15 +40,15 @@ from lab.phantom.shading import add_noise
 PAIR_FX_PX, PAIR_BASELINE_MM = 520.0, 4.2
 WIDTH, HEIGHT = 640, 512
 DRAWN = PhantomSettings(width=800, height=640, frames=2, noise=False)
-"""Wider than the recorded picture, so that distortion finds something at its corners."""
+"""Wider than the recorded picture, so that distortion has content at its corners."""
 FRAME, SEEDS = 1, (0, 1, 2)
 PATCH_PX = 8
 BESIDE_PX = 24  # from an instrument's edge; nearer than BESIDE_PX of intrasplat/stereo/depth.py no depth is given
 DISTORTION = ((-0.30, 0.02, 0.0, 0.0), (-0.29, 0.02, 0.0, 0.0))
 """k1 k2 p1 p2 of each eye: the picture's corner moves by 47 px."""
-CENTRES_PX = 6.0  # the right eye's principal point lies so far to the left of the left eye's
+CENTRES_PX = 6.0  # how far the right eye's principal point lies to the left of the left eye's
 DARK_FROM, BLACK_FROM = 0.55, 0.92
-"""Of the half diagonal: where light begins to fall, and where none is left."""
+"""Distances from the centre, as shares of the half diagonal, at which light starts to fall off and at which it ends."""
 WETNESS, ROUGHNESS = 150.0, 0.4
 """Factors of the wet film's mirrored light and of its slopes: broad highlights burn out a third of the picture."""
 FLAT_SHARE = 0.97  # of the contrast that flat tissue has lost
@@ -65,7 +65,7 @@ CLIPS = {
     "hard": frozenset({"dark", "wet", "distorted"}),
     "beside": frozenset({"masked"}),
 }
-"""What is wrong with each synthetic clip; "masked": nothing, but it is judged beside instruments alone."""
+"""The flaws of each synthetic clip; "masked": none, but only pixels beside instruments are judged."""
 
 Rgb = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -108,7 +108,7 @@ def _clips(data: Path) -> Iterator[tuple[str, int, Judged]]:
 
 
 def real_pair(folder: Path) -> Judged:
-    """The pair of structured-light truth."""
+    """The recorded pair with truth from structured light."""
     eyes = [cv2.cvtColor(cv2.imread(str(folder / f"{eye}.png")), cv2.COLOR_BGR2RGB) for eye in ("left", "right")]
     truth_px = np.asarray(cv2.imread(str(folder / "disparity.tiff"), cv2.IMREAD_UNCHANGED), np.float32)
     height, width = truth_px.shape
@@ -171,7 +171,7 @@ def _calibration(distorted: bool) -> RawCalibration:
 
 
 def _recorded(drawn: Rgb, eye: RawEye, dark: bool, random: np.random.Generator) -> Rgb:
-    """The picture that an eye with this lens takes of what is drawn: distorted, dark at the border, with noise."""
+    """The drawn picture as recorded through this lens: distorted, dark at the border, with noise."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     matrix = np.array([[eye.fx_px, 0, eye.cx_px], [0, eye.fy_px, eye.cy_px], [0, 0, 1]])
     rays = cv2.undistortPointsIter(
@@ -191,7 +191,7 @@ def _recorded(drawn: Rgb, eye: RawEye, dark: bool, random: np.random.Generator) 
 
 
 def _as_recorded(drawn: NDArray[np.generic]) -> Floats:
-    """What is drawn of the left eye, in the pixels of a lens without distortion; nearest neighbour."""
+    """Resample a drawn picture of the left eye to a lens without distortion; nearest neighbour."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     maps = x + (DRAWN.width - WIDTH) / 2, y + (DRAWN.height - HEIGHT) / 2
     return np.asarray(
@@ -200,7 +200,7 @@ def _as_recorded(drawn: NDArray[np.generic]) -> Floats:
 
 
 def _as_rectified(drawn: NDArray[np.generic], camera: Intrinsics) -> Floats:
-    """What is drawn of the left eye, in the pixels of its rectified picture; nearest neighbour, 0 beyond."""
+    """Resample a drawn picture of the left eye to its rectified camera; nearest neighbour, 0 outside."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32) + np.float32(0.5)
     to_x = (x - camera.cx) / camera.fx * DRAWN.intrinsics.fx + DRAWN.width / 2 - 0.5
     to_y = (y - camera.cy) / camera.fy * DRAWN.intrinsics.fy + DRAWN.height / 2 - 0.5

@@ -41,7 +41,7 @@ COLUMNS = {
     "iterations": ("steps", 0), "step_ms": ("ms/step", 1), "t_train_s": ("train s", 1), "t_post_s": ("post s", 1),
     "scene_bytes": ("bytes", 0),
 }  # fmt: skip
-"""Of the printed table: what a column is called, and its digits."""
+"""Heading and digits of the columns of the printed table."""
 BUDGETS_S, SEEDS = (15.0, 60.0), (0, 1, 2)
 
 

@@ -25,13 +25,13 @@ Spoiler = Callable[[CleanClip, float, np.random.Generator], Given]
 
 @dataclass(frozen=True)
 class Condition:
-    """One way of going wrong.
+    """One adverse condition.
 
-    title   with the unit of its levels
-    levels  of severity 1 to 5
-    stereo  whether it is written as stereo files and read, rectified and matched; its clean cell is then, too
-    calm    where the tissue moves in a way of its own, the level of severity 0, which does no harm: what another motion
-            scores says nothing about this one. Else None: severity 0 is the clean clip
+    title   its name, with the unit of its levels
+    levels  the levels of severity 1 to 5
+    stereo  whether it is written as stereo files and read, rectified and matched; so is its clean cell then
+    calm    for a condition with its own tissue motion: the harmless level of severity 0, because scores of different
+            motions cannot be compared. Else None: severity 0 is the clean clip
     """
 
     name: str
@@ -43,13 +43,13 @@ class Condition:
 
     @property
     def clean_name(self) -> str:
-        """The condition whose severity 0 it is compared with."""
+        """The name of the condition whose severity 0 it is compared with."""
         if self.calm is not None:
             return self.name
         return CLEAN_STEREO if self.stereo else CLEAN
 
     def level(self, severity: int) -> float:
-        """The level of a severity from 1 to 5, or of 0 where there is a calm one."""
+        """The level of a severity from 1 to 5, or of 0 for a condition with a calm level."""
         if severity == 0:
             assert self.calm is not None
             return self.calm
@@ -58,16 +58,16 @@ class Condition:
     def apply(self, clean: CleanClip, severity: int, seed: int) -> Given:
         """The clip of a severity, as level() has them; the same arguments give the same clip.
 
-        The generator is seeded by the condition's name and the seed, not by the severity: where the level is a size, a
-        share or a strength, a higher one is the same mishap, but worse. Where it is a number of things (highlights),
-        those of a lower one start at the same places, but go other ways, because the generator takes turns among them.
+        The generator is seeded by the condition's name and the seed, not by the severity. If the level is a size, a
+        share or a strength, a higher level is the same event, but worse. If it is a number of objects (highlights),
+        those of a lower level start at the same points but move differently, because they share one generator.
         """
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         return self.spoil(clean, self.level(severity), random)
 
 
 def clean_given(clean: CleanClip, *, stereo: bool) -> Given:
-    """Severity 0: the clean clip, as it is or through stereo files."""
+    """Severity 0: the clean clip, unchanged or through stereo files."""
     return given(clean, recording_of(clean.phantom) if stereo else None)
 
 

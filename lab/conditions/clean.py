@@ -1,4 +1,4 @@
-"""The clean clip that every condition spoils, and what a condition hands back: the clip as a user would give it.
+"""The clean clip that every condition degrades, and the result of a condition: the clip as a user would give it.
 
 Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
 """
@@ -15,9 +15,9 @@ from lab.conditions.recording import Recording
 from lab.phantom import Phantom, PhantomSettings, make_phantom
 
 REFERENCE_WIDTH = 640
-"""Lengths in the table of conditions are pixels of a picture this wide, so that every size suffers alike."""
+"""Lengths in the table of conditions are pixels of a picture this wide, so that every size is degraded equally."""
 SEEN_SHARE = 0.25
-"""Of the frames: where a pixel shows tissue less often, nobody can ask what the instrument hides."""
+"""Minimum share of the frames in which a pixel must show tissue, for what the instrument hides there to be scored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +41,13 @@ class CleanClip:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """[T, H, W] pixels with tissue that the clip shows often enough to know what the instrument hides there."""
+        """[T, H, W] pixels that show tissue in at least SEEN_SHARE of the frames."""
         return np.asarray((self.clip.tissue.mean(axis=0) >= SEEN_SHARE) & (self.depth_mm > 0))
 
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """A clip as the user would give it, with what it ought to have come to.
+    """A clip as the user would give it, with its true result.
 
     clip     decoded, or a recording that is to be written as files and read like any other
     rgb      [T, H, W, 3] float32 in [0, 1], what a model without flaw would show at the clean clip's frames

@@ -1,6 +1,6 @@
 """Instruments that hide tissue, and masks that do not fit them. Symbols: T frames, H W pixels.
 
-Each function spoils a clean clip by `level`; `random` is seeded by the cell. Lengths in pixels are of a picture 640
+Each function degrades a clean clip by `level`; `random` is seeded by the cell. Lengths in pixels refer to a picture 640
 wide.
 """
 
@@ -19,7 +19,7 @@ from lab.phantom import PhantomFrame
 from lab.phantom.settings import Tool
 
 STEEL = (118, 121, 124)
-BRUSHED_LEVELS = 6  # of 255, deviation of the steel's grain
+BRUSHED_LEVELS = 6  # standard deviation of the steel's grain, of 255
 TOOL_DEPTH_MM = 45.0  # nearer than any tissue of the phantom
 NO_MASKS: tuple[tuple[tuple[Tool, ...], float], ...] = (
     (("yellow",), 0.0),
@@ -28,12 +28,12 @@ NO_MASKS: tuple[tuple[tuple[Tool, ...], float], ...] = (
     (("steel", "dark"), 0.6),
     (("grasper", "steel", "dark"), 0.9),
 )
-"""Instruments, and how far their colour is the tissue's: ever harder to find."""
-WAG_DEG, WAG_PERIODS = 12.0, 1.5  # a large instrument turns to and fro about where it enters
+"""Instruments, and the share of the tissue's colour in theirs: increasingly hard to find."""
+WAG_DEG, WAG_PERIODS = 12.0, 1.5  # a large instrument swings about its entry point
 
 
 def tools_over_frame(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """A second instrument over `level` of the picture, wagging; masked rightly. Judged where it is not."""
+    """A second, swinging instrument over `level` of the picture, with correct masks. Scored outside it."""
     clip = clean.clip
     frames, height, width = clip.tissue.shape
     start = random.uniform(0, 2 * np.pi)
@@ -45,7 +45,7 @@ def tools_over_frame(clean: CleanClip, level: float, random: np.random.Generator
 def hidden_at_start(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """A masked instrument hides a disc of `level` of the picture in frame 0 and shrinks to nothing by half-time.
 
-    Judged also where it still hides the tissue: every place of it is seen in the end.
+    Scored also where it still hides the tissue: all of it is seen in the end.
     """
     frames, height, width = clean.clip.tissue.shape
     column, row = random.uniform(0.4, 0.6) * width, random.uniform(0.4, 0.6) * height
@@ -90,7 +90,7 @@ def inverted_masks(clean: CleanClip, level: float, random: np.random.Generator) 
 
 
 def no_masks(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Stereo files without masks, of the instruments NO_MASKS[level - 1], which are to be found."""
+    """Stereo files without masks, with the instruments NO_MASKS[level - 1]."""
     del random
     tools, tint = NO_MASKS[round(level) - 1]
     drawn = clean_clip(dataclasses.replace(clean.phantom.settings, tools=tools))
@@ -117,7 +117,7 @@ def _wag(index: int, frames: int) -> float:
 
 
 def _beyond(angle: float, share: float, height: int, width: int) -> NDArray[np.bool_]:
-    """The `share` of the picture [H, W] that lies farthest in a direction."""
+    """The `share` of the picture [H, W] that lies farthest in the direction `angle`."""
     rows, columns = np.indices((height, width))
     along = np.cos(angle) * (columns - width / 2) + np.sin(angle) * (rows - height / 2)
     return np.asarray(along > np.quantile(along, 1 - share))

@@ -1,9 +1,9 @@
-"""What happens to the picture: highlights, smoke, blood, blur, exposure, colour, borders.
+"""Degraded pictures: highlights, smoke, blood, blur, exposure, colour, borders.
 
 Symbols: T frames, H W pixels.
 
-Each function spoils a clean clip by `level`; `random` is seeded by the cell. Lengths in pixels are of a picture 640
-wide. Depth stays true: what these do to stereo is not asked here.
+Each function degrades a clean clip by `level`; `random` is seeded by the cell. Lengths in pixels refer to a picture 640
+wide. Depth stays true: effects on stereo are not measured here.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from lab.conditions.clean import CleanClip, Given, given
 
-HIGHLIGHT_PX, HIGHLIGHT_STEP_PX = 10.0, 8.0  # radius, and deviation of the way it goes in a frame
+HIGHLIGHT_PX, HIGHLIGHT_STEP_PX = 10.0, 8.0  # radius, and standard deviation of the step per frame
 SMOKE_GREY = 205.0
 CLOUD_PX, CLOUD_DRIFT_PX, CLOUD_DEPTH = 160.0, 12.0, 0.35  # size, drift per frame, share by which its density varies
 BLOOD = (104.0, 14.0, 12.0)
-BLOOD_OPACITY, BLOOD_FROM = 0.92, 0.25  # it comes in after this share of the clip
-BLURRED_SHARE = 0.5  # of the frames, where blur comes and goes
+BLOOD_OPACITY, BLOOD_FROM = 0.92, 0.25  # blood appears after this share of the clip
+BLURRED_SHARE = 0.5  # share of blurred frames
 DRIFT_PERIODS = 1.5
 
 
@@ -38,7 +38,7 @@ def highlights(clean: CleanClip, level: float, random: np.random.Generator) -> G
 
 
 def smoke(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """A drifting grey veil that takes `level` of the tissue's light on average."""
+    """A drifting grey veil that absorbs `level` of the tissue's light on average."""
     frames, height, width = clean.clip.tissue.shape
     drift_px = CLOUD_DRIFT_PX * clean.px
     wide = width + int(drift_px * frames) + 1
@@ -50,7 +50,7 @@ def smoke(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
 
 
 def blood(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Blood rises from below and in the end floods `level` of the picture. Judged against the flooded tissue."""
+    """Blood rises from below and in the end covers `level` of the picture. Scored against the covered tissue."""
     frames, height, width = clean.clip.tissue.shape
     wave = cv2.GaussianBlur(random.standard_normal((1, width)), (0, 0), width / 12)[0]
     wave *= 0.05 * height / max(float(wave.std()), 1e-9)
@@ -64,7 +64,7 @@ def blood(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
 
 
 def motion_blur(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Every other frame, drawn at random, is smeared over `level` px in a direction of its own."""
+    """Half of the frames, drawn at random, are blurred over `level` px, each in its own direction."""
     rgb = clean.clip.rgb.copy()
     for index in random.permutation(len(rgb))[: round(BLURRED_SHARE * len(rgb))]:
         rgb[index] = cv2.filter2D(rgb[index], -1, _line(level * clean.px, random.uniform(0, np.pi)))
@@ -79,11 +79,11 @@ def defocus(clean: CleanClip, level: float, random: np.random.Generator) -> Give
 
 
 def exposure_drift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Exposure goes to and fro over `level` stops, twice the light each, one and a half times in the clip."""
+    """Exposure oscillates over `level` stops (a factor of two each), one and a half times in the clip."""
     share = np.arange(clean.clip.frame_count) / clean.clip.frame_count
     phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * DRIFT_PERIODS * share
     gain = 2 ** (level / 2 * np.sin(phase))
-    # a gain of light acts before the camera's curve, of which the 2.2th root is the usual account
+    # a gain of light acts before the camera's tone curve, usually modelled as the power 1 / 2.2
     rgb = _bytes(clean.clip.rgb * (gain ** (1 / 2.2))[:, None, None, None])
     return given(clean, dataclasses.replace(clean.clip, rgb=rgb))
 
@@ -97,7 +97,7 @@ def white_balance_drift(clean: CleanClip, level: float, random: np.random.Genera
 
 
 def black_border(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """`level` of the picture, outside a circle, is black, without depth, and masked by nobody. Judged within."""
+    """`level` of the picture, outside a circle, is black, without depth, and not masked. Scored inside."""
     del random
     height, width = clean.clip.tissue.shape[1:]
     rows, columns = np.indices((height, width))
@@ -114,7 +114,7 @@ def black_border(clean: CleanClip, level: float, random: np.random.Generator) ->
 
 
 def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """`level` of the colour is gone: 1 is grey. Judged against the tissue with that colour gone."""
+    """Colour is reduced by `level`: 1 is grey. Scored against the tissue with the same reduction."""
     del random
     grey = clean.rgb.mean(axis=-1, keepdims=True)
     recorded = clean.clip.rgb.mean(axis=-1, keepdims=True)
@@ -124,7 +124,7 @@ def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> G
 
 
 def _line(length_px: float, angle: float) -> NDArray[np.float32]:
-    """A kernel of a straight smear; sums to 1."""
+    """A kernel of linear motion blur; sums to 1."""
     half = int(np.ceil(length_px / 2)) + 1
     offset = np.arange(-half, half + 1)
     kernel = np.zeros((offset.size, offset.size))

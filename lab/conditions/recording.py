@@ -1,7 +1,7 @@
-"""Recordings that are to pass through files: what spoils stereo, masks and calibration must meet the checks of input.
+"""Recordings that are written as files, so that wrong stereo, masks and calibration meet the checks of the input.
 
-A recording is a phantom, so that the phantom's own writers write it; what the user believes of the endoscope stands in
-its settings, how it was really drawn in `drawn`.
+A recording is a phantom, so that the phantom's own writers write it. Its settings are what the user believes of the
+endoscope; `drawn` is how it was really drawn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STEREOMIS_CALIBRATION = "StereoCalibration.ini"
 
 @dataclass(frozen=True)
 class Recording(Phantom):
-    """A phantom whose frames are those of `drawn`, each spoilt: spoil(frame, index).
+    """A phantom whose frames are those of `drawn`, each degraded by spoil(frame, index).
 
     masks: whether the user has them
     """
@@ -38,7 +38,7 @@ class Recording(Phantom):
 def recording_of(
     drawn: Phantom, spoil: Spoil | None = None, *, baseline_mm: float | None = None, masks: bool = True
 ) -> Recording:
-    """What is drawn, spoilt; its calibration tells baseline_mm if that is given."""
+    """A degraded recording of `drawn`; its calibration states baseline_mm if that is given."""
     settings = drawn.settings
     if baseline_mm is not None:
         settings = dataclasses.replace(settings, baseline_mm=baseline_mm)
@@ -46,7 +46,7 @@ def recording_of(
 
 
 def write_recording(recording: Recording, folder: Path) -> ReconstructionRequest:
-    """Writes frames of both eyes, masks and calibration into the folder; what a user would ask for with them."""
+    """Write frames of both eyes, masks and calibration into the folder. Returns what a user would request with them."""
     write_stereomis(recording, folder, masks=recording.masks)
     options = ReconstructionOptions(mask_source="given" if recording.masks else "auto")
     return ReconstructionRequest(clip=folder, calibration=folder / STEREOMIS_CALIBRATION, options=options)

@@ -1,7 +1,7 @@
-"""Other scenes: faster pulls, cuts, a camera that moves, tissue without texture, other sizes; and stereo gone wrong.
+"""Other scenes: faster pulls, cuts, a moving camera, tissue without texture, other sizes; and wrong stereo geometry.
 
-Each function takes the clean clip's settings, changed by `level`; lengths in pixels are of a picture 640 wide where not
-said otherwise.
+Each function uses the clean clip's settings, changed by `level`; lengths in pixels refer to a picture 640 wide unless
+stated otherwise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lab.phantom.settings import MEAN_DEPTH_MM
 from lab.phantom.surface import Surface
 
 PULL_FRAMES = 24.0  # from one pull to the next
-POSE_SWING_DEG = 5.0  # of the camera whose poses are noisy
+POSE_SWING_DEG = 5.0  # swing of the camera with noisy poses
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class TurningPhantom(Phantom):
 
 @dataclass(frozen=True)
 class ScaledPull(Pull):
-    """A pull `gain` times as far."""
+    """A pull over `gain` times the distance."""
 
     gain: float
 
     def strength(self, frame: float) -> float:
-        """How far the pull has gone: 0 at rest, gain held."""
+        """Progress of the pull: 0 at rest, `gain` when held."""
         return self.gain * super().strength(frame)
 
 
@@ -102,13 +102,13 @@ def _cut(clean: CleanClip, level: float) -> PhantomSettings:
 
 
 def moving_camera(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """The endoscope swings once by `level` degrees to either side; its poses are right."""
+    """The endoscope swings once by `level` degrees to either side; its poses are correct."""
     del random
     return given(clean_of(_swinging(clean.phantom, level)))
 
 
 def camera_unknown(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Stereo files of an endoscope that turns about its port by `level` degrees in the clip; nobody gives its poses."""
+    """Stereo files of an endoscope that rotates about its port by `level` degrees in the clip, without poses."""
     del random
     # a pan has tissue as far as the widest turn looks
     phantom = make_phantom(dataclasses.replace(clean.phantom.settings, camera=("pan",)))
@@ -169,7 +169,7 @@ def misrectified(clean: CleanClip, level: float, random: np.random.Generator) ->
 
 
 def wrong_baseline(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Stereo files whose calibration tells `level` times the baseline that they were taken with."""
+    """Stereo files whose calibration states `level` times their true baseline."""
     del random
     return given(clean, recording_of(clean.phantom, baseline_mm=level * clean.phantom.settings.baseline_mm))
 
@@ -183,7 +183,7 @@ def _pulled(surface: Surface, gain: float) -> Surface:
 
 
 def _fastest_px(phantom: Phantom) -> float:
-    """The longest way in the picture of any tissue point from one frame to the next; the camera is at rest."""
+    """The longest step in px of any tissue point from one frame to the next; the camera is at rest."""
     points_mm = phantom.trajectories().points_mm
     places_px = phantom.settings.intrinsics.fx * points_mm[..., :2] / points_mm[..., 2:]
     return float(np.linalg.norm(np.diff(places_px, axis=0), axis=-1).max(initial=0.0))

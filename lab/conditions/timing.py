@@ -1,7 +1,7 @@
-"""Frames that are too few, lost or repeated. Symbols: T frames of the clean clip.
+"""Too few, lost or repeated frames. Symbols: T frames of the clean clip.
 
-The given frame k shows the clean frame source[k] but is trained as if frames were evenly spaced, which is all that a
-clip tells.
+The given frame k shows the clean frame source[k] but is trained as if frames were evenly spaced, because a clip has no
+other times.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def few_frames(clean: CleanClip, level: float, random: np.random.Generator) -> G
 
 
 def dropped_frames(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """`level` of the frames, drawn at random, are lost, and the rest closed up."""
+    """`level` of the frames, drawn at random, are lost, and the rest follow without gaps."""
     count = clean.clip.frame_count
     lost = random.permutation(np.arange(1, count))[: round(level * count)]
     kept = sorted(set(range(count)) - set(lost.tolist()))
@@ -31,7 +31,7 @@ def dropped_frames(clean: CleanClip, level: float, random: np.random.Generator) 
 
 
 def duplicated_frames(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """`level` of the frames, drawn at random, repeat the one before. Judged against what should have been there."""
+    """`level` of the frames, drawn at random, repeat the one before. Scored against the true frames."""
     shown = np.arange(clean.clip.frame_count)
     for index in sorted(random.permutation(shown[1:])[: round(level * len(shown))]):
         shown[index] = shown[index - 1]
@@ -39,7 +39,7 @@ def duplicated_frames(clean: CleanClip, level: float, random: np.random.Generato
 
 
 def taken(clip: DepthClip, frames: Sequence[int]) -> DepthClip:
-    """These frames of a clip, in this order, one after the other at the clip's own rate."""
+    """The clip of these frames, in this order, at the clip's own frame rate."""
     index = list(frames)
     return dataclasses.replace(
         clip,

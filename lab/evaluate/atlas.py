@@ -1,7 +1,7 @@
 """The stability atlas, drawn from rows alone: one heat map a method, and a table of what the user is told.
 
-A place of the map is a condition at a severity: decibels lost against the clean clip, mean over seeds, and a mark for
-the worst outcome of any seed. What was not measured is hatched.
+A cell of the map is a condition at a severity. It shows the loss in dB against the clean clip, mean over seeds, and a
+mark for the worst outcome of any seed. Unmeasured cells are hatched.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lab.evaluate.style import GREY, SETTINGS, save
 
 WORST_FIRST = ("silent", "crashed", "unknown", "diverged", "told", "refused", "held")
 MARKS = {"silent": "X", "told": "^", "refused": "s", "diverged": "D", "crashed": "P", "unknown": "$?$"}
-"""Matplotlib's markers; what held needs none."""
+"""Matplotlib's markers by outcome; an unharmed cell has none."""
 MEANINGS = {
     "silent": "harmed, and nothing was said",
     "told": "harmed, and the report warns",
@@ -31,7 +31,7 @@ MEANINGS = {
     "unknown": "the clean clip has no score to compare with",
 }
 FULL_COLOUR_DB = 10.0
-"""Losses from here on look alike: none of them is of use."""
+"""Losses above this have the same colour: none of these results is usable."""
 COLOURS = "Blues"  # one hue, light to dark: read in print and by the colour-blind
 DARK_FROM = 0.6  # of the scale, from where white writing is read better
 ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.0, 3.6

@@ -35,12 +35,12 @@ GRID_POINTS = (10_000, 20_000, 40_000, 80_000)
 """Bases and Gaussians per image of the grid that the automatic choice is compared with."""
 EYES = "eyes"
 BOTH_EYES: Eyes = "both"
-"""The change in a series that is an option of the reconstruction and no value of its preset, and what it is unsaid."""
+"""The default of `eyes`, the one change in a series that is a reconstruction option and not a value of its preset."""
 
 
 def expected_beside(series: Collection[str]) -> list[str]:
-    """The series that a comparison of these is to have: the table's if a system of others is among them, and all
-    presets unless they are the table's alone."""
+    """The series that a comparison of these should include: the table's if a rival is among them, and all presets
+    unless all of them belong to the table."""
     table = TABLE_1 if any(each in RIVAL_SYSTEMS for each in series) else ()
     presets = () if table and set(series) <= set(TABLE_1) else DEFAULT_SERIES
     return list(dict.fromkeys((*presets, *table)))
@@ -59,12 +59,12 @@ class Cell:
 
     @property
     def limit(self) -> str:
-        """How long it trains, in words."""
+        """The length of its training, in words."""
         return f"{self.iterations} iterations" if self.iterations else f"{self.budget_s:g} s"
 
     @property
     def key(self) -> tuple[str, ...]:
-        """What its row is found by; the values of rows.KEY."""
+        """The key of its row: the values of rows.KEY."""
         return (self.clip, self.holdout, self.series, str(self.seed), self.limit)
 
 
@@ -77,16 +77,16 @@ def plan(
     iterations: Sequence[int] = (),
     eyes: Sequence[Eyes] = (BOTH_EYES,),
 ) -> list[Cell]:
-    """Every combination, clip by clip so that each is opened once; without budgets and iterations as the presets say.
+    """Every combination, clip by clip so that each clip is opened once. Lengths default to those of the presets.
 
-    Cells have the series' canonical names: one series is one row, however it was spelt.
+    Cells have the series' canonical names, so one series has one row, however it was spelt.
 
     Args:
         series: also "ours", "ablation" and "table1".
-        eyes: of the series that do not say themselves; a preset that trains on the left eye alone has one cell.
+        eyes: for series that do not name them; a preset that trains only on the left eye has one cell.
 
     Raises:
-        InputError: a series is not known, or no reconstruction takes a holdout or a seed.
+        InputError: a series is unknown, or a holdout or a seed is invalid.
     """
     named = [name for each in series for name in SHORTHANDS.get(each, (each,))]
     lengths = dict(_named_length(with_eyes(name, which)) for name in named for which in eyes)
@@ -133,7 +133,7 @@ def preset_of(series: str) -> Preset:
     """The preset that a series names, with its changes made.
 
     Raises:
-        InputError: there is no such preset, no such plain value in it, it makes no use of one, or none can train so.
+        InputError: the preset or the field does not exist, the change has no effect, or the value is invalid.
     """
     return _read(series)[1]
 
@@ -163,7 +163,7 @@ def eyes_of(series: str) -> Eyes:
 
 
 def with_eyes(series: str, eyes: Eyes) -> str:
-    """The series trained on these eyes, unless it says itself or its preset takes one eye only."""
+    """The series trained on these eyes, unless it names its eyes or its preset takes only one."""
     preset = PRESETS.get(preset_name_of(series))
     decided = any(_is_eyes(change) for change in _changes(series)) or eyes == BOTH_EYES
     if decided or preset is None or not preset.both_eyes:
@@ -207,7 +207,7 @@ def _named(preset: str, changes: Sequence[str]) -> str:
 
 
 def _named_length(series: str) -> tuple[str, tuple[int | None, float | None]]:
-    """A series' canonical name, and the iterations or seconds that it trains if nobody says. Raises as preset_of."""
+    """A series' canonical name, and its default iterations or seconds. Raises as preset_of."""
     if is_rival_system(series):
         return preset_name_of(series), (None, RIVAL_BUDGET_S)
     name, preset = _read(series)
@@ -243,7 +243,7 @@ def _read(series: str) -> tuple[str, Preset]:
 
 
 def _check_change(preset: Preset, series: str, change: str) -> None:
-    """InputError unless the preset has what is changed, and the change has an effect."""
+    """Raise InputError unless the preset has the changed field, and the change has an effect."""
     field, plain = change.partition("=")[0], [*_plain_fields(), EYES]
     if field not in plain:
         problem = f"{change!r} in {series!r} changes no plain value of a preset."
@@ -270,7 +270,7 @@ def _plain_fields() -> list[str]:
 
 
 def _value(series: str, field: str, text: str, current: object) -> object:
-    """text as a value of the current one's type."""
+    """Parse text as a value of the type of `current`."""
     kind = Eyes if field == EYES else get_type_hints(Preset)[field]
     words = get_args(kind) if get_origin(kind) is Literal else ()
     try:

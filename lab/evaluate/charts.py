@@ -2,16 +2,16 @@
 
 curves  held-out psnr_tissue against seconds of training; curves-ssim, curves-depth: SSIM, median depth error
 curves-eyes  the same of the left eye and of the right eye beside each other, where a clip has two
-pareto  its end against the seconds it took; the front joins what nothing is both sooner and better than
+pareto  its end against the seconds it took; a line joins the Pareto front
 pareto-right  the same for the right eye
 curves-post, pareto-post  the same against seconds from the request; pareto-one-clip has both clocks
 frames  its end against images rendered a second
 knee    of the grid of capacities: its end against the scene's bytes, and where the automatic choice lies
 
-The area of the disc behind a mark is the scene's size on disk; a small scene's is hidden by its mark. What was not
-measured is named over its panel, and a clock that no row has makes no chart. Copying the neighbouring frames is dashed
-everywhere; for the right eye, warping the left eye's picture of the same moment is. Series trained on the left eye
-alone have hollow marks.
+The area of the disc behind a mark is the scene's size on disk; a small scene's disc is hidden by its mark. Unmeasured
+series are named over their panel, and a clock that no row has gets no chart. Dashed lines are the scores of copying the
+neighbouring frames, and for the right eye of warping the left eye's picture of the same moment. Series trained on the
+left eye alone have hollow marks.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ AREA_A_MEGABYTE, MARK_AREA = 5.0, 30.0
 """Points squared: a scene of 33 MB has a disc of 14 points across; one of less than 6 MB is behind its mark."""
 LEGEND_MEGABYTES = (10, 50)
 SHOWN_BELOW_WORST_DB = 6.0
-"""Curves begin far below where they end; what lies this far under the worst end is cut off."""
+"""Curves start far below their ends; parts that lie this far below the worst end are cut off."""
 MAX_FINE_TICKS = 500
-"""An axis that spans more than this factor has ticks at powers of ten alone: others would run into each other."""
+"""An axis that spans more than this factor has ticks only at powers of ten, because others would overlap."""
 REAL_CLIPS, PAPERS_HOLDOUT = ("d4d-a", "d4d-a-320x256"), "every8"
-"""Published figures are drawn for the real clip alone, at any size, held out as the papers do."""
+"""Published figures are drawn only for the real clip, at any size, with the papers' held-out frames."""
 SCORE, DECIBEL = "psnr_tissue_db", "held-out psnr_tissue, dB"
 TRAINING, SINCE_REQUEST, SPEED = "t_train_s", "t_post_s", "render_fps"
 OVER_TIME = {
@@ -46,22 +46,22 @@ OVER_TIME = {
     "curves-ssim": ("ssim", "held-out SSIM", TRAINING),
     "curves-depth": ("depth_agreement_mm", "median depth error, mm", TRAINING),
 }
-"""By chart: the column of curves.csv, what it is called, and the clock."""
+"""By chart: the column of curves.csv, its label, and the clock."""
 ACROSS = {
     TRAINING: "seconds of training (log)",
     SINCE_REQUEST: "seconds since the request (log)",
     SPEED: "images rendered a second, at the clip's size (log)",
 }
-"""By column: what the axis across is called."""
+"""By column: the label of the x axis."""
 RIGHT = "psnr_right_db"
 EYES = {
     "left eye": (SCORE, DECIBEL),
     "right eye": (RIGHT, "held-out psnr_right, dB"),
 }
-"""By eye: its column in both files, and what it is called."""
+"""By eye: its column in both files, and its label."""
 COPY_LINES = {"copy_blend_db": ("copying: blend", (5, 3)), "copy_flow_db": ("copying: flow", (2, 2))}
 WARP_LINES = {"warp_db": ("warped left eye", (5, 3))}
-"""By column: what a dashed line is called, and its dashes."""
+"""By column: the label of a dashed line, and its dashes."""
 
 Points = list[tuple[float, float]]
 DrawPanel = Callable[[Any, Sequence[Group], str], list[str]]
@@ -69,7 +69,7 @@ DrawPanel = Callable[[Any, Sequence[Group], str], list[str]]
 
 
 def draw_all(results: Results, folder: Path) -> list[str]:
-    """Draw what the rows allow into folder; the names of the charts that were drawn."""
+    """Draw all charts for which there are rows into folder. Returns their names."""
     import matplotlib as mpl
 
     groups = groups_of(results.runs)
@@ -90,7 +90,7 @@ def draw_all(results: Results, folder: Path) -> list[str]:
 
 
 def _draw_presets(presets: Sequence[Group], curves: Sequence[Row], folder: Path) -> list[str]:
-    """The charts that need no second eye and no grid; their names."""
+    """Draw the charts that need neither a second eye nor the grid. Returns their names."""
     drawn = []
     since_request = _points_by_run(curves, SCORE, SINCE_REQUEST)
     with_curves = _at_places(presets, lambda group: any(key_of(row) in since_request for row in group.rows))
@@ -142,7 +142,7 @@ def _draw(groups: Sequence[Group], draw_panel: DrawPanel, folder: Path, name: st
 
 
 def _at_places(groups: Sequence[Group], is_known: Callable[[Group], bool]) -> list[Group]:
-    """The groups of the places where something is known of any."""
+    """The groups of the places where is_known is true for any group."""
     places = {group.place for group in groups if is_known(group)}
     return [group for group in groups if group.place in places]
 
@@ -177,7 +177,7 @@ def _points_by_run(curves: Sequence[Row], column: str, clock: str) -> dict[tuple
 
 
 def _curves(axis: Any, groups: Sequence[Group], clock: str, *, rows: Sequence[Row], score: str) -> list[str]:
-    """Every run of a group, the one that ends in the middle drawn strongly. A DrawPanel with the rows of the curves."""
+    """Draw every run of a group, the one with the median end in bold. A DrawPanel with the rows of the curves."""
     points, without = _points_by_run(rows, score, clock), []
     for group in groups:
         look = look_of(group.series)
@@ -234,7 +234,7 @@ def _name_limit(
 
 
 def _front(axis: Any, groups: Sequence[Group], clock: str, score: str) -> None:
-    """Joins the groups that no other beats in both seconds and decibels."""
+    """Join the groups that no other beats in both seconds and decibels."""
     points = ((group.median(clock), group.median(score)) for group in groups)
     front: Points = []
     for x, y in sorted(point for point in points if not any(map(math.isnan, point))):
@@ -245,7 +245,7 @@ def _front(axis: Any, groups: Sequence[Group], clock: str, score: str) -> None:
 
 
 def _published(axis: Any, across: str) -> None:
-    """What papers print: hollow marks, joined to nothing; their names stand above and below in turn."""
+    """Draw the figures of papers as hollow, unconnected marks, with names above and below alternately."""
     for place, each in enumerate(each for each in RESULTS if each.data == "EndoNeRF"):
         x, y = each.fps if across == SPEED else each.train_s, each.psnr_paper_db
         if x is None:
@@ -256,7 +256,7 @@ def _published(axis: Any, across: str) -> None:
 
 
 def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, tuple[int, int]]]) -> None:
-    """Dashed: what copying or warping recorded pictures scores; named right of the panel, where no mark lies."""
+    """Draw the scores of copying or warping recorded pictures as dashed lines, named to the right of the panel."""
     rising = []
     for column in lines:
         known = [score for group in groups if not math.isnan(score := group.median(column))]
@@ -270,7 +270,7 @@ def _dashed(axis: Any, groups: Sequence[Group], lines: Mapping[str, tuple[str, t
 
 
 def _missing(groups: Sequence[Group], more: Mapping[str, Sequence[str]]) -> str:
-    """Which series have no figure here, and which failed; and more of that kind."""
+    """The text on series without a figure here, on failed ones, and on those in `more`."""
     failed = [group.series for group in groups if group.errors and not group.rows]
     there = {group.series for group in groups}
     missing = [series for series in expected_beside(there) if series not in there]
@@ -321,7 +321,7 @@ def _knee_handles(looks: dict[int, Look]) -> list[Any]:
 
 
 def _handles(groups: Sequence[Group], name: str) -> list[Any]:
-    """The legend's entries: every series, and what else the chart shows."""
+    """The legend's entries: every series, and other elements of the chart."""
     from matplotlib.lines import Line2D
 
     line = "-" if name in OVER_TIME else "none"
@@ -352,19 +352,19 @@ def _has_published(place: Place) -> bool:
 
 
 def _places(groups: Sequence[Group]) -> list[Place]:
-    """Clips with their ways of holding out, clip by clip; a place without any row keeps its panel."""
+    """Clips with their holdouts, clip by clip; a place without any row keeps its panel."""
     clips, holdouts = (list(dict.fromkeys(each)) for each in zip(*(group.place for group in groups), strict=True))
     return [(clip, holdout) for clip in clips for holdout in holdouts]
 
 
 def _columns(places: Sequence[Place]) -> int:
-    """A column a way of holding out; two where there is only one way."""
+    """The number of columns: one per holdout, two if there is only one holdout."""
     holdouts = len({holdout for _, holdout in places})
     return holdouts if holdouts > 1 else min(2, len(places))
 
 
 def _leave_empty(axis: Any, place: Place) -> None:
-    """A panel of a place where nothing was run."""
+    """The empty panel of a place without runs."""
     axis.set_axis_off()
     axis.text(0, 1.0, f"{', '.join(place)}: not measured", transform=axis.transAxes, fontsize=7, color=GREY, va="top")
 
@@ -379,7 +379,7 @@ def _name(axis: Any, place: Place, groups: Sequence[Group], missing: str) -> Non
 
 
 def _finish(axis: Any) -> None:
-    """Room around what is drawn and the limits named beside it, and plain numbers on the logarithmic axis."""
+    """Add margins for marks and labels, and use plain numbers on the logarithmic axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.margins(x=0.14, y=0.1)
@@ -390,7 +390,7 @@ def _finish(axis: Any) -> None:
 
 
 def _cut_below(axes: Sequence[Any], ends_db: Sequence[float]) -> None:
-    """Leave out the beginnings of curves that lie far below where all of them end."""
+    """Cut off the starts of curves, which lie far below all ends."""
     ends = [score for score in ends_db if not math.isnan(score)]
     for axis in axes:
         low, high = axis.get_ylim()

@@ -30,7 +30,7 @@ from lab.rivals import RIVAL_SYSTEMS
 
 SUMMARY = "summary.csv"
 FILES = ("calibration", "masks")
-"""Beside a clip that is a path."""
+"""The files that may be given with a clip that is a path."""
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,9 +82,9 @@ def run_cli(options: argparse.Namespace) -> int:
 
     Raises:
         InputError: a clip, a series or an option is not known, or another process adds rows to the folder.
-        UnavailableError: the device is not there, which is seen before anything is measured, or something else that
-            this machine lacks; what was measured until then is kept.
-        Cancelled: a signal came; what was measured until then is kept.
+        UnavailableError: the device is missing, which is checked first, or this machine lacks something else; earlier
+            rows are kept.
+        Cancelled: a signal came; earlier rows are kept.
     """
     register_variants()
     out: Path = options.out
@@ -129,7 +129,7 @@ def measure_all(bench: Bench, cells: Sequence[Cell], results: Results) -> None:
 
 
 def conclude(results: Results, out: Path) -> None:
-    """summary.csv and the charts, and the claims in words."""
+    """Write summary.csv and the charts, and print the claims."""
     groups = groups_of(results.runs)
     write_rows(out / SUMMARY, SUMMARY_FIELDS, [group.summary() for group in groups])
     charts = draw_all(results, out)
@@ -150,7 +150,7 @@ def conclude(results: Results, out: Path) -> None:
 
 
 def in_words(found: Sooner) -> str:
-    """The headline of one place."""
+    """The main result of one place as a sentence."""
     theirs = f"paper's final {found.target_db:.2f} dB ({found.their_s:.0f} s)"
     where = f"{found.clip}, {found.holdout}: fast ({found.our_limit})"
     if found.our_s is None:
@@ -163,7 +163,7 @@ def in_words(found: Sooner) -> str:
 
 
 def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
-    """Where the clips come from, and every cell of the grid."""
+    """The sources of the clips, and every cell of the grid."""
     files = {name: getattr(options, name) for name in FILES if getattr(options, name) is not None}
     reading = given_options(options, ClipOptions)
     sources = [source_of(argument, files, reading) for argument in options.clips]
@@ -179,7 +179,7 @@ def _asked(options: argparse.Namespace) -> tuple[Bench, list[Cell]]:
 
 
 def _reporter(bar: ProgressBar, place: int, total: int) -> Callable[[Progress], None]:
-    """Shows how much of all cells is done; of a cell, training counts."""
+    """Report the progress over all cells; within a cell, that of training."""
     trained = 0.0
 
     def show(now: Progress) -> None:

@@ -1,4 +1,4 @@
-"""One cell becomes a row and a curve: trained by `reconstruct` itself, then judged as it lies on disk.
+"""Measures one cell: trains it with `reconstruct` itself, then scores the stored scene. Gives a row and a curve.
 
 Symbols: N Gaussians, T frames.
 """
@@ -46,14 +46,14 @@ from lab.rivals import RAY_BY_RAY, RIVAL_SYSTEMS, scored_step_px
 from lab.rivals.run import Length, Make, RivalCandidate, every_core, run_rival
 
 UNTIMED_RENDERS, TIMED_RENDERS = 5, 40
-"""Renders at different times, of which the median counts; the first fill caches."""
+"""Numbers of renders at different times: untimed ones that fill caches, then timed ones, whose median counts."""
 MAX_TIMING_S = 30.0
-"""After so long the renders that are timed already are enough."""
+"""Timing stops after this long."""
 MAX_ERROR_CHARACTERS = 300
 OF_WHOLE_PICTURES = ("ssim", "psnr_clear_db", "psnr_right_clear_db", *COPIES)
-"""Figures in which a pixel's neighbours have a part: a lattice of pixels has none."""
+"""Figures that depend on a pixel's neighbours, so a lattice of pixels cannot have them."""
 OPAQUE = ("coverage", "seen_ok")
-"""Figures that would be 1 whatever a method that draws ray by ray has learnt."""
+"""Figures that are always 1 for a method that renders ray by ray."""
 WHY_OPAQUE = "coverage and seen_ok: the last sample of a ray is opaque"
 WHY_THINNED = (
     "whole pictures: ssim, clear and the copies need neighbours, and scores are of every {0}th pixel of every {0}th row"
@@ -64,10 +64,10 @@ Values = dict[str, object]
 
 @dataclass
 class Bench:
-    """Opens clips and measures cells on them; the clip and truth used last are kept for the next cell.
+    """Opens clips and measures cells on them. Keeps the last clip and truth for the next cell.
 
-    A scene that is trained on device is judged by renders of the CPU, so that all rows are judged alike. A system of
-    others is judged on its device; on a CPU, one that draws ray by ray on fewer pixels (lab/evaluate/thinned.py).
+    A scene that is trained on the device is scored by CPU renders, so that all rows are comparable. A rival is scored
+    on its device; on a CPU, one that renders ray by ray is scored on fewer pixels (lab/evaluate/thinned.py).
     """
 
     sources: Mapping[str, Source]
@@ -81,8 +81,8 @@ class Bench:
         """The row and the curve of a cell; a failure's row says why in `error` and has no curve.
 
         Raises:
-            Cancelled: hooks.should_stop said so.
-            UnavailableError: this machine lacks something, such as the device or room on the disk.
+            Cancelled: hooks.should_stop returned True.
+            UnavailableError: this machine lacks something, such as the device or disk space.
         """
         source = self.sources[cell.clip]
         row: Values = {
@@ -149,7 +149,7 @@ class Bench:
         return values | self._true(cell, opened, SceneCandidate(scene), report), curve
 
     def _measured_rival(self, cell: Cell, opened: OpenClip, hooks: TrainingHooks) -> tuple[Values, list[Values]]:
-        """The same of a system that has no scene."""
+        """As measure(), for a rival, which has no scene."""
         device, timings, options = choose_device(self.device), Timings(), options_of(cell)
         timings.seconds.update(opened.seconds)
         clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, timings, device)
@@ -205,7 +205,7 @@ class Bench:
 
 
 class _OnTheWay:
-    """SSIM and depth agreement of the held-out frames each time they are scored while training goes on.
+    """SSIM and depth agreement of the held-out frames, each time they are scored during training.
 
     last_db  the psnr_tissue of each frame of the last scoring: of the model as training left it
     took_s   what judging has taken so far; nobody who reconstructs a clip waits for it
@@ -273,7 +273,7 @@ def render_ms(render: Callable[[float], object]) -> float:
 
 
 def scene_renderer(scene: TrainedScene, device: Device) -> Callable[[float], object]:
-    """Renders a time of the scene at the clip's size, deformation included."""
+    """A function that renders the scene at a time, at the clip's size, including deformation."""
     model = model_of(scene, device)
     camera = camera_vector(camera_in_units(scene.intrinsics, scene.world_from_camera[0], scene.units_per_mm))
     return lambda t: model.render(camera, t)
@@ -290,7 +290,7 @@ def seconds_of(run: Mapping[str, float], opening: Mapping[str, float], judging_s
 
 
 def _reported(report: Report, seconds: Mapping[str, float]) -> Values:
-    """What the quality report has of it; seconds by stage as JSON."""
+    """The columns from the quality report; seconds by stage as JSON."""
     return {name: getattr(report, name) for name in (*SCORES, "iterations", "width", "height")} | {
         "copy_blend_db": report.baseline_blend_db,
         "copy_flow_db": report.baseline_flow_db,
@@ -304,7 +304,7 @@ def _reported(report: Report, seconds: Mapping[str, float]) -> Values:
 
 
 def _size(scene: TrainedScene) -> Values:
-    """N, and how many numbers the model has for each; what the confidence layer keeps is not the model's."""
+    """N, and the model's numbers per Gaussian, without those of the confidence layer."""
     floats = sum(tensor.numel() for name, tensor in scene.tensors().items() if name != "seen")
     return {"gaussians": len(scene.gaussians), "floats_a_gaussian": floats / len(scene.gaussians)}
 
@@ -325,6 +325,6 @@ def _stored_loss_held_out_db(report: Report, trained_db: Mapping[int, float]) ->
 
 
 def _mean_of_known(scores: Sequence[float]) -> float | None:
-    """A frame without tissue has no score: NaN."""
+    """The mean of the known scores; a frame without tissue has NaN."""
     known = [score for score in scores if not math.isnan(score)]
     return float(np.mean(known)) if known else None

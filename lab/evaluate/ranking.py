@@ -3,9 +3,9 @@
 Symbols: P pixels, H W pixels of a view. An error is one pixel's: of colour the mean absolute difference over R G B in
 [0, 1], of depth the absolute difference over the true depth. Where nothing solid is drawn, depth is infinitely wrong.
 
-A pixel's error is the size of the model's mistake there times a draw of chance, and no confidence can know the draw. So
-correlations are also taken between squares of SQUARE_PX pixels: of their mean confidence and their mean error, in which
-depth counts as wrong by at most its whole length.
+A pixel's error is the size of the model's mistake times a random factor, which no confidence can know. So correlations
+are also computed between squares of SQUARE_PX pixels: of their mean confidence and their mean error, in which the
+relative error of depth is limited to 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SQUARE_PX = 8
 LEAST_JUDGED = 0.5
 """Share of a square's pixels that must be judged for the square to count."""
 BINS = 10
-"""Of the reliability diagram, equally wide in confidence."""
+"""Number of bins of the reliability diagram, equally wide in confidence."""
 
 
 @dataclass(frozen=True, eq=False)

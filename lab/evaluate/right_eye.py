@@ -25,7 +25,7 @@ def right_eye_ranks(scene: TrainedScene, clip: DepthClip, held_out: Sequence[int
 
 
 def _errors(scene: TrainedScene, clip: DepthClip, frame: int) -> PixelErrors:
-    """Of the right eye's tissue that the left eye sees, too; the depths are those rendered."""
+    """Errors of the right eye's tissue that the left eye sees too. True depth is unknown, so rendered depth is used."""
     assert clip.right is not None
     right = clip.right
     shown = render_frame(scene, frame / scene.frame_count, right.world_from_camera[frame], right.intrinsics)

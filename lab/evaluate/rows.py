@@ -1,6 +1,6 @@
-"""runs.csv and curves.csv: a row per run, kept as soon as the run has ended, and which commit and machine it is of.
+"""runs.csv and curves.csv: a row per run with commit and machine, written as soon as the run has ended.
 
-Who adds rows to a folder writes its files whole, so one process at a time may: adding_alone().
+A process that adds rows rewrites the folder's files, so only one process at a time may do so: adding_alone().
 
 A run is found by KEY. Both files are written whole and renamed, the curve before the run, so that after any
 interruption a run either has its row and its curve or is measured again.
@@ -51,12 +51,12 @@ CURVE_FIELDS = (
     *KEY, "t_train_s", "t_post_s", "iteration", "psnr_tissue_db", "psnr_right_db", "ssim", "depth_agreement_mm",
 )  # fmt: skip
 NO_RESULT = (Cancelled, UnavailableError, ModuleNotFoundError)
-"""Errors of the caller or of this machine: the method had no part in them, so no row holds them, and where they come
-measuring ends. Any other error is what a method breaks on: a result of its own, with a row."""
+"""Errors of the caller or of this machine, not of the method: they end measuring and get no row. Any other error is a
+failure of the method: a result, with a row."""
 
 
 def key_of(row: Mapping[str, str]) -> tuple[str, ...]:
-    """What names a run."""
+    """The key of a run."""
     return tuple(row[name] for name in KEY)
 
 
@@ -82,16 +82,16 @@ class Results:
         return any(key_of(row) == key for row in self.runs)
 
     def failed(self, keys: Iterable[tuple[str, ...]]) -> list[Row]:
-        """The rows of these runs that say why there is no result."""
+        """The rows of these runs that record a failure."""
         asked = set(keys)
         return [row for row in self.runs if row["error"] and key_of(row) in asked]
 
     def forget_failed(self) -> None:
-        """Let what failed be measured again; the files keep those rows until something is added."""
+        """Let failed runs be measured again; the files keep their rows until the next row is added."""
         self.runs = [row for row in self.runs if not row["error"]]
 
     def add(self, run: Mapping[str, object], curve: Sequence[Mapping[str, object]]) -> None:
-        """Keep a run and its curve."""
+        """Store a run and its curve."""
         key = {name: run[name] for name in KEY}
         self.curves += [texts_of({**key, **point}, CURVE_FIELDS) for point in curve]
         self.runs.append(texts_of(run, RUN_FIELDS))
@@ -102,7 +102,7 @@ class Results:
 
 @contextmanager
 def adding_alone(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, is this process's to add rows to; the lock goes when the process does.
+    """Lock the folder for adding rows, and create it if missing. The lock ends with the process.
 
     Raises:
         InputError: another process adds rows to it.
@@ -127,7 +127,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, object]]) -> None:
-    """The whole file or none of it."""
+    """Write a CSV file whole or not at all."""
     text = io.StringIO()
     writer = csv.DictWriter(text, tuple(fields), restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -136,7 +136,7 @@ def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, ob
 
 
 def machine(device: str = "cpu") -> str:
-    """Processor, cores, a device other than them, and date: the figures are of this machine on this day."""
+    """Processor, cores, another device if there is one, and the date."""
     name = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text().splitlines()

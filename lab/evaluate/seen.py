@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lab.phantom import Phantom
 
 BEHIND = 0.005
-"""Of its depth: a point that lies behind the nearest surface within a pixel by more is hidden by it."""
+"""A point is hidden if it lies behind the nearest surface within a pixel by more than this share of its depth."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What a clip's name means on the command line, and the clip itself.
+"""The names of clips on the command line, and the clips themselves.
 
 PATH                                        anything `reconstruct` reads
 phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0

@@ -1,4 +1,4 @@
-"""Where a method breaks, and whether it says so: one cell is one clip spoilt in one way, trained and judged by truth.
+"""Where a method fails, and whether it warns: a cell is a clip degraded by one condition, trained and scored by truth.
 
 Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
 
@@ -70,7 +70,7 @@ has SEVERITY:CODE of each of the warnings."""
 MAX_LOSS_DB = 3.0
 """Twice the squared error: nobody would call that the same quality."""
 MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG = 1.5, 1.0
-"""Of a path that nobody gave; more is harm, of which a warning of the poses has to tell (POSE_DOUBTS)."""
+"""Error of an estimated camera path above which a cell is harmed and must have a warning in POSE_DOUBTS."""
 MAX_DEPTH_LOSS_MM = 2.0
 """About the width of a grasper's jaw."""
 SEPARATOR = " | "
@@ -86,12 +86,12 @@ class Grid:
     iterations: int = 150
 
     def settings(self, seed: int) -> PhantomSettings:
-        """The clean clip of a seed: each seed has tissue of its own."""
+        """The settings of a seed's clean clip: each seed has its own tissue."""
         return PhantomSettings(width=self.width, height=self.height, frames=self.frames, seed=seed)
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Grid:
-        """What these rows share. Raises InputError if they differ in it, or there are none."""
+        """The grid of these rows. Raises InputError if they have different ones, or there are none."""
         found = {tuple(int(row[each.name]) for each in dataclasses.fields(cls)) for row in rows}
         if not found:
             raise InputError("--out", "the folder holds no rows.", "Leave --redraw out.")
@@ -235,13 +235,13 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
 
 
 def _lost_its_way(row: Row) -> bool:
-    """Whether a path that was to be found is not well found."""
+    """Whether an estimated camera path exceeds the maximum error."""
     limits = zip(PATH, (MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG), strict=True)
     return any(float(row.get(name) or 0) > limit for name, limit in limits)
 
 
 def failure(error: Exception) -> str:
-    """The outcome of a cell that ended in this error."""
+    """The outcome of a cell that ended with this error."""
     if isinstance(error, InputError):
         return "refused"
     return "diverged" if isinstance(error, TrainingDiverged) else "crashed"

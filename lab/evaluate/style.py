@@ -1,4 +1,4 @@
-"""How the charts look: told apart in print and by the colour-blind, and the same bytes from the same rows.
+"""The style of charts: readable in print and by the colour-blind. The same rows give the same bytes.
 
 Colours are those of Okabe and Ito (2008); every series has a mark of its own as well.
 """
@@ -38,7 +38,7 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Look:
-    """Of a series' marks and line; one that is hollow has marks filled with white."""
+    """Colour and marker of a series; hollow: markers are filled with white."""
 
     colour: str
     marker: str
@@ -72,7 +72,7 @@ _LOOKS = {
 BASES_LOOKS = (
     Look("#E69F00", "^"), Look("#56B4E9", "v"), Look("#009E73", "s"), Look("#D55E00", "D"), Look("#CC79A7", "P"),
 )  # fmt: skip
-"""Of the grid's numbers of bases, in rising order; the automatic choice looks like its preset."""
+"""The looks of the grid's numbers of bases, in ascending order; the automatic choice looks like its preset."""
 
 
 def look_of(series: str) -> Look:

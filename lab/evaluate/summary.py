@@ -212,7 +212,7 @@ def capacities(groups: Sequence[Group]) -> list[Capacity]:
 
 
 def _best_beside(chosen: Group, grid: Sequence[Group]) -> tuple[Group, list[float]]:
-    """Of the grid the one with the highest mean, of equals the smallest; and chosen - best, dB, seed by seed."""
+    """The group of the grid with the highest mean score (of equals the smallest), and chosen - best in dB by seed."""
     best = max(grid, key=lambda each: (fmean(each.by_seed("psnr_tissue_db").values()), -each.median("scene_bytes")))
     of_chosen, of_best = chosen.by_seed("psnr_tissue_db"), best.by_seed("psnr_tissue_db")
     return best, [of_chosen[seed] - of_best[seed] for seed in of_chosen if seed in of_best]

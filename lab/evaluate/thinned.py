@@ -1,4 +1,4 @@
-"""A clip of fewer pixels, for methods that draw ray by ray: each pixel costs them the same.
+"""A clip of fewer pixels, for methods that render ray by ray, whose cost grows with the number of pixels.
 
 thinned  every nth pixel of every nth row, to score on: pixels of the clip itself; their camera sends the same rays
 shrunk   squares of n pixels become one, to train on, as a recording at a smaller size would be
@@ -19,7 +19,7 @@ SomeEye = TypeVar("SomeEye", bound=Eye)
 
 
 def lattice(step_px: int) -> tuple[slice, slice]:
-    """The rows and the columns that are left of a picture."""
+    """The rows and the columns of the lattice in a picture."""
     each = slice(step_px // 2, None, step_px)
     return each, each
 
@@ -38,7 +38,7 @@ def thinned_camera(camera: Intrinsics, step_px: int) -> Intrinsics:
 
 
 def dense_camera(thin: Intrinsics, step_px: int) -> Intrinsics:
-    """A camera of which thinned_camera makes the given one."""
+    """The inverse of thinned_camera."""
     first = step_px // 2
     return Intrinsics(
         width=thin.width * step_px,
@@ -51,7 +51,7 @@ def dense_camera(thin: Intrinsics, step_px: int) -> Intrinsics:
 
 
 def thinned(clip: DepthClip, step_px: int) -> DepthClip:
-    """The clip of those pixels alone, both eyes; 1 leaves it as it is."""
+    """The clip on the lattice of pixels, both eyes; unchanged for step_px = 1."""
     if step_px == 1:
         return clip
     right = None if clip.right is None else _thinned_eye(clip.right, step_px)

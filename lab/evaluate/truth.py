@@ -54,22 +54,22 @@ Pose = NDArray[np.float64]
 
 ANGLES_DEG = (10.0, 15.0)
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
-"""Yaw and pitch of the views, in turn from frame to frame."""
+"""Directions (yaw, pitch) of the views; they alternate from frame to frame."""
 JUDGED_FRAMES = 8
 """Held-out frames looked at, evenly spread."""
 TRACK_STRIDE_PX = 4
 MOVING_MM = 1.0
-"""A point that has gone less far counts as resting; stereo's own noise is a few tenths."""
+"""A point that has moved less counts as resting; stereo noise is a few tenths of a mm."""
 SEEN_CELL_TEXELS = 4
 """A material point counts as seen if training frames showed some in the same square of the tissue's texture, about
 three pixels wide, and in all squares about it."""
 FREE_SPACE = 0.03
-"""What is drawn nearer than the true surface by more than this share of its depth hangs in free space."""
+"""A rendered surface that is nearer than the true one by more than this share of its depth lies in free space."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShownView:
-    """What a candidate shows: rgb [H, W, 3] float in [0, 1], depth_mm [H, W], 0 where it draws nothing solid, and
+    """A candidate's render: rgb [H, W, 3] float in [0, 1], depth_mm [H, W], 0 where it draws nothing solid, and
     confidence [H, W] in [0, 1].
     """
 
@@ -79,7 +79,7 @@ class ShownView:
 
 
 class Candidate(Protocol):
-    """What can be judged against the truth."""
+    """A model that can be scored against the truth."""
 
     def view(self, frame: int, pose: Pose) -> ShownView:
         """The tissue at a frame from world_from_camera [4, 4] in mm, with the clip's intrinsics."""
@@ -159,7 +159,7 @@ class Truth:
         self._bounds_db = [_mean_psnr([each.baked for each in views], views) for views in self._views.values()]
 
     def score(self, candidate: Candidate) -> TruthScores:
-        """How near the candidate is to the truth."""
+        """Score the candidate against the truth."""
         at10, at15 = (self._shown(candidate, views) for views in self._views.values())
         views10, views15 = self._views.values()
         shown, expected = at10 + at15, views10 + views15
@@ -226,7 +226,7 @@ class Truth:
         return depth_agreement_mm(errors)
 
     def _motion(self, candidate: Candidate) -> tuple[float, float, float]:
-        """Medians in mm: end-point error of all, of what moves, and how far that has moved."""
+        """Medians in mm: end-point error of all points, of moving points, and the displacement of moving points."""
         row, column = self._tracks.pixels.T
         tissue = self._tissue_of_tracks[row, column]
         row, column, points_mm = row[tissue], column[tissue], self._tracks.points_mm[:, tissue]
@@ -243,7 +243,7 @@ class Truth:
 
 
 class SceneCandidate:
-    """A stored scene as it is rendered."""
+    """A stored scene as a Candidate."""
 
     def __init__(self, scene: TrainedScene) -> None:
         self._scene, self._model = scene, model_of(scene)
@@ -291,7 +291,7 @@ def _seen_by(
             row, column, shows = _cells(surface.atlas_xy)
             visible = shows & shown[frame]
             seen[row[visible], column[visible]] = True
-    # Where the tissue lies obliquely, neighbouring pixels are more than a square apart: first such gaps are closed.
+    # On oblique tissue, neighbouring pixels are more than a square apart: close such gaps first.
     closed = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     inner = closed if not eroded else cv2.erode(closed, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(inner, np.bool_), float(np.median(medians_mm))
@@ -326,7 +326,7 @@ def _share_solid(shown: Sequence[ShownView], expected: Sequence[Expected]) -> fl
 
 
 def errors_of(shown: Sequence[ShownView], expected: Sequence[Expected]) -> PixelErrors:
-    """The errors of every pixel that shows tissue in truth."""
+    """The errors of every pixel that shows tissue in the truth."""
     return together(
         [
             pixel_errors(view.confidence, (view.rgb, each.rgb), (view.depth_mm, each.depth_mm), each.depth_mm > 0)

@@ -37,7 +37,7 @@ from tests.intrasplat.splat.scenes import SplatScene, pixels_near_a_cut, random_
 
 FIELDS = ("check", "worst", "limit", "ok", "seconds", "detail")
 LIMIT = 1e-3
-"""Relative error of a kernel that is believed; tests hold small cases to 1e-4."""
+"""Maximum relative error of a correct kernel; tests limit small cases to 1e-4."""
 EIGHT_BITS = 1 / 255
 RATES = StepRates(2e-3, 3e-3, 4e-3, 5e-3, 6e-3, 8e-3, 1e-3, *[7e-3] * 5, eps=1e-8)
 """eps is far above rounding, so that gradients that are nothing but rounding do not become whole steps."""
@@ -46,8 +46,8 @@ Differences = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Of the scenes: Gaussians and pixels of the reference's and of the models', and steps that a model is trained; and
-    of stereo pairs: pixels, error in px that is accepted."""
+    """Sizes of the checks: Gaussians and pixels of the reference's scenes and of the models, steps of training; pixels
+    of stereo pairs, and their maximum error in px."""
 
     count: int
     width: int
@@ -63,7 +63,7 @@ class Sizes:
 
 REAL = Sizes(1500, 96, 80, 4000, 160, 128, 70, 640, 512, 0.1)
 SMALL = Sizes(16, 9, 7, 12, 9, 8, 2, 64, 24, 0.25)
-"""In Triton's interpreter; of a width that ends within a tile."""
+"""Sizes for Triton's interpreter; the width ends within a tile."""
 
 
 def main() -> None:
@@ -101,7 +101,7 @@ class Checks:
         self._made = 0
 
     def make(self, name: str, limit: float, check: Callable[[], Differences]) -> bool:
-        """Make one and write its row; whether it failed. What is raised is a failure too."""
+        """Run one check and write its row. Returns whether it failed; an exception is a failure too."""
         start = time.perf_counter()
         try:
             found = check()
@@ -119,7 +119,7 @@ class Checks:
         return not ok
 
     def _random(self) -> int:
-        """Another seed each time, of the run's."""
+        """Another seed each time, derived from the run's seed."""
         self._made += 1
         return self._part.seed + self._made
 
@@ -202,7 +202,7 @@ class Checks:
         ]
 
     def deformed(self, kinds: Sequence[str]) -> Differences:
-        """Where the Gaussians are at some time, against the same in float64."""
+        """Compare deformed Gaussians with float64."""
         worst = {}
         for kind in kinds:
             gaussians, deformation = self._parts(kind)
@@ -224,7 +224,7 @@ class Checks:
         model.wait()
 
     def steps(self, kind: str, sh_degree: int = 0) -> Differences:
-        """How far a few steps, the last on two frames, take every parameter, beside how far they take the CPU's."""
+        """Compare the changes of every parameter in a few steps, the last on two frames, with the CPU's."""
         size = self.sizes
         cpu = CpuModel(*self._parts(kind, sh_degree), size.model_width, size.model_height)
         cuda = self._model(kind, sh_degree)
@@ -240,7 +240,7 @@ class Checks:
         }
 
     def full_size(self, width: int = WIDTH, height: int = HEIGHT, frames: int = 16) -> Differences:
-        """Steps and pictures of the scene that is timed: numbers as large as they get, several frames at once."""
+        """Check steps and pictures of the timed scene: the largest sizes, several frames at once."""
         gaussians, camera = grid_scene(width, height, GRID_STEP_PX)
         view, shared = camera_vector(camera), SharedBasis.initial(len(gaussians), bases=BASES, colour=True)
         noise = Noise(random_scene(1, width=width, height=height), self._random())
@@ -269,7 +269,7 @@ class Checks:
         return _different(first, second)
 
     def little_room(self) -> Differences:
-        """A model whose buffers are too small for the first step, beside one with room."""
+        """Compare a model whose buffers are too small for the first step with one whose buffers are large enough."""
         ample, tight = self._model("shared"), self._model("shared")
         tight._training.rasterizer.reserve(tight._training.state.shape[2], 8)
         for model in (ample, tight):
@@ -279,7 +279,7 @@ class Checks:
         return _different(ample, tight)
 
     def stereo(self) -> Differences:
-        """Disparities beside the planes' own; and how many differ when the same pairs are matched again."""
+        """Compare disparities with the planes' own, and count those that differ when the pairs are matched again."""
         size = self.sizes
         left, right, disparity, plan = stereo_pairs(2, size.stereo_width, size.stereo_height, self._random())
         one, other = (torch.from_numpy(each).to(self._device) for each in (left, right))

@@ -1,4 +1,4 @@
-"""What all parts of check.py share: folders, deadline, rows, and a clock of the device.
+"""Shared by all parts of check.py: folders, deadline, rows, and a clock of the device.
 
 Each part is a process, so that an error in one, even of the device's memory, does not break another. A part writes each
 row when it is measured, with the machine, the versions and the commit.
@@ -33,7 +33,7 @@ class Part:
 
     out, work    folders of its CSV file, and of what the parts hand on
     deadline     Unix time at which check.py ends it; it starts nothing that it cannot finish by then
-    doubt        why nobody should believe its figures; empty if nothing speaks against them
+    doubt        why its figures are unreliable; empty if they are reliable
     interpret    on tiny sizes in Triton's interpreter, where no duration means anything
     seed         of all that is random
     """

@@ -24,7 +24,7 @@ from tests.intrasplat.splat.scenes import SplatScene, pixels_near_a_cut
 
 LOSS = LossSettings(depth_weight=20.0, colour_huber_delta=0.05, depth_huber_delta=1e-3)
 NOT_BUFFERS = frozenset({"ok", "needed", "_borders", "_camera", "_state", "_opacity_logit"})
-"""Of a rasteriser's tensors: what outlives a projection, a constant, and its caller's."""
+"""Tensors of a rasteriser that are not buffers: they outlive a projection, are constant, or belong to its caller."""
 
 
 class Noise:
@@ -69,7 +69,7 @@ class Noise:
         return torch.from_numpy(frame.loss_settings(LOSS))
 
     def gradients(self, scene: SplatScene) -> dict[str, Tensor]:
-        """Of the loss, in float64, to what the rasteriser takes: log-scales and logits."""
+        """Gradients of the loss in float64 with respect to the rasteriser's inputs, with log-scales and logits."""
         live = scene.to(torch.float64)
         log_scale, logit = live.scale.log().requires_grad_(), torch.logit(live.opacity).requires_grad_()
         mean, quaternion, colour = (each.clone().requires_grad_() for each in (live.mean, live.quaternion, live.colour))
@@ -85,7 +85,7 @@ class Noise:
 
 
 def poison(rasterizer: CudaRasterizer) -> None:
-    """Fill every buffer with what no computation may read: NaN, and the largest integer."""
+    """Fill every buffer with values that no computation may read: NaN and the largest integer."""
     held = {name: each for name, each in vars(rasterizer).items() if name not in NOT_BUFFERS}
     for each in [*held.values(), *vars(rasterizer.gradients).values()]:
         if isinstance(each, Tensor):

@@ -1,4 +1,4 @@
-"""Part of check.py: how long a step and a picture take, and what they spend it on.
+"""Part of check.py: the durations of a step and a picture, and of their parts.
 
 The standard scene is that of bm_raster.py: 640x512, a Gaussian every 2.86 pixels each way (40,096), with 17 shared
 bases and moving colour, and with the paper's FDM of 17 bases. Durations are medians of the device's own events. Rows
@@ -81,7 +81,7 @@ class Speed:
         return SharedBasis.initial(number, bases=BASES, colour=True)
 
     def frame(self, t: float) -> TrainingFrame:
-        """Noise: every pixel has a gradient."""
+        """A frame of noise, so that every pixel has a gradient."""
         random, pixels = np.random.default_rng(int(1000 * t)), self._height * padded(self._width)
         target = Target(
             random.integers(0, 256, 3 * pixels, dtype=np.uint8),
@@ -101,7 +101,7 @@ class Speed:
         self.add("compilation, cache full", _seconds_of_another_process(), "s", clock="host")
 
     def first_step_s(self) -> float:
-        """Of a step, a picture and an image's gradient of a new model."""
+        """Seconds of a step, a picture and an image gradient of a new model."""
         model, frame = self.model("shared"), self.frame(TIME)
         synchronize(self._device)
         start = time.perf_counter()
@@ -214,7 +214,7 @@ class Speed:
     # Pictures
 
     def pictures(self) -> None:
-        """Of the standard scene: one on the host, one on the device, and several times at once."""
+        """Time pictures of the standard scene: one for the host, one on the device, and several at once."""
         model = self.model("shared")
         times = iter(np.random.default_rng(0).uniform(0, 1, 100_000))
         calls = 1 if self._part.interpret else 20
@@ -268,7 +268,7 @@ def compile_again() -> None:
 
 
 def _nested(ms: dict[str, float]) -> dict[str, float]:
-    """What was timed within something else, taken out of it."""
+    """Subtract nested timings from those that contain them."""
     return {
         "deform": ms["deform"],
         "project": ms["project"] - ms["_bin"],

@@ -45,7 +45,7 @@ FRAMES_A_STEP = (1, 2, 4)
 POINT_FIELDS = ("t_train_s", "iteration", "psnr_tissue_db")
 CURVE_FIELDS = ("clip", "preset", "frames_a_step", "device", "seed", *POINT_FIELDS)
 MOMENTS_S = (*np.arange(0.1, 2.0, 0.1), *np.arange(2.0, 6.0, 0.25), *np.arange(6.0, 60.0, 2.0))
-"""Of t_train_s, at which held-out frames are scored: closer than those of a report, for a run is over in seconds."""
+"""Values of t_train_s at which held-out frames are scored; closer than a report's, because a run takes seconds."""
 FAST_BUDGET_S, CPU_BUDGET_S = 15.0, 45.0
 MIN_LEFT_S = {"paper": 45.0, "fast": 24.0, "cpu": 35.0}
 """A run starts only if so many seconds are left of the part, for its training and its scoring."""

@@ -1,1 +1,1 @@
-"""Rows of lab/rows/ in; the results page and the README's evaluation block out: `python -m lab.pages`."""
+"""`python -m lab.pages` writes the results page and the README's evaluation block from the rows in lab/rows/."""

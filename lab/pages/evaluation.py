@@ -1,6 +1,6 @@
-"""The part of docs/results/index.md, and of README.md, that `python -m lab evaluate` has the rows for.
+"""The part of docs/results/index.md, and of README.md, from the rows of `python -m lab evaluate`.
 
-Every sentence with a figure in it is made from rows; the others hold whatever the rows say.
+Every sentence with a figure is generated from rows; the other sentences do not depend on them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is measured of a camera that moves, its path and the tissue that it shows, and of clips without masks."""
+"""The parts of docs/results/index.md on moving cameras, tissue that comes into view, and clips without masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The part of docs/results/index.md that `python -m lab stability` has the rows for."""
+"""The part of docs/results/index.md from the rows of `python -m lab stability`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Settings in; a stereo clip of synthetic tissue and its true depth and motion out.
+"""The phantom: stereo clips of synthetic tissue with true depth and motion.
 
-Verbs: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
+Functions: make_phantom, write_endonerf, write_stereomis, write_stereo_video.
 """
 
 from lab.phantom.camera import orbit_pose

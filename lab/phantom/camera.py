@@ -23,18 +23,18 @@ from numpy.typing import NDArray
 from lab.phantom.settings import CAMERA_PATHS, FOCAL_PER_WIDTH, MEAN_DEPTH_MM, CameraPath, PhantomSettings
 
 SWING_DEG = (4.0, 2.5)  # yaw and pitch
-SWING_PERIODS = (2.3, 3.1)  # of the tissue's period, so that the view never repeats with the tissue
+SWING_PERIODS = (2.3, 3.1)  # in periods of the tissue, so that the view never repeats with the tissue
 DOLLY_MM = 5.0
 
 PAN_VIEWS = 1.5
-PAN_BOW_MM, PAN_BOW_DEG = 8.0, 6.0  # down and to the right, half-way: no hand moves along a line
+PAN_BOW_MM, PAN_BOW_DEG = 8.0, 6.0  # deviation down and to the right, half-way: no hand moves along a line
 ADVANCE_MM = 30.0
 ROLL_DEG = 20.0
 TURN_DEG, TURN_S, TURN_START_S = 5.0, 1.5, 0.4  # as fast as the kinematics of real recordings show
 PORT_BEHIND_MM = 120.0  # the endoscope turns about its port in the abdominal wall
-RAMP = 0.2  # share of a movement in which it gathers speed, and in which it loses it
+RAMP = 0.2  # share of a movement for acceleration, and for deceleration
 
-# A hand is faster than a breath, whose usual 36 frames are 0.7 Hz: at one frequency nobody could tell them apart.
+# A hand is faster than a breath, whose usual 36 frames are 0.7 Hz: at equal frequency they could not be separated.
 SWAY_MM, SWAY_MM_HZ = np.array([1.8, 1.5, 1.1]), np.array([1.1, 1.6, 1.3])  # along x, y, z
 SWAY_DEG, SWAY_DEG_HZ = np.array([0.6, 0.8, 0.6]), np.array([1.7, 1.2, 2.1])  # about x, y, z
 TREMOR_HZ = np.array([5.3, 6.1, 7.3])
@@ -61,7 +61,7 @@ def endoscope_pose(frame: float, settings: PhantomSettings) -> Pose:
 
 
 def working_place_mm(frame: float, settings: PhantomSettings) -> NDArray[np.float64]:
-    """(right, down) [2] of the tissue that is worked at: a pan follows the instruments from place to place."""
+    """(right, down) [2] mm of the tissue below the instruments, which a pan follows."""
     return _pan(frame, settings)[:2, 3] if "pan" in settings.camera else np.zeros(2)
 
 
@@ -131,7 +131,7 @@ def _done(frame: float, settings: PhantomSettings) -> float:
 
 
 def _eased(share: float) -> float:
-    """From 0 to 1 at an even speed but for both ends, where it starts and stops gently."""
+    """From 0 to 1 at constant speed, with acceleration and deceleration at the ends."""
     share = min(max(share, 0.0), 1.0)
     if share > 0.5:
         return 1 - _eased(1 - share)
@@ -140,7 +140,7 @@ def _eased(share: float) -> float:
 
 
 def _moved(by_mm: NDArray[np.float64] | tuple[float, ...], by_deg: NDArray[np.float64] | tuple[float, ...]) -> Pose:
-    """A camera moved along (x, y, z) and turned about the vector by_deg, whose length is the angle."""
+    """A camera translated by (x, y, z) and rotated about the vector by_deg, whose length is the angle."""
     pose = np.eye(4)
     pose[:3, :3], _ = cv2.Rodrigues(np.deg2rad(np.asarray(by_deg, np.float64)))
     pose[:3, 3] = by_mm

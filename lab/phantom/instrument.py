@@ -24,11 +24,11 @@ JAW_MM, WRIST_MM, SHAFT_MM = 11.0, 22.0, 150.0  # from the tip, where each part 
 JAW_HALF_MM = (1.7, 0.9)  # half width and half thickness at the jaw's root
 WRIST_RADIUS_MM, SHAFT_RADIUS_MM = 2.7, 4.0
 PORTS_MM = np.array([[70.0, 62.0, 6.0], [-66.0, 58.0, 4.0], [-24.0, -74.0, 10.0]])
-"""Of the instruments, in turn, in the abdominal wall: below right, below left and above frame 0's camera."""
-HOVER_MM = 3.0  # of the tip above tissue that it does not hold
-RETREAT_MM = 16.0  # after the release
-LEAVE_MM = 60.0  # of the instruments but the first: as far they draw back, which takes them out of view
-TURN_RAD = 2.1  # of its round, by which each instrument is ahead of the one before
+"""The instruments' ports in the abdominal wall, mm: below right, below left and above frame 0's camera."""
+HOVER_MM = 3.0  # height of the tip above tissue that it does not grip
+RETREAT_MM = 16.0  # distance from the tissue after the release
+LEAVE_MM = 60.0  # how far all instruments but the first draw back, which takes them out of view
+TURN_RAD = 2.1  # phase on its orbit by which each instrument is ahead of the one before
 JAW_OPEN_RAD = 0.30
 STEEL = np.array([0.42, 0.43, 0.44])
 SHAFT_GREY = np.array([0.075, 0.078, 0.082])

@@ -99,7 +99,7 @@ class PhantomSettings:
 
     @property
     def calibration(self) -> RectifiedCalibration:
-        """Of both eyes."""
+        """The calibration of both eyes."""
         camera = self.intrinsics
         return RectifiedCalibration(
             model="rectified",

@@ -1,4 +1,4 @@
-"""Light on wet tissue and on metal. All light is linear until to_srgb. P points.
+"""Illumination of wet tissue and metal. All light is linear until to_srgb. Symbols: P points.
 
 The lamp sits in the endoscope: surfaces that face it are bright. Its light falls off with the squared distance and
 towards the rim of its beam, which looks like gentle vignetting. Wet places that mirror the lamp to the eye glint. For a

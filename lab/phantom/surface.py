@@ -19,8 +19,8 @@ from lab.phantom.motion import CUT_HALF_LENGTH_MM, CUT_SLANT, Cut, TissueMotion,
 from lab.phantom.settings import MEAN_DEPTH_MM, PhantomSettings
 
 DEPTH_RANGE_MM = (58.0, 104.0)  # of the sheet at rest
-SHEET_PER_VIEW = 1.75  # the sheet over the view at mean depth: it leaves room for motion and other views
-MIN_HALF_MM = 30.0  # of the sheet, so that a cut fits into the flattest picture
+SHEET_PER_VIEW = 1.75  # size of the sheet over the view at mean depth, with a margin for motion and other views
+MIN_HALF_MM = 30.0  # minimum half size of the sheet, so that a cut fits into the flattest picture
 TILT_MM_PER_MM = (0.06, -0.2)  # (right, down): the lower edge is nearer, as seen along a cavity
 LOOPS_MM = ((34.0, 11.0, 0.12), (13.0, 1.9, 0.15))  # (wavelength, height, crease) of folds and of lobes on them
 RELIEF_MM = (4.5, 0.16)  # (wavelength, height)
@@ -118,7 +118,7 @@ class Surface:
 
 
 def room_mm(settings: PhantomSettings) -> tuple[float, float]:
-    """Half the extent (right, down) of what a fixed endoscope needs: the view, room for motion and for other views."""
+    """Half the extent (right, down) of the sheet for a fixed endoscope: the view, and a margin for motion and views."""
     pixel_mm = MEAN_DEPTH_MM / settings.intrinsics.fx
     half_u, half_v = (
         max(SHEET_PER_VIEW * pixel_mm * side / 2, MIN_HALF_MM) for side in (settings.width, settings.height)

@@ -17,8 +17,8 @@ from intrasplat.splat.reference import rotation
 from intrasplat.train.densify import SPLIT_SHRINK, successors
 
 PARAMETERS = 6
-"""Of Gaussians, each in a group of its own, and these the optimiser's first groups: mean [N, 3] in units,
-quaternion [N, 4], log_scale [N, 3], opacity_logit [N, 1], then two of colours: [N, 1, 3], and harmonics [N, K, 3]."""
+"""Number of the Gaussians' parameters. They are the optimiser's first groups, one group each: mean [N, 3] in units,
+quaternion [N, 4], log_scale [N, 3], opacity_logit [N, 1], colour [N, 1, 3] and harmonics [N, K, 3]."""
 
 
 class AdaptiveDensity:

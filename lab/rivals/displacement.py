@@ -14,7 +14,7 @@ from lab.rivals.planes import Planes
 
 MEAN, QUATERNION, LOG_SCALE, OPACITY = slice(0, 3), slice(3, 7), slice(7, 10), 10
 WIDTHS = (3, 4, 3, 1)
-"""Of these columns; each has a decoder of its own."""
+"""The numbers of columns of mean, quaternion, log-scale and opacity; each has its own decoder."""
 DEFORMED = sum(WIDTHS)
 
 

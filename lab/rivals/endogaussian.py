@@ -135,7 +135,7 @@ class EndoGaussian(Rival):
         return loss
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """Of one frame: colour and inverse depth where there is tissue, and how uneven the picture is anywhere."""
+        """The loss of one frame: colour and inverse depth on tissue, and the total variation of the whole picture."""
         seen, frame = self._seen, self._with_tissue[0]
         static = self._is_static(iteration, progress)
         if not static:
@@ -164,7 +164,7 @@ class EndoGaussian(Rival):
     def motion_mm(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
     ) -> NDArray[np.float32]:
-        """The displacements of the Gaussians that a pixel is blended of, blended with the same weights."""
+        """The displacements of a pixel's Gaussians, blended with the weights of its colour."""
         first, deformed = self._deformed(0.0), self._deformed(t)
         distance_mm = (deformed[:, MEAN] - first[:, MEAN]) / self._scale
         camera = camera_in_units(intrinsics, world_from_camera, self._scale)

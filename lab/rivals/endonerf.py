@@ -28,7 +28,7 @@ GUIDES = 8
 """Training frames nearest in time whose depth guides the rays of a render."""
 
 CPU_RAYS = 128
-"""Of a step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
+"""Rays per step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class EndoNerf(Rival):
         return [decayed((self.settings.rate, self.settings.last_rate), progress)]
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """Of rays of one frame: mean squared colour error and mean depth error where there is depth."""
+        """The loss of rays of one frame: mean squared colour error, and mean depth error where depth is known."""
         seen, random = self._seen, self.generator(iteration)
         frame = self._with_tissue[int(torch.randint(len(self._with_tissue), (), generator=random))]
         drawn = drawn_pixels(cumulated(self._importance * seen.tissue[frame]), self.settings.rays, random)

@@ -25,7 +25,7 @@ from intrasplat.train.targets import solid_depth_mm
 from lab.rivals.rival import Seen
 
 MARGIN = 0.05
-"""Of the box's size, on each side."""
+"""Margin on each side, as a share of the box's size."""
 SOLID = 1e10
 """Length of a ray's last sample: whatever is dense there ends the ray."""
 OUTLIERS = 0.001
@@ -78,7 +78,7 @@ class Box:
 
 
 def _projected(points_mm: Tensor) -> Tensor:
-    """x / z, y / z, 1 / z; z is held at 1 mm."""
+    """x / z, y / z, 1 / z; z is at least 1 mm."""
     inverse = 1 / points_mm[..., 2:].clamp(min=1.0)
     return torch.cat([points_mm[..., :2] * inverse, inverse], -1)
 
@@ -103,7 +103,7 @@ def weights_along(density: Tensor, length: Tensor) -> Tensor:
 
 
 def cumulated(weight: Tensor) -> Tensor:
-    """What drawn_pixels draws by, of weights of any shape."""
+    """The cumulative sum of weights of any shape, for drawn_pixels."""
     return torch.cumsum(weight.flatten().double(), 0)
 
 

@@ -33,13 +33,13 @@ WINDOW = 2
 """Frames before and after with which a frame is compared, for the importance of its pixels."""
 
 HUBER_DELTA = 0.2
-"""In s: the depth error from which its loss is linear."""
+"""The depth error in s above which its loss is linear."""
 
 HANDED_ON = 15
-"""Features that colour is decoded from, beside density."""
+"""Number of features from which colour is decoded, besides density."""
 
 CPU_RAYS = 512
-"""Of a step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
+"""Rays per step on a processor, where 2048 leave time for few steps (docs/rivals.md)."""
 
 
 @dataclass(frozen=True)
@@ -177,9 +177,9 @@ class LerPlane(Rival):
 
 
 def importance(seen: Seen, least: float, most: float) -> Tensor:
-    """[F, H, W] weight with which a pixel is drawn: how much its colour differs from the frames around, held between
-    least and most, over how often it shows tissue; 0 where it does not. Instruments are black, so that tissue
-    which they hide in a frame around has changed."""
+    """[F, H, W] weight with which a pixel is drawn: the difference of its colour from neighbouring frames, clamped to
+    [least, most], divided by how often it shows tissue; 0 where it does not. Instruments are black, so tissue that
+    they hide in a neighbouring frame counts as changed."""
     shown = seen.rgb * seen.tissue[..., None]
     weight = torch.empty_like(seen.depth_mm)
     often = seen.tissue.sum(0).clamp(min=1) / len(seen)

@@ -94,7 +94,7 @@ class _MeanSquaredDifference(Function):
 
 
 def mean_squared_difference(values: Tensor, axis: int, order: int) -> Tensor:
-    """Of neighbours along an axis (order 1), or of their differences (order 2)."""
+    """The mean squared difference of neighbours along an axis (order 1), or of their differences (order 2)."""
     found: Tensor = _MeanSquaredDifference.apply(values, axis, order)  # type: ignore[no-untyped-call]
     return found
 

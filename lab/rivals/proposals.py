@@ -36,18 +36,18 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, random: torch.Generat
 
 
 def lengths(edges: Tensor) -> Tensor:
-    """Of the intervals between the edges [M, K + 1]: [M, K], in s; the last one is opaque."""
+    """Lengths [M, K] in s of the intervals between the edges [M, K + 1]; the last one makes its interval opaque."""
     return torch.cat([edges.diff(dim=-1)[:, :-1], torch.full_like(edges[:, :1], SOLID)], 1)
 
 
 def middles(edges: Tensor) -> Tensor:
-    """Of the intervals between the edges [M, K + 1]: [M, K]."""
+    """Middles [M, K] of the intervals between the edges [M, K + 1]."""
     return (edges[:, 1:] + edges[:, :-1]) / 2
 
 
 def interlevel_loss(edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor) -> Tensor:
-    """By how much weights [M, S] exceed what the proposals [M, K] allow where they overlap, as a mean over samples
-    (Barron et al., 2022)."""
+    """How far weights [M, S] exceed the sum of the overlapping proposals [M, K], as a mean over samples (Barron et al.,
+    2022)."""
     total = torch.cat([torch.zeros_like(proposed[:, :1]), torch.cumsum(proposed, -1)], -1)
     most = proposed.shape[1]
     at = proposed_edges.contiguous()

@@ -1,4 +1,4 @@
-"""What a rival is: a published method that learns from the left eye's training frames and renders any time and pose.
+"""A rival: a published method that learns from the left eye's training frames and renders any time and pose.
 
 Symbols: F training frames, H W pixels. Lengths in mm of the clip's world.
 """
@@ -66,7 +66,7 @@ class Seen:
 
 
 class Rival(ABC):
-    """A method in training. All that is random follows from its seed and the iteration.
+    """A method in training. All random numbers follow from its seed and the iteration.
 
     not_measured     which figures of a row it cannot have, and why
     published_steps  iterations of its paper, at which a run ends if its budget does not end it before
@@ -137,14 +137,14 @@ class Rival(ABC):
 
 
 def decayed(first_and_last: tuple[float, float], share: float) -> float:
-    """What falls exponentially from the first to the last, after a share of its way."""
+    """A value that decays exponentially from the first to the last, at a share of the training in [0, 1]."""
     first, last = first_and_last
     return first * math.exp(share * math.log(last / first))
 
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """What torch draws on the CPU within the block follows from the seed; what it draws afterwards does not."""
+    """Torch's random numbers on the CPU within the block follow from the seed; later ones do not."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield

@@ -1,4 +1,4 @@
-"""A rival is trained on a clip and judged as every model is: same frames, same clock, same scores.
+"""Trains a rival on a clip and scores it like every model: same frames, same clock, same scores.
 
 Learning rates follow the share of the budget that is used, so a larger budget lowers them later. The iterations of the
 paper end a run that has budget left. With a number of iterations nothing reads the clock, and the same seed gives the
@@ -52,11 +52,11 @@ class Length:
     budget_s: float | None
 
     def time_share(self, elapsed_s: float) -> float:
-        """How much of the budget of seconds is used; 0 without one."""
+        """The used share of the budget of seconds; 0 without one."""
         return 0.0 if self.budget_s is None else elapsed_s / self.budget_s
 
     def progress(self, made: int, elapsed_s: float) -> float:
-        """The share that is done; 1 or more at the end."""
+        """The share of the training that is done; 1 or more at the end."""
         of_iterations = 0.0 if self.iterations is None else made / self.iterations
         return max(of_iterations, self.time_share(elapsed_s))
 
@@ -75,7 +75,7 @@ class Renders:
         return self._known[key]
 
     def forget(self) -> None:
-        """The rival has been trained further."""
+        """Drop all pictures, because the rival has been trained further."""
         self._known.clear()
 
 
