@@ -1,4 +1,4 @@
-"""Files in; a StereoClip, or a DepthClip if depth came along, out. Verbs: open_clip, find_calibration, split_frames."""
+"""Files in; a StereoClip, or with depth a DepthClip, out. Verbs: open_clip, find_calibration, split_frames."""
 
 from intrasplat.clip.opening import find_calibration, open_clip
 from intrasplat.clip.split import FrameSplit, held_out_frames, split_frames, spread, training_frames

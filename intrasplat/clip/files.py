@@ -1,6 +1,6 @@
-"""A folder, a zip or a single image as one flat list of named files, read in memory.
+"""A folder, a zip or a single image as one flat list of named files, read into memory.
 
-Archives are untrusted: intrasplat/intake/zips.py says what is refused, and no member is written under its own name.
+Archives are untrusted: intrasplat/intake/zips.py defines what is refused, and no member is written under its own name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from intrasplat.intake.zips import UNREADABLE, check_member_count, open_zip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm"})
-MAX_FOLDER_DEPTH = 6  # levels below the given folder; it also ends a loop of linked folders
+MAX_FOLDER_DEPTH = 6  # levels below the given folder; also limits a loop of linked folders
 _CHUNK_BYTES = 1 << 20
 _LAYOUT_FOLDERS = frozenset({"images", "depth", "masks", "mask", "left", "right"})  # never removed as a wrapping folder
 
@@ -38,7 +38,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 class FileTree(ABC):
     """Files by relative name ("images/000001.png"), in natural order, without wrapping folders.
 
-    field is the input at fault in errors ("clip", "masks", "right"); label names the tree in messages.
+    field is the input that errors name ("clip", "masks", "right"); label is the tree's name in messages.
     """
 
     field: str
@@ -48,14 +48,14 @@ class FileTree(ABC):
 
     @abstractmethod
     def open(self, name: str) -> IO[bytes]:
-        """The file for reading; may raise what zipfile and the operating system raise."""
+        """The file, open for reading. Raises the exceptions of zipfile and of the operating system."""
 
     def path(self, name: str) -> Path | None:
         """The file's path on disk; None inside an archive."""
         return None
 
     def read(self, name: str, max_bytes: int) -> bytes:
-        """Content of a file. InputError if it is unreadable, LimitError if it is larger than max_bytes."""
+        """The content of a file. InputError if it is unreadable, LimitError if it is larger than max_bytes."""
         return b"".join(self._chunks(name, max_bytes))
 
     def head(self, name: str, size: int) -> bytes:
@@ -73,7 +73,7 @@ class FileTree(ABC):
                 stream.write(chunk)
 
     def _chunks(self, name: str, max_bytes: int, size: int = _CHUNK_BYTES) -> Iterator[bytes]:
-        """Content piece by piece. It is counted while it is inflated, because an archive may declare a false size."""
+        """The content in chunks. Bytes are counted during inflation, because an archive may declare a false size."""
         total = 0
         try:
             with self.open(name) as stream:
@@ -91,7 +91,7 @@ class FileTree(ABC):
             ) from error
 
     def images(self, folder: str | None = None) -> tuple[str, ...]:
-        """Image files of the tree, or only those directly in `folder`."""
+        """The image files of the tree, or only those directly in `folder`."""
         return tuple(
             name
             for name in self.names
@@ -124,7 +124,7 @@ class _Zip(FileTree):
 
 
 def open_tree(path: Path, field: str, limits: ClipLimits) -> FileTree | None:
-    """The files of a folder, of a zip (detected by content) or a single image; None for any other file."""
+    """The files of a folder or of a zip (detected by content), or a single image; None for any other file."""
     if path.is_dir():
         return _open_folder(path, field, limits)
     if zipfile.is_zipfile(path):
@@ -171,7 +171,7 @@ def _open_zip(path: Path, field: str, limits: ClipLimits) -> FileTree:
 
 
 def _without_wrapping(items: dict[str, _Item]) -> dict[str, _Item]:
-    """The items without files of file managers and without wrapping folders ("clip/images/..." -> "images/...")."""
+    """The items without file managers' own files and wrapping folders ("clip/images/..." -> "images/...")."""
     kept = {name: item for name, item in items.items() if not _is_litter(name)}
     while kept:
         first = {name.split("/", 1)[0] for name in kept}

@@ -1,4 +1,4 @@
-"""PNG and JPEG frames, size-checked in the header before a decoder sees them.
+"""PNG and JPEG frames. Their size is checked in the header before decoding.
 
 Symbols: T frames, H W pixels.
 """
@@ -23,12 +23,12 @@ from intrasplat.notices import Notice
 MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing make grey edges
 _HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
-_JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are none
+_JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are no frame headers
 
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """T images of one size as a restartable sequence of RGB frames."""
+    """T images of one size as a sequence of RGB frames, which can be read repeatedly."""
 
     tree: FileTree
     names: tuple[str, ...]
@@ -46,12 +46,12 @@ class ImageSequence:
         return self.tree.label
 
     def frames(self) -> Iterator[RgbFrame]:
-        """RGB uint8 [H, W, 3], from the first frame on. InputError if an image is damaged."""
+        """The frames, RGB uint8 [H, W, 3], from the first on. InputError if an image is damaged."""
         for name in self.names:
             yield as_rgb(self.decode(name), self.tree.field, name)
 
     def decode(self, name: str) -> NDArray[Any]:
-        """The pixels as stored, size checked: [H, W] or [H, W, channels], uint8 or uint16, colours in BGR order."""
+        """The pixels as stored, with their size checked: [H, W] or [H, W, channels], uint8 or uint16, BGR order."""
         metadata_bytes, pixel_bytes = MAX_IMAGE_BYTES
         data = self.tree.read(name, metadata_bytes + pixel_bytes * self.width * self.height)
         image = decode_image(data, self.tree.field, name)
@@ -62,7 +62,7 @@ class ImageSequence:
 
 
 def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
-    """Checks every image's header: all of one size, and within the tree's limits. InputError, LimitError."""
+    """The images as a sequence, after a check of every header. InputError if sizes differ; LimitError."""
     if not names:
         raise InputError(tree.field, f"{tree.label} holds no PNG or JPEG images.", "Give the frames as PNG files.")
     width, height = _size_of(tree, names[0])
@@ -90,7 +90,7 @@ def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
 
 
 def as_rgb(image: NDArray[Any], field: str, name: str) -> RgbFrame:
-    """RGB uint8 [H, W, 3] of a decoded image: grey is repeated, alpha dropped, 16 bit scaled to 8."""
+    """A decoded image as RGB uint8 [H, W, 3]: grey is repeated, alpha dropped, 16 bit scaled to 8."""
     if image.dtype == np.uint16:
         if 0 < image.max() <= 255:
             raise InputError(
@@ -102,14 +102,14 @@ def as_rgb(image: NDArray[Any], field: str, name: str) -> RgbFrame:
 
 
 def as_mask(image: NDArray[Any]) -> NDArray[np.bool_]:
-    """Bool [H, W] of a decoded mask: True where any colour channel reaches half of its range."""
+    """A decoded mask as bool [H, W]: True where any colour channel reaches half of its range."""
     threshold = MASK_THRESHOLD * 257 if image.dtype == np.uint16 else MASK_THRESHOLD
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     return np.asarray(colours >= threshold)
 
 
 def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float32]:
-    """Depth [H, W] float32 in mm of a decoded depth image; 0 = invalid. InputError if it is a colour picture."""
+    """A decoded depth image as float32 [H, W] in mm; 0 = invalid. InputError if it is a colour picture."""
     if image.ndim == 3:
         if not (image[:, :, 0] == image[:, :, 1]).all() or not (image[:, :, 0] == image[:, :, 2]).all():
             raise InputError(

@@ -1,7 +1,7 @@
-"""Instrument masks: which pixels are tissue, and what decided it.
+"""Instrument masks: which pixels are tissue, and how white was interpreted.
 
-Masks show the left eye, or both: told apart by their names, two videos or one image a frame and eye, or packed into one
-picture as frames are. What white means is decided once, by the left eye.
+Masks show the left eye or both eyes. Masks of both eyes are two videos or one image per frame and eye, distinguished by
+name, or are packed into one picture like frames. The left eye alone determines the meaning of white.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -28,16 +28,16 @@ from intrasplat.notices import Notice, NoticeCode
 
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
-MAX_TOOL_SHARE = 0.4  # of the area: a larger class is never taken for the instrument by its look
+MAX_TOOL_SHARE = 0.4  # of the area: by look, a larger class is never taken as the instrument
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
 
 
 @dataclass(frozen=True)
 class TissueMasks:
-    """tissue [T, H, W] bool, True = tissue, with the assumption behind it and warnings.
+    """Tissue pixels, tissue [T, H, W] bool, True = tissue, with the assumption behind them and warnings.
 
-    right is the same of the right eye; None if the masks show the left eye alone. given: False if there are no masks.
+    right is the same for the right eye; None if the masks show the left eye alone. given: False if there are no masks.
     """
 
     tissue: NDArray[np.bool_]
@@ -49,9 +49,9 @@ class TissueMasks:
 
 @dataclass(frozen=True)
 class MaskFrames:
-    """Masks of known number and size that are not decoded yet, because a small file may decode to gigabytes.
+    """Masks of known number and size, not decoded yet, because a small file may decode to gigabytes.
 
-    right holds those of the right eye, if their names name both eyes; frames are then the left eye's alone.
+    right has the right eye's masks if the names distinguish eyes; frames are then the left eye's alone.
     """
 
     frames: ImageSequence | VideoFile
@@ -63,12 +63,12 @@ class MaskFrames:
         return self.frames.frame_count, self.frames.height, self.frames.width
 
     def packing(self, shape: tuple[int, int, int]) -> Packing | None:
-        """How each picture holds the masks of both eyes of a clip of `shape` (T, H, W); None if it holds one eye's."""
+        """The packing of both eyes' masks in each picture, for a clip of `shape` (T, H, W); None: it shows one eye."""
         return packing_by_size(self.shape[1:], shape[1:]) if self.right is None else None
 
 
 def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
-    """The masks in a video, or in a zip or folder of images, of one video or of two. InputError, LimitError."""
+    """The masks in a video, or in a zip or folder of images, one video or two. InputError, LimitError."""
     check_exists(path, _FIELD)
     tree = open_tree(path, _FIELD, limits)
     if tree is None:
@@ -77,7 +77,7 @@ def open_masks(path: Path, limits: ClipLimits) -> MaskFrames:
 
 
 def own_masks(tree: FileTree) -> MaskFrames | None:
-    """The masks in the folders masks or mask of a clip; None without any. InputError, LimitError."""
+    """The masks in a clip's folder masks or mask; None if there are none. InputError, LimitError."""
     images, videos = _in_mask_folders(tree.images()), _in_mask_folders(tree.videos())
     return _masks_named(tree, images, videos) if images or videos else None
 
@@ -111,7 +111,7 @@ def _mask_images(tree: FileTree, names: tuple[str, ...]) -> MaskFrames:
 
 
 def no_masks(*, ignored: bool = False) -> Notice:
-    """The assumption of a clip without masks, or whose masks are not to be used."""
+    """The assumption for a clip without masks, or with masks that are ignored."""
     return Notice.info(NoticeCode.MASKS, f"masks: none {'used' if ignored else 'given'}, every pixel is tissue")
 
 
@@ -123,13 +123,12 @@ def tissue_from_masks(
     *,
     both_eyes: bool = False,
 ) -> TissueMasks:
-    """Tissue pixels of masks. The masks are decoded only if their number and size fit `shape` (T, H, W).
+    """The tissue pixels from masks. The masks are decoded only if their number and size fit `shape` (T, H, W).
 
-    What white means is decided by the caller (`told`), else by the layout (its name and what white means there), else
-    by look: the tool is the class that touches the border in most frames and covers less than 40 % of the area.
-    With both_eyes, masks that show the right eye, too, give its tissue.
-    InputError if the masks do not fit, contradict the layout, mark nothing, leave no tissue, or if their look does not
-    decide.
+    The caller determines what white means (`told`), else the layout (its name and meaning of white), else the look: the
+    tool is the class that touches the border in most frames and covers less than 40 % of the area.
+    both_eyes: the tissue of the right eye, too, if the masks show it.
+    InputError if the masks do not fit, contradict the layout, mark nothing, leave no tissue, or look ambiguous.
     """
     packing = masks.packing(shape) if both_eyes else None
     _check_shape(masks.shape, (shape[0], *masks.shape[1:]) if packing else shape, "left")
@@ -146,7 +145,7 @@ def tissue_from_masks(
 
 
 def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None) -> tuple[Notice, ...]:
-    """What looks odd about the tissue of the left eye. InputError if either eye shows none."""
+    """Warnings about the left eye's tissue. InputError if either eye shows no tissue."""
     for eye in (tissue, right):
         if eye is not None and not eye.any():
             which = "" if right is None else f" of the {'left' if eye is tissue else 'right'} eye"
@@ -168,7 +167,7 @@ def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None)
 def _white_of_eyes(
     masks: MaskFrames, packing: Packing | None, *, both_eyes: bool
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-    """White pixels [T, H, W] of the left eye and, if the masks show it and both are wanted, of the right."""
+    """White pixels [T, H, W] of the left eye, and of the right eye if masks show it and both_eyes is set."""
     white = _white(masks.frames)
     if packing is not None:
         left, right = (np.stack(eye) for eye in zip(*(halves(each, packing) for each in white), strict=True))
@@ -177,7 +176,7 @@ def _white_of_eyes(
 
 
 def _white(frames: ImageSequence | VideoFile) -> NDArray[np.bool_]:
-    """White pixels [T, H, W]. InputError if the images have values but none is white."""
+    """White pixels [T, H, W]. InputError if the images have nonzero values but no white."""
     decoded: Iterator[NDArray[Any]]
     decoded = map(frames.decode, frames.names) if isinstance(frames, ImageSequence) else frames.frames()
     white = np.empty((frames.frame_count, frames.height, frames.width), dtype=np.bool_)
@@ -195,7 +194,7 @@ def _white(frames: ImageSequence | VideoFile) -> NDArray[np.bool_]:
 def _bright_class(
     white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> tuple[BrightClass, str]:
-    """What white means, and the reason in words."""
+    """What white means, and the reason as text."""
     if told != "auto":
         return told, "as told"
     if white.all() or not white.any():
@@ -222,7 +221,7 @@ def _bright_class(
 
 
 def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
-    """What white means if one class covers little area and touches the border in most frames it is in; else None."""
+    """What white means, if one class covers little area and touches the border in most of its frames; else None."""
     border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
     if white.mean() < MAX_TOOL_SHARE:
         touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()

@@ -1,4 +1,4 @@
-"""The eye and the frame that file names name, and whether two lists of files match."""
+"""Eye and frame from file names, and whether two lists of files match."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def eye_of(name: str) -> tuple[Side, str] | None:
     for depth, part in enumerate(path.parts[:-1]):
         if _FOLDER.fullmatch(part):
             others = path.parts[:depth] + path.parts[depth + 1 : -1]
-            # an eye in the file name repeats the folder's; it is not part of the frame's key
+            # an eye in the file name repeats that of the folder; it is not part of the frame key
             stem = _by_stem(path.stem)
             return _SIDES[part.lower()], "/".join((*others, stem[1] if stem else path.stem))
     found = _by_stem(path.stem)
@@ -34,13 +34,13 @@ def eye_of(name: str) -> tuple[Side, str] | None:
 
 
 def left_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names without the right eye's, if they name both eyes; else all names."""
+    """The names without the right eye's, if the names distinguish both eyes; else all names."""
     right = set(right_eye_only(names))
     return tuple(name for name in names if name not in right)
 
 
 def right_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The right eye's names, if they name both eyes; else none."""
+    """The right eye's names, if the names distinguish both eyes; else none."""
     eyes = {name: found[0] for name in names if (found := eye_of(name))}
     if set(eyes.values()) != {"left", "right"}:
         return ()
@@ -50,7 +50,7 @@ def right_eye_only(names: tuple[str, ...]) -> tuple[str, ...]:
 def pair_names(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """(left, right) file names, frame by frame in natural order.
 
-    InputError if a frame lacks an eye, or a name names none.
+    InputError if a frame lacks an eye, or a name has none.
     """
     frames: dict[str, dict[Side, str]] = {}
     for name in names:

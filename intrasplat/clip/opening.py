@@ -1,4 +1,4 @@
-"""The front of the pipeline: files become a StereoClip or a DepthClip, or an error says why they cannot."""
+"""The first stage: opens files as a StereoClip or a DepthClip, or raises an error that says why it cannot."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def open_clip(
     options: ClipOptions | None = None,
     limits: ClipLimits | None = None,
 ) -> StereoClip | DepthClip:
-    """The clip in these files, validated. Its `assumptions` list every assumption that was made.
+    """The clip in these files, validated. `assumptions` lists every assumption about it.
 
     path     a stereo video, a folder or a zip; or the left eye's video or frames when `right` is given
     masks    zip or folder of PNG, or of videos, or a video, of the left eye or of both (masks.py); default: the clip's
              own masks/ folder, if it has one
-    options  layout: one of clip/layouts/ by its name; "auto" detects it by names, shape and content.
-             mask_polarity: "auto" decides by layout and look (masks.tissue_from_masks)
-             mask_source: "none" leaves masks unread, also those of the clip
+    options  layout: the name of one of clip/layouts/; "auto" detects it by names, shape and content
+             mask_polarity: "auto" uses layout and look (masks.tissue_from_masks)
+             mask_source: "none" ignores all masks, also the clip's own
 
-    Raises InputError for everything that is wrong, with field and remedy, and LimitError for a clip that is too large.
+    Raises InputError for anything wrong, with field and remedy, and LimitError for a clip that is too large.
     """
     options, limits = options or ClipOptions(), limits or ClipLimits()
     layout, mask_polarity = options.layout, options.mask_polarity
@@ -70,8 +70,8 @@ def open_clip(
 def find_calibration(path: Path | str, scratch: Path | None = None, limits: ClipLimits | None = None) -> Path | None:
     """The calibration file in a clip's folder or zip; None if there is none, or if path is a single file.
 
-    StereoMIS's own name has priority, then files called calibration.*, then names that contain "calib". From a zip it
-    is copied into `scratch`, or into a temporary folder that lasts until the process ends.
+    StereoMIS's file name has priority, then calibration.*, then names that contain "calib". A file in a zip is copied
+    into `scratch`, or into a temporary folder that lasts until the process ends.
     Raises InputError if several files are equally likely.
     """
     path = Path(path)

@@ -24,15 +24,15 @@ Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb": "top-bottom, left eye on top"}
 
 _EYE_ASPECTS = (0.8, 2.4)  # plausible width / height of an endoscope's eye; 5:4 and 16:9 are well inside
-_CLEAR_MARGIN = 0.15  # of correlation; beyond it the content decides against the shape
+_CLEAR_MARGIN = 0.15  # of correlation; with a larger one, content overrides the shape
 _MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
 _LIKENESS_WIDTH_PX = 160  # halves are compared at this width: disparities are a few pixels, and it takes 1 ms
-_MIN_DETAIL_STD = 1.0  # grey levels; a frame with less detail decides nothing
+_MIN_DETAIL_STD = 1.0  # grey levels; a frame with less detail is ignored
 _MAX_FRAMES_COMPARED = 30  # clips may start black
 
 
 class FrameSequence(Protocol):
-    """T RGB frames of one size, a video or images. Each call of frames() starts again from frame 0."""
+    """T RGB frames of one size: a video or images. Each call of frames() starts again from frame 0."""
 
     @property
     def frame_count(self) -> int: ...
@@ -87,7 +87,7 @@ class TwoSequences:
 
 
 def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
-    """The pairs of two eyes' sequences. InputError if their lengths or sizes differ."""
+    """The frame pairs of a left and a right sequence. InputError if their lengths or sizes differ."""
     if left.frame_count != right.frame_count:
         raise InputError(
             "right",
@@ -114,7 +114,7 @@ def halves(frame: NDArray[Pixel], packing: Packing) -> tuple[NDArray[Pixel], NDA
 
 
 def packing_by_size(packed: tuple[int, int], eye: tuple[int, int]) -> Packing | None:
-    """How pictures of one (height, width) hold two eyes of another; None if they do not. An odd middle line is free."""
+    """How pictures (height, width) contain two eyes of size `eye`, apart from an odd middle line; None: they do not."""
     height, width = packed
     if (height, width // 2) == eye:
         return "sbs"
@@ -122,7 +122,7 @@ def packing_by_size(packed: tuple[int, int], eye: tuple[int, int]) -> Packing | 
 
 
 def detect_packing(sequence: FrameSequence) -> Packing:
-    """Side by side or top-bottom, decided by which halves look alike and which shape of an eye is plausible.
+    """Side by side or top-bottom, by the likeness of the halves and the plausibility of an eye's shape.
 
     InputError if neither pair of halves looks alike, or if content and shape disagree.
     """
@@ -173,7 +173,7 @@ def _likeness(first: RgbFrame, second: RgbFrame) -> float | None:
 
 
 def _detail(eye: RgbFrame) -> NDArray[np.float32]:
-    """A small grey picture without slow shading, which any two halves have in common."""
+    """A small grey picture, high-pass filtered: any two halves share slow shading."""
     height, width = eye.shape[:2]
     small_width = min(width, _LIKENESS_WIDTH_PX)
     small_height = max(4, round(height * small_width / width))

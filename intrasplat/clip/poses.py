@@ -37,7 +37,7 @@ class Poses:
 
 
 def parse_poses(data: bytes, frame_count: int, convention: PoseConvention) -> Poses:
-    """Reads and re-expresses the poses. InputError when shape, count, numbers, rotations or sizes are wrong."""
+    """The poses in a file, converted. InputError if shape, count, numbers, rotations or sizes are wrong."""
     rows = _load(data)
     if len(rows) != frame_count:
         raise _error(f"has {len(rows)} poses for {frame_count} images.", "Give one pose for each image.")
@@ -54,7 +54,7 @@ def parse_poses(data: bytes, frame_count: int, convention: PoseConvention) -> Po
 
 
 def _load(data: bytes) -> NDArray[np.float64]:
-    """The array [T, 17]; its header is judged before anything is allocated, and pickled objects are refused."""
+    """The array [T, 17]. Its header is checked before allocation, and pickled objects are refused."""
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)
@@ -88,7 +88,7 @@ def _common_size(sizes: NDArray[np.float64]) -> tuple[int, int, float]:
 
 
 def _nearest_rotations(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Exact rotations nearest to nearly exact ones (polar factor); InputError for the rest."""
+    """The rotations nearest to nearly orthogonal matrices (polar factor); InputError for other matrices."""
     gram = np.swapaxes(matrices, 1, 2) @ matrices
     skewed = np.abs(gram - np.eye(3)).max(axis=(1, 2)) > RIGID_TOLERANCE
     mirrored = np.linalg.det(matrices) < 0
@@ -101,7 +101,7 @@ def _nearest_rotations(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _relative_to_first(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same cameras in a world that is the camera of frame 0 (rigid inverse of frame 0 in front)."""
+    """The same cameras in the world of frame 0's camera (multiplied from the left by its rigid inverse)."""
     first = world_from_camera[0]
     first_from_world = np.eye(4)
     first_from_world[:3, :3] = first[:3, :3].T

@@ -1,4 +1,4 @@
-"""Masks in the pixels of the recording, from those in the pixels of the rectified eye."""
+"""Converts masks from the rectified eye's pixels to the recording's pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Rectification:
-    """How the recorded left eye was rectified, as OpenCV takes it: cv2.initUndistortRectifyMap."""
+    """The rectification of the recorded left eye: parameters of cv2.initUndistortRectifyMap."""
 
     camera: tuple[tuple[float, ...], ...]
     distortion: tuple[float, ...]
@@ -23,16 +23,16 @@ class Rectification:
 
     @classmethod
     def parsed(cls, value: dict[str, Any]) -> Rectification:
-        """What numbers() gave, after it was stored as JSON. KeyError, TypeError."""
+        """The rectification from numbers() after storage as JSON. KeyError, TypeError."""
         matrices = {name: tuple(map(tuple, value[name])) for name in ("camera", "rotation", "projection")}
         return cls(distortion=tuple(value["distortion"]), **matrices)
 
     def numbers(self) -> dict[str, Any]:
-        """The numbers by their names, for JSON."""
+        """The parameters by name, for JSON."""
         return asdict(self)
 
     def maps(self, height: int, width: int) -> Maps:
-        """Where each recorded pixel lies in the rectified picture: columns and rows [H, W], as cv2.remap takes them."""
+        """Columns and rows [H, W] of each recorded pixel in the rectified picture, as cv2.remap expects them."""
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2)
         camera, rotation, projection = map(np.array, (self.camera, self.rotation, self.projection))
         distortion = np.array(self.distortion)
@@ -42,6 +42,6 @@ class Rectification:
 
 
 def as_recorded(mask: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
-    """A rectified eye's mask [H, W] in recorded pixels. What rectification cut off is as the picture's border is."""
+    """A rectified eye's mask [H, W] in recorded pixels. Pixels that rectification cut off copy the border."""
     moved = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(moved > 0)

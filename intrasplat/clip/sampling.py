@@ -1,6 +1,6 @@
-"""Training frames that are left out: those that show nothing new, and those that a short training has no time for.
+"""Selects training frames to skip: frames that show nothing new, and frames that a short training has no time for.
 
-Nothing new: repeats, a paused recording, tissue that rests or hardly moves.
+Nothing new are repeats, a paused recording, and tissue that rests or hardly moves.
 
 Symbols: T frames, h w pixels of a thumbnail, P patches of PATCH x PATCH pixels of it.
 """
@@ -24,20 +24,20 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ReconstructionOptions
 
 FRAMES_A_SECOND, LEAST_FRAMES = 5.8, 32
-"""Training frames for each second of training, and the fewest: two cores make some three steps on each of so many."""
+"""Training frames for each second of training, and the minimum: two cores make some three steps on each of them."""
 LEFT_OUT_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
 KEPT_FRAMES = 64
-"""About so many frames are used at least: a clip of less than twice as many keeps all of them."""
+"""Approximate minimum of frames used: a clip of less than twice as many keeps all of them."""
 MAX_MOVED = 1 / 640
-"""Of the picture's width: what moved less since the last frame that is used shows nothing new."""
+"""Share of the picture's width: a frame with less motion since the last used frame shows nothing new."""
 SAME_LEVELS = 0.2
-"""Of 255, in a thumbnail: what changed less is the same, also where there is no noise."""
+"""A smaller change of a thumbnail, in levels of 255, counts as none even without noise."""
 THUMBNAIL_WIDTH = 80
 PATCH = 8
 NOISE_PERCENTILE = 5.0
-"""Of a patch's changes over time, which the noise alone makes: most clips rest in a twentieth of their frames."""
+"""This percentile of a patch's changes over time is due to noise: most clips rest in a twentieth of their frames."""
 NOISE_MARGIN = 2.0
-"""Over that: of 64 pixels, one frame in twenty shows 0.7 of the noise, and the noisiest of all patches 1.4."""
+"""Factor on that change: with 64 pixels, one frame in twenty has 0.7 of the noise, and the noisiest patch 1.4."""
 
 Thumbnail = NDArray[np.float32]
 """Grey [h, w], levels of 255."""
@@ -45,9 +45,9 @@ Mapping = Callable[[Callable[[int], Thumbnail], Iterable[int]], Iterable[Thumbna
 
 
 def thumbnail(rgb: RgbFrame) -> Thumbnail:
-    """A picture [H, W, 3] in grey, THUMBNAIL_WIDTH to twice as many pixels wide; each is the mean of a square.
+    """A grey thumbnail of a picture [H, W, 3], THUMBNAIL_WIDTH to twice as many pixels wide, by means over squares.
 
-    The picture leaves memory, as far as it lies in a file.
+    If the picture is mapped from a file, it is released from memory.
     """
     side = max(1, rgb.shape[1] // THUMBNAIL_WIDTH)
     height, width = max(1, rgb.shape[0] // side), rgb.shape[1] // side
@@ -58,18 +58,18 @@ def thumbnail(rgb: RgbFrame) -> Thumbnail:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Training frames that are not used, rising: those that show nothing new, and those there is no time for."""
+    """Skipped training frames, rising: those that show nothing new, and those for which there is no time."""
 
     nothing_new: tuple[int, ...] = ()
     no_time: tuple[int, ...] = ()
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """All of them, rising."""
+        """All skipped frames, rising."""
         return tuple(sorted({*self.nothing_new, *self.no_time}))
 
     def told(self, frame_count: int) -> tuple[Notice, ...]:
-        """What the report says of them."""
+        """The notices about them for the report."""
         found = []
         if self.nothing_new:
             text = f"frames: {len(self.nothing_new):,} of {frame_count:,} show nothing new and were left out"
@@ -81,17 +81,17 @@ class LeftOut:
 
 
 def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = None, mapping: Mapping = map) -> LeftOut:
-    """Those of `frames` that need not be used. Others, such as held-out ones, are not looked at.
+    """The frames, out of `frames`, that training can skip. Others, such as held-out frames, are not read.
 
-    A frame shows nothing new if beyond the clip's own noise no patch has changed as if something in it had moved by
-    MAX_MOVED since the last frame that is used. After T // KEPT_FRAMES frames one is used in any case. If more than
-    `most` would be used, about so many stay: half of them spread evenly over time, half evenly over the motion.
+    A frame shows nothing new if, since the last used frame, no patch has changed beyond noise by as much as a motion of
+    MAX_MOVED. One in T // KEPT_FRAMES frames is used in any case. If more than `most` remain, about `most` are used:
+    half of them spread evenly over time, half evenly over the motion.
 
     Args:
         rgb: [T, H, W, 3] of the whole clip.
         frames: rising.
-        most: None: no limit.
-        mapping: as map(); it may use several threads.
+        most: maximum number of used frames; None: no limit.
+        mapping: a replacement of map(), such as a thread pool's.
     """
     longest = len(rgb) // KEPT_FRAMES
     too_many = most is not None and len(frames) > most
@@ -111,9 +111,9 @@ def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = N
 
 
 def _spread(frames: Sequence[int], moved: Sequence[float], count: int) -> list[int]:
-    """At most so many of the frames, at equal steps of the time and the motion between them; first and last included.
+    """At most `count` of the frames, at equal steps of time and motion, the first and the last included.
 
-    moved: between each frame and the next.
+    moved: the motion between each frame and the next.
     """
     shares = [np.asarray(each, np.float64) / max(np.sum(each), 1e-12) for each in (np.diff(frames), moved)]
     course = np.concatenate([[0.0], np.cumsum(np.mean(shares, axis=0))])
@@ -122,14 +122,14 @@ def _spread(frames: Sequence[int], moved: Sequence[float], count: int) -> list[i
 
 
 def most_frames(options: ReconstructionOptions) -> int | None:
-    """The training frames that the time of our presets is enough for; None where nothing limits them."""
+    """The number of training frames for which a preset's time suffices; None: no limit."""
     if options.use_frames == "all" or options.iterations is not None or options.preset not in BUDGETS_S:
         return None
     return max(LEAST_FRAMES, round(FRAMES_A_SECOND * (options.budget_s or BUDGETS_S[options.preset])))
 
 
 def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
-    """A clip whose depth is known, without the training frames that need not be used."""
+    """A clip with depth, with skipped training frames in left_out."""
     if options.use_frames == "all":
         return clip
     found = left_out(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
@@ -138,9 +138,9 @@ def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:
-    """Variance of the noise of each patch [P], levels^2. Motion that is not even adds to it.
+    """Noise variance of each patch [P], levels^2. Accelerated motion adds to it.
 
-    Second differences in time have six times the noise's variance, and even motion cancels in them.
+    Second differences in time have six times the noise's variance, and uniform motion cancels in them.
     """
     triples = zip(thumbnails, thumbnails[1:], thumbnails[2:], strict=False)
     changes = [_by_patch(np.square(one - 2 * two + three)) / 6 for one, two, three in triples]
@@ -148,9 +148,9 @@ def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:
 
 
 def _moved(earlier: Thumbnail, later: Thumbnail, noise: NDArray[np.float64]) -> float:
-    """The motion that would explain the change of the patch that changed most, in picture widths; 0 for noise [P].
+    """The motion, in picture widths, that explains the change of the patch that changed most; 0 if it is noise.
 
-    A texture that moves by u px changes by u^2 / 2 times its squared gradient, in the mean over directions.
+    A texture that moves by u px changes by u^2 / 2 times its squared gradient, averaged over directions. noise: [P].
     """
     change = _by_patch(np.square(later - earlier)) - 2 * NOISE_MARGIN * noise - SAME_LEVELS**2
     down, right = np.gradient(earlier)

@@ -18,10 +18,10 @@ from intrasplat.errors import InputError
 from intrasplat.machine.mapped import let_go
 from intrasplat.notices import Notice, NoticeCode
 
-MIN_FRAMES = 9  # shorter clips hold out no frame
+MIN_FRAMES = 9  # shorter clips have no held-out frames
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels; two frames below it are the same picture
 PAUSE_FRAMES = 8
-"""A picture that stands for more frames is a pause: it is trained on, and held-out frames in it say nothing."""
+"""A picture that lasts for more frames is a pause: it is trained on, so held-out frames in it test nothing."""
 RULES = ("every8", "blocks8", "none")
 _FIELD = "options.holdout"
 _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
@@ -29,10 +29,10 @@ _REMEDY = 'Say "every8", "blocks8", "none", or frame numbers like "1,9,17".'
 
 @dataclass(frozen=True)
 class FrameSplit:
-    """Frame indices, each list rising. No part of training reads held-out frames.
+    """The training and held-out frames, as rising lists of indices. No part of training reads held-out frames.
 
-    repeated lists frames that are in neither set: training frames that repeat a held-out frame, held-out frames that
-    repeat training frames in a pause, and those that the clip left out.
+    repeated lists frames in neither set: training frames that repeat a held-out frame, held-out frames that repeat
+    training frames in a pause, and frames that the clip skips (left_out).
     """
 
     train: list[int]
@@ -45,8 +45,8 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     """The split of the clip's T frames.
 
     holdout  "every8": frames i with (i - 1) % 8 == 0, as in the papers; "blocks8": i in [8, T - 8) with
-             (i // 8) % 3 == 1, the honest rule for a fixed camera; "none"; or a list, "1,9,17"
-    Clips under 9 frames hold out none, with a warning. InputError for an unknown rule and for frames that do not exist.
+             (i // 8) % 3 == 1, which tests more strictly with a fixed camera; "none"; or a list, "1,9,17"
+    Clips under 9 frames have no held-out frames, with a warning. InputError for unknown rules and missing frames.
     """
     count = clip.frame_count
     held_out = held_out_frames(count, holdout)
@@ -74,7 +74,7 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
 
 
 def held_out_frames(frame_count: int, holdout: str) -> list[int]:
-    """The frames that split_frames would hold out, rising. It reads no picture.
+    """The held-out frames of split_frames, rising, before its check for repeats. It reads no picture.
 
     Stages before the split use it to avoid these frames. InputError as in split_frames.
     """
@@ -83,23 +83,23 @@ def held_out_frames(frame_count: int, holdout: str) -> list[int]:
 
 
 def training_frames(frame_count: int, holdout: str) -> list[int]:
-    """The frames that are not held out, rising, those that repeat a held-out one among them. InputError likewise."""
+    """The frames that are not held out, rising, including repeats of held-out frames. InputError as in split_frames."""
     held_out = set(held_out_frames(frame_count, holdout))
     return [index for index in range(frame_count) if index not in held_out]
 
 
 def check_holdout(holdout: str) -> None:
-    """Refuse what is neither a rule of split_frames nor a list of frames. It does not know the clip's frames.
+    """Check that holdout is a rule of split_frames or a list of frames, whatever the clip.
 
     Raises:
-        InputError: names the field.
+        InputError: it is neither.
     """
     if holdout not in RULES and not re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", holdout):
         raise InputError(_FIELD, f"{holdout!r} is not known.", _REMEDY)
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most count of the indices, evenly spread, with the first and the last."""
+    """At most `count` of the indices, evenly spread, the first and the last included."""
     places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
     return [indices[place] for place in places]
 
@@ -127,7 +127,7 @@ def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) 
 
 
 def find_paused(rgb: NDArray[np.uint8], held_out: Sequence[int]) -> set[int]:
-    """Held-out frames of rgb [T, H, W, 3] in a pause that has training frames, too.
+    """Held-out frames of rgb [T, H, W, 3] in a pause that also has training frames.
 
     A pause is a run of more than PAUSE_FRAMES frames that repeat its first.
     """
@@ -145,7 +145,7 @@ def find_paused(rgb: NDArray[np.uint8], held_out: Sequence[int]) -> set[int]:
 
 
 def _closer_than(limit: float, frame: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
-    """Whether the sum of |differences| is below the limit. Every 8th row is tried first: it often decides."""
+    """Whether the sum of |differences| is below the limit. Every 8th row is tried first, which often suffices."""
     return all(cv2.norm(frame[::step], other[::step], cv2.NORM_L1) < limit for step in (8, 1))
 
 

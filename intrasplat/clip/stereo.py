@@ -1,4 +1,4 @@
-"""Stereo clips from one sequence of pictures or two, checked, and decoded when asked for.
+"""Stereo clips from one or two sequences of pictures, checked, and decoded on demand.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -25,7 +25,7 @@ from intrasplat.notices import Notice, NoticeCode
 def packed_clip(
     sequence: FrameSequence, packing: Packing, limits: ClipLimits, *, detected: bool, title: str = ""
 ) -> StereoClip:
-    """Both eyes in each picture of one sequence; title is the layout's, if it has one."""
+    """The clip of a sequence whose pictures contain both eyes; title is the layout's, if it has one."""
     how = " (found by likeness of the halves)" if detected else ""
     words = f"layout: {title}{', ' if title else ''}{PACKING_WORDS[packing]}{how}"
     assumptions = [Notice.info(NoticeCode.LAYOUT, words)]
@@ -38,12 +38,12 @@ def packed_clip(
 
 
 def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Notice, limits: ClipLimits) -> StereoClip:
-    """One sequence an eye. InputError when their lengths or sizes differ."""
+    """The clip of one sequence per eye. InputError if their lengths or sizes differ."""
     return _stereo_clip(pair_sequences(left, right), (assumption,), limits)
 
 
 def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
-    """Two videos of a tree whose names name the eyes. InputError when there are others."""
+    """The clip of two videos in a tree whose names give the eye. InputError if there are other videos."""
     eyes = {found[0] for name in videos if (found := eye_of(name))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
@@ -58,7 +58,7 @@ def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
 
 
 def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> StereoClip:
-    """Images of a tree whose names name the eyes; title is the layout's. InputError when there are none, or others."""
+    """The clip of a tree's images, whose names give the eye; title is the layout's. InputError: none, or others."""
     left, right = pair_names(images)
     if not left:
         raise InputError(
@@ -73,9 +73,9 @@ def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> Ster
 def with_masks(
     clip: StereoClip, given: MaskFrames, told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> StereoClip:
-    """The clip with its tissue pixels, of the right eye if the masks show it; tissue_from_masks says how white is read.
+    """The clip with its tissue pixels, also the right eye's if the masks show it (see tissue_from_masks).
 
-    Without masks of the right eye, stereo moves the left eye's by their depth (intrasplat/stereo/right_eye.py).
+    Without masks of the right eye, stereo warps the left eye's by their depth (intrasplat/stereo/right_eye.py).
     """
     shape = (clip.frame_count, clip.height, clip.width)
     masks = tissue_from_masks(given, shape, told, by_layout, both_eyes=True)

@@ -1,6 +1,6 @@
-"""A clip with depth in a folder: one .npy file for each array, and manifest.json, which is written last.
+"""A clip with depth in a folder: one .npy file per array, and manifest.json, which is written last.
 
-A folder without its manifest holds nothing. How the clip was made does not matter here.
+A folder without manifest counts as empty. This module does not depend on how the clip was computed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from intrasplat.notices import Notice
 from intrasplat.report import CameraPoses, Masks, RightEye
 
 VERSION = 5
-"""Raised whenever what the folder holds changes; no version reads another's."""
+"""Format version, raised with every change of the folder's content; no version reads another's folder."""
 MANIFEST = "manifest.json"
 EYES = ("left", "right")
 ARRAYS = (*PIXELS, "world_from_camera")
@@ -33,11 +33,11 @@ TIMES = "frame_times_s"
 
 
 def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callable[[], bool] = lambda: False) -> None:
-    """Write the clip into a folder, which is made if need be. It is on disk when this returns.
+    """Write the clip into a folder, which is created if necessary. It is on disk when this returns.
 
     Args:
-        identity: what the clip was made of, in any form; load_clip asks for it.
-        should_stop: asked before each frame; after a yes the folder is removed.
+        identity: any text that identifies the clip's source; load_clip compares it.
+        should_stop: called before each frame; if it returns True, the folder is removed.
 
     Raises:
         OSError: the disk is full or refuses; the folder is removed.
@@ -69,9 +69,9 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
 
 
 def load_clip(folder: Path, identity: str) -> DepthClip | None:
-    """The clip that save_clip wrote with this identity, its arrays mapped into memory; None if there is none.
+    """The clip that save_clip wrote with this identity, with its arrays mapped into memory; None if there is none.
 
-    Do not write to the arrays. The files may be removed at once: the mappings live as long as the arrays.
+    Do not write to the arrays. The files may be removed at once: the mappings last as long as the arrays.
     """
     try:
         told = json.loads((folder / MANIFEST).read_bytes())
@@ -91,7 +91,7 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
             warnings=tuple(Notice.model_validate(each) for each in told["warnings"]),
             measurements=told["measurements"],
         )
-    except (OSError, EOFError, ValueError, KeyError, TypeError):  # nothing, or of another program
+    except (OSError, EOFError, ValueError, KeyError, TypeError):  # no clip, or files of another program
         return None
 
 
@@ -108,7 +108,7 @@ def _eye(folder: Path, side: str, intrinsics: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write(path: Path, array: NDArray[Any], should_stop: Callable[[], bool]) -> bool:
-    """Write an array frame by frame and wait until it is on disk; False if it was stopped."""
+    """Write an array frame by frame and wait until it is on disk; False if should_stop ended it."""
     with path.open("wb") as file:
         header = npy.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype)) | {"shape": array.shape}
         npy.write_array_header_1_0(file, header)

@@ -1,6 +1,6 @@
-"""The two kinds of clip that the front of the pipeline gives, and an eye of a clip with depth.
+"""The two kinds of clip: StereoClip as recorded, DepthClip with depth; and Eye, one eye of a clip with depth.
 
-Symbols of the whole worker: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
+Symbols of the whole library: T frames, H W pixels (rows, columns), N Gaussians, B bases, C = 10 deformed channels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from intrasplat.notices import Notice
 from intrasplat.report import CameraPoses, Masks, RightEye
 
 PIXELS = ("rgb", "tissue", "depth_mm", "depth_confidence")
-"""Names of an eye's arrays [T, H, W, ...]. They may lie in files (intrasplat/machine/mapped.py)."""
+"""Names of an eye's arrays [T, H, W, ...]. They may be mapped from files (intrasplat/machine/mapped.py)."""
 
 RgbFrame = NDArray[np.uint8]  # [H, W, 3]
 
@@ -35,7 +35,7 @@ class StereoClip:
     """A stereo clip as recorded, not yet rectified. Frames are decoded lazily, RGB uint8.
 
     tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
-    tissue_right is the same of the right eye, or None if the masks show the left eye alone.
+    tissue_right is the same for the right eye, or None if the masks show the left eye alone.
     frame_times_s is [T] float64, from the container, or i / 30 if it has none.
     """
 
@@ -78,32 +78,32 @@ class Eye:
         return np.arange(self.frame_count) / self.frame_count
 
     def let_go(self, index: int) -> None:
-        """Take a frame's pixels out of memory, as far as they lie in files. They come back when they are asked for."""
+        """Release a frame's pixels from memory if they are mapped from files. Access reads them back."""
         for name in PIXELS:
             let_go(getattr(self, name)[index])
 
     def one_by_one(self, frames: Iterable[int]) -> Iterator[int]:
-        """The frames as given; each is taken out of memory when the next is asked for."""
+        """The frames as given; each is released from memory when the next is requested."""
         for index in frames:
             yield index
             self.let_go(index)
 
     def arrays_at(self, frames: slice) -> dict[str, Any]:
-        """The eye's arrays by name, of some frames alone: views."""
+        """The eye's arrays by name, for some frames alone, as views."""
         return {name: getattr(self, name)[frames] for name in (*PIXELS, "world_from_camera")}
 
 
 @dataclass(frozen=True)
 class DepthClip(Eye):
-    """The left eye, when its frames were taken, and the right eye if there is one. Training reads nothing else.
+    """The left eye with its frame times, and the right eye if there is one. Training reads nothing else.
 
     frame_times_s    [T]          float64, seconds from frame 0
-    right            the same moments and size; None for a clip of one eye
-    registration     what the right eye's camera and colours were corrected by; None for a clip of one eye
-    masks            where `tissue` comes from
-    rectification    how the recorded left eye became this one; None: it is as recorded
-    poses            how world_from_camera is known; None: nobody has asked yet
-    left_out         frames that show nothing new (sampling.py): nobody looks at them, and stereo gives them no depth
+    right            the same times and size; None for a clip of one eye
+    registration     corrections of the right eye's camera and colours; None for a clip of one eye
+    masks            source of `tissue`
+    rectification    rectification of the recorded left eye; None: it is as recorded
+    poses            source of world_from_camera; None: poses are not set yet
+    left_out         skipped frames (sampling.py): no stage reads them, and stereo gives them no depth
     """
 
     frame_times_s: NDArray[np.float64]
@@ -119,16 +119,16 @@ class DepthClip(Eye):
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
-        """Left, and right if there is one."""
+        """The left eye, and the right one if there is one."""
         return (self,) if self.right is None else (self, self.right)
 
     @property
     def used(self) -> list[int]:
-        """The frames that are not left out, in order."""
+        """The frames that are not in left_out, in order."""
         return sorted(set(range(self.frame_count)) - set(self.left_out))
 
     def moment(self, index: int) -> DepthClip:
-        """A clip of one frame of both eyes, which views this one's arrays."""
+        """A clip of one frame of both eyes, with views of this clip's arrays."""
         only = slice(index, index + 1)
         right = None if self.right is None else replace(self.right, **self.right.arrays_at(only))
         return replace(self, right=right, frame_times_s=self.frame_times_s[only], left_out=(), **self.arrays_at(only))

@@ -1,7 +1,7 @@
-"""Video files through one of three decoders and nothing else.
+"""Reads video files with one of three decoders and no other.
 
-OpenCV bundles many decoders, and some had security holes. A whitelist of codecs only affects FFmpeg's probe. So each
-allowed decoder is forced by name, in turn.
+OpenCV bundles many decoders, some of which had security holes. A whitelist of codecs only affects FFmpeg's probe, so
+each allowed decoder is forced by name, in turn.
 
 Symbols: T frames, H W pixels.
 """
@@ -39,13 +39,13 @@ _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _SILENT = 0  # OpenCV's own messages
 _QUIET = "-8"  # AV_LOG_QUIET: hides the messages of decoders that refuse a file
-_environment_lock = threading.Lock()  # OpenCV reads these options only from the environment, which all threads share
+_environment_lock = threading.Lock()  # OpenCV reads the options from the environment, which all threads share
 
 
 class KeptFrames:
-    """The frames of a video in a file without a name, so that what counted them need not be repeated.
+    """Decoded frames of a video, cached in an unnamed file, so that the pass that counts them need not be repeated.
 
-    MAX_KEPT_BYTES at most: a longer video costs less to decode twice than its frames take of the disk.
+    It stores MAX_KEPT_BYTES at most: for a longer video, decoding twice is cheaper than the disk space.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class KeptFrames:
         self._count = 0
 
     def add(self, frame: NDArray[np.uint8]) -> bool:
-        """Keep the next frame [H, W, 3], BGR. False if it is too much, the disk is full, or sizes differ."""
+        """Store the next frame [H, W, 3], BGR. False if it exceeds the limit, the disk is full, or sizes differ."""
         if (self._count + 1) * frame.nbytes > MAX_KEPT_BYTES or frame.shape != (self._shape or frame.shape):
             return False
         self._shape, self._count = frame.shape, self._count + 1
@@ -65,7 +65,7 @@ class KeptFrames:
             return False
 
     def frame(self, index: int) -> RgbFrame:
-        """A frame that was kept, RGB."""
+        """A stored frame, RGB."""
         frame = np.empty(self._shape, np.uint8)
         os.preadv(self._file.fileno(), [frame.data], index * frame.nbytes)
         return frame
@@ -73,7 +73,7 @@ class KeptFrames:
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A video that was opened once, counted and timed: a restartable sequence of T RGB frames."""
+    """A video with known frame count and times: a sequence of T RGB frames, which can be read repeatedly."""
 
     path: Path
     field: str
@@ -88,7 +88,7 @@ class VideoFile:
     kept: KeptFrames | None = None  # None: each call of frames() decodes anew
 
     def frames(self) -> Iterator[RgbFrame]:
-        """RGB uint8 [H, W, 3], from the first frame on. InputError if frames change size or stop early."""
+        """The frames, RGB uint8 [H, W, 3], from the first on. InputError if frames change size or end early."""
         if self.kept is not None:
             for index in range(self.frame_count):
                 self.limits.on_picture()
@@ -117,7 +117,7 @@ def open_video(path: Path, field: str, limits: ClipLimits, label: str | None = N
     """
     label = label or path.name
     codec = check_video(path, field, label, limits).codec
-    # the file's declared codec only sets the order: it saves failed attempts
+    # the declared codec only sets the order, to avoid failed attempts
     for decoder in sorted(CODECS, key=lambda decoder: codec not in CODECS[decoder]):
         with _capture(path, decoder) as capture:
             if capture is not None:
@@ -144,7 +144,7 @@ def open_video_in(tree: FileTree, name: str) -> VideoFile:
 
 
 def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str, decoder: str) -> VideoFile:
-    """Check the header, then walk all frames once: only that gives their exact number and times."""
+    """The video, after a check of its header and one pass over all frames, which alone gives exact number and times."""
     width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     declared = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))  # negative when the container has no duration
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
@@ -157,7 +157,7 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
         limits.on_picture()
         if kept is not None or len(times_ms) == 1:
             good, frame = capture.retrieve()
-            if len(times_ms) == 1:  # a rotated clip has another size than its header says
+            if len(times_ms) == 1:  # a rotated clip differs in size from its header
                 height, width = frame.shape[:2] if good else (height, width)
             kept = kept if kept is not None and good and kept.add(frame) else None
         limits.check_clip(field, label, len(times_ms), width, height)
@@ -176,8 +176,8 @@ def _whole_despite_count(
 ) -> bool:
     """Whether a video with fewer frames than `declared` is complete.
 
-    For Matroska, `declared` is the duration times the nominal rate. Frames of varying length may be fewer, if they last
-    to the end. An mp4 that was cut without re-encoding keeps hidden frames outside its edit list; they count, too.
+    For Matroska, `declared` is the duration times the nominal rate. With a variable frame rate, frames may be fewer if
+    they last to the end. An mp4 that was cut without re-encoding has hidden frames outside its edit list, which count.
     """
     if is_matroska(path):
         if times_s is None or len(times_s) < 2:

@@ -1,4 +1,4 @@
-"""Files from outside in; a clip and its calibration out, read by a confined process. Verb: decode_clip."""
+"""Untrusted files in; a clip and its calibration out, read by a confined process. Verb: decode_clip."""
 
 from intrasplat.decode.contained import DecoderKilledError, keep_decoder_ready
 from intrasplat.decode.decoding import StereoRecording, decode_clip

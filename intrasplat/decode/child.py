@@ -1,8 +1,8 @@
-"""`python -m intrasplat.decode.child`: the process that reads files from outside.
+"""`python -m intrasplat.decode.child`: the process that reads untrusted files.
 
-It loads the decoders, reads one request as JSON from its input, confines itself, and only then opens files from
-outside. It answers in lines of JSON: any number of {"pictures": ..., "frames": ..., "share": ..., "field": ...}; for a
-stereo clip one {"opened": ...} before its first frame; then one {"result": ...} or {"error": ...}.
+It loads the decoders, reads one request as JSON from stdin, confines itself, and only then opens untrusted files. It
+answers in lines of JSON: any number of {"pictures": ..., "frames": ..., "share": ..., "field": ...}; for a stereo clip
+one {"opened": ...} before its first frame; then one {"result": ...} or {"error": ...}.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Work = Callable[[dict[str, Any], Path, Reports], dict[str, Any]]
 
 
 def serve(work_of: Callable[[], Work]) -> None:
-    """Import what the work needs, by work_of, read the request, confine this process, work, answer.
+    """Import the libraries by work_of, read the request, confine this process, do the work, and answer.
 
-    It may be started long before there is a request, and ends without one when its parent does.
+    The process may start long before there is a request. It ends without one if its parent ends.
     """
     with os.fdopen(os.dup(1), "wb") as stream:
-        os.dup2(2, 1)  # output of libraries must not mix with the answer
+        os.dup2(2, 1)  # libraries' output must not mix with the answer
         work = work_of()
         line = sys.stdin.buffer.readline()
         if not line:
@@ -37,7 +37,7 @@ def serve(work_of: Callable[[], Work]) -> None:
         request = json.loads(line)
         folder = Path.cwd()
         granted = lock_in(Allowance(**request["allowance"]), [Path(each) for each in request["readable"]], folder)
-        if os.getppid() != request["parent"]:  # it ended before lock_in could ask the kernel to watch it
+        if os.getppid() != request["parent"]:  # the parent ended before lock_in could register for its death
             return
         reports = Reports(stream, granted)
         try:

@@ -1,4 +1,4 @@
-"""Runs the decoding process and watches it. The caller always gets a result or a typed error."""
+"""Runs and monitors the decoding process. The caller always gets a result or a typed error."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from intrasplat.files.disk_errors import StoreFullError
 
 MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
 MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
-MAX_ANSWER_BYTES = 4 << 20  # a line of the answer; it grows with warnings, not with frames
+MAX_ANSWER_BYTES = 4 << 20  # of a line of the answer; it grows with warnings, not with frames
 POLL_S = 0.1  # a stop is noticed within this time
-MAX_EXIT_S = 5.0  # between answer and exit; a process that lives on could change the arrays that the worker maps
-MAX_DEATH_S = 0.5  # between the end of its output and its exit, if it gave no answer
-END = b"\n"  # of the output; no line is one
+MAX_EXIT_S = 5.0  # between answer and exit; a process that lives on could change the arrays that the caller maps
+MAX_DEATH_S = 0.5  # between the end of its output and its exit, without an answer
+END = b"\n"  # marks the end of the output; no line is empty
 
 PROGRAM = ("-m", "intrasplat.decode.child")
 NONSENSE = "the decoder talks nonsense"
-MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # what a false answer may raise
+MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # raised by malformed answers
 MEMORY_REMEDY = "Cut it shorter or scale it down, or give the worker's machine or container more memory."
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
-_PACKAGES = Path(__file__).resolve().parents[2]  # the folder that holds `intrasplat`
+_PACKAGES = Path(__file__).resolve().parents[2]  # the folder that contains `intrasplat`
 _KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
 
 logger = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ OnReport = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Patience:
-    """Limits of the process in seconds: without another picture, in total, and from its answer to its exit."""
+    """Time limits of the process in seconds: without another picture, in total, and from its answer to its exit."""
 
     max_silence_s: float = MAX_SILENCE_S
     max_total_s: float = MAX_TOTAL_S
@@ -57,7 +57,7 @@ class Patience:
 
 
 class DecoderKilledError(UnavailableError):
-    """Something outside killed the decoding process, such as a system without memory: the clip is not to blame."""
+    """Something outside killed the decoding process, such as the out-of-memory killer: the clip is not the cause."""
 
     code = ErrorCode.DECODER_KILLED
 
@@ -67,18 +67,18 @@ class DecoderKilledError(UnavailableError):
 
 
 class Decoder:
-    """A decoding process with a folder of its own, from its start to its end. It answers one request.
+    """A decoding process with a folder of its own. It answers one request.
 
     folder   where it writes its arrays; only this user may enter it, and it is removed with the process
-    opened   what it told of the clip before the first frame; None until then
-    frames   how many frames of both eyes are complete in its files
-    result   its last words; None until then
+    opened   what it reported about the clip before the first frame; None until then
+    frames   number of frames of both eyes that are complete in its files
+    result   its result; None until then
     """
 
     def __init__(self, program: Sequence[str] = PROGRAM) -> None:
-        """Start the process. Until it is asked it only loads its libraries.
+        """Start the process. Until it gets a request it only loads its libraries.
 
-        The kernel ends it with the thread that calls this: call it from one that lives as long as the process.
+        The kernel kills it when the calling thread ends: call this from a thread that lives as long as the process.
         """
         self.folder = Path(tempfile.mkdtemp(prefix="intrasplat-")).resolve()
         self.opened: dict[str, Any] | None = None
@@ -93,13 +93,13 @@ class Decoder:
                 cwd=self.folder,
                 env=_environment(self.folder),
                 umask=0o077,
-                start_new_session=True,  # Ctrl-C is for the parent to answer
+                start_new_session=True,  # the parent handles Ctrl-C
             )
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
         self.close: Callable[[], None] = weakref.finalize(self, _end_and_remove, self._process, self.folder)
-        """End the process, if it still runs, and remove its folder."""
+        """End the process if it still runs, and remove its folder."""
 
     @property
     def is_alive(self) -> bool:
@@ -114,8 +114,8 @@ class Decoder:
         should_stop: Callable[[], bool] = lambda: False,
         patience: Patience = Patience(),
     ) -> None:
-        """Give the process its request. While this process waits for it, on_report gets the share done until the clip
-        is opened, and should_stop is called at least every POLL_S."""
+        """Send the process its request. During later waits, on_report gets the share done until the clip is opened, and
+        should_stop is called at least every POLL_S."""
         self._allowance, self._on_report, self._should_stop, self._patience = (
             allowance,
             on_report,
@@ -128,23 +128,23 @@ class Decoder:
         self._lines = _lines(self._process)
         assert self._process.stdin is not None
         asked = request | {"allowance": asdict(allowance), "parent": os.getpid()}
-        with contextlib.suppress(BrokenPipeError), self._process.stdin as stdin:  # until_ended() tells why
+        with contextlib.suppress(BrokenPipeError), self._process.stdin as stdin:  # until_ended() reports the cause
             stdin.write(json.dumps(asked).encode() + b"\n")
 
     def until_opened(self) -> None:
-        """Wait until `opened` or `result` is there. Raises what until_ended raises."""
+        """Wait until `opened` or `result` is set. Raises as until_ended."""
         self._wait(lambda: self.opened is not None)
 
     def until_frame(self, index: int) -> None:
-        """Wait until frame `index` is complete in the files, or `result` is there. Raises what until_ended raises."""
+        """Wait until frame `index` is complete in the files, or `result` is set. Raises as until_ended."""
         self._wait(lambda: self.frames > index)
 
     def until_ended(self) -> dict[str, Any]:
-        """Wait for the result. An error closes this.
+        """The result, once it arrives. An error closes this.
 
         Raises:
             InputError, LimitError: as the process raised them; or it crashed, hung, or exceeded its allowance.
-            Cancelled: should_stop said so.
+            Cancelled: should_stop returned True.
             StoreFullError: the disk is full.
             DecoderKilledError: something outside killed it.
         """
@@ -165,7 +165,7 @@ class Decoder:
             raise
 
     def _take(self, line: bytes | None) -> None:
-        """Note a line, or that there was none for a while."""
+        """Process a line, or None if none arrived for a while."""
         if line is None:
             return
         told = json.loads(line) if line != END else {}
@@ -196,7 +196,7 @@ class Decoder:
             raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")
 
     def _ended(self, answer: dict[str, Any]) -> dict[str, Any]:
-        """The result that the process's last line, empty if it had none, and its exit give."""
+        """The result, from the process's last line (empty if there was none) and its exit status."""
         try:
             self._process.wait(self._patience.max_exit_s if answer else MAX_DEATH_S)
             status = self._process.returncode
@@ -204,28 +204,28 @@ class Decoder:
             self._process.kill()
             self._process.wait()
             status = 0
-        if not answer and status == -signal.SIGKILL:  # none of its own limits ends it so
+        if not answer and status == -signal.SIGKILL:  # no limit of its own sends SIGKILL
             raise DecoderKilledError
         try:
             return _result(answer or None, status, self._field, self._allowance)
         except InputError as error:
-            if Disk(self.folder).is_full():  # whatever it was, the clip is judged again when there is room
+            if Disk(self.folder).is_full():  # whatever failed, the clip is tried again when there is space
                 raise _no_room() from error
             raise
 
 
 _ready: list[Decoder] = []
-"""A process that has loaded its libraries and waits for its request."""
+"""At most one process that has loaded its libraries and waits for its request."""
 
 
 def keep_decoder_ready() -> None:
-    """Start the next clip's decoding process now, if none waits. Call it from the thread that will decode."""
+    """Start the next clip's decoding process now if none is waiting. Call it from the thread that will decode."""
     if not _ready:
         _ready.append(Decoder())
 
 
 def take_decoder() -> Decoder:
-    """The process that waits, or a new one."""
+    """The waiting process, or a new one."""
     decoder = _ready.pop() if _ready else Decoder()
     return decoder if decoder.is_alive else Decoder()
 
@@ -238,7 +238,7 @@ def run_contained(
     program: Sequence[str] = PROGRAM,
     patience: Patience = Patience(),
 ) -> dict[str, Any]:
-    """The result of a decoding process. Raises what Decoder.until_ended raises."""
+    """The result of a decoding process. Raises as Decoder.until_ended."""
     with closing(Decoder(program)) as decoder:
         decoder.ask(request, allowance, on_report, should_stop, patience)
         return decoder.until_ended()
@@ -282,14 +282,14 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """The process's environment: of the parent's, only what libraries need to be found."""
+    """The process's environment. From the parent's it keeps only the variables for finding libraries."""
     kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
     return kept | {
         "PYTHONPATH": str(_PACKAGES),
         "PYTHONDONTWRITEBYTECODE": "1",
         "LANG": "C.UTF-8",
         "TMPDIR": str(folder),
-        "MALLOC_ARENA_MAX": "2",  # each takes address space, which is limited
+        "MALLOC_ARENA_MAX": "2",  # each arena takes address space, which is limited
         "OPENBLAS_NUM_THREADS": "1",
     }
 
@@ -313,7 +313,7 @@ def _result(answer: dict[str, Any] | None, status: int, field: str, allowance: A
 
 
 def _fault(error: dict[str, Any], field: str, allowance: Allowance) -> dict[str, Any]:
-    """Raise for an unexpected exception: an InputError for the caller, its place for the log."""
+    """Raise an InputError for an unexpected exception of the process, and log where it was raised."""
     if error["errno"] == errno.ENOSPC:
         raise _no_room()
     if error["errno"] == errno.EFBIG:

@@ -1,4 +1,4 @@
-"""The parent's side of the decoding process: what the process wrote down becomes a clip and its calibration.
+"""The parent's side of the decoding process: turns its output into a clip and its calibration.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -39,16 +39,16 @@ from intrasplat.report import Masks
 
 STAGE = "decode"
 LIBRARIES_BYTES = 2 * 2**30  # address space of Python, NumPy, OpenCV and a decoder's threads
-MAX_SHARE = 2 / 3  # of the memory there is; the rest is for the worker and the scenes that it shows
+MAX_SHARE = 2 / 3  # of the available memory; the rest is for the calling process
 MAX_CPU_S = 1800  # of all cores together; the same as MAX_TOTAL_S of one core
 
 
 @dataclass(frozen=True)
 class StereoRecording:
-    """A stereo clip, whose frames arrive while they are decoded, and its calibration.
+    """A stereo clip, whose frames arrive during decoding, and its calibration.
 
-    clip.pairs waits for each frame, and raises what decode_clip raises when decoding fails on the way. It can be read
-    again. close() ends decoding; a recording that was read to its end, or that nobody holds any more, is closed.
+    clip.pairs waits for each frame, and raises as decode_clip if decoding fails on the way. It can be read repeatedly.
+    close() ends decoding; a recording that was read to its end or garbage-collected is closed.
     """
 
     clip: StereoClip
@@ -57,9 +57,9 @@ class StereoRecording:
 
 
 class _ArrivingPairs:
-    """Left and right frames [H, W, 3] out of the files of a process that may still write them; the same again later.
+    """Left and right frames [H, W, 3] from the files of a process that may still write them, readable repeatedly.
 
-    They are read, not mapped: nothing that the process does to its files harms who reads them.
+    They are read, not mapped, so that a process that truncates its files cannot crash the reader.
     """
 
     def __init__(self, decoder: Decoder, size: tuple[int, int, int]) -> None:
@@ -90,17 +90,17 @@ def decode_clip(
     limits: ClipLimits | None = None,
     hooks: Hooks | None = None,
 ) -> StereoRecording | DepthClip:
-    """The clip and calibration of these files. The same bits as open_clip and load_calibration give.
+    """The clip and calibration in these files, bit-identical to those of open_clip and load_calibration.
 
     Another process decodes every frame into a private folder below tempfile.gettempdir(). Its memory and time are
-    limited; if the kernel allows it, it has no network and can read only these files. `assumptions` list the
-    protections that were in force. A clip with depth is whole when this returns; of a stereo clip the process goes on
-    decoding the frames. The folder is removed with the process; arrays and open files live with the clip.
+    limited. If the kernel allows it, the process has no network and can read only these files. `assumptions` lists the
+    active protections. A clip with depth is complete when this returns; the frames of a stereo clip are still being
+    decoded. The folder is removed with the process; arrays and open files live as long as the clip.
 
     Raises:
         InputError, LimitError: as open_clip and load_calibration raise them; or the stereo clip has no calibration; or
             the decoder crashed, made no progress for 10 s, or took more memory or time than allowed.
-        Cancelled: hooks.should_stop said so.
+        Cancelled: hooks.should_stop returned True.
         UnavailableError: the disk is full.
     """
     limits, hooks = limits or ClipLimits(), hooks or Hooks()
@@ -131,7 +131,7 @@ def decode_clip(
 
 
 def allowance_of(limits: ClipLimits) -> Allowance:
-    """Of the process that decodes a clip: what libraries and clip may take, and at most MAX_SHARE of the memory."""
+    """The limits of a clip's decoding process: memory for libraries and clip, at most MAX_SHARE of what there is."""
     wanted, there = LIBRARIES_BYTES + limits.decoded_bytes, memory_bytes()
     allowed = wanted if there is None else min(wanted, int(MAX_SHARE * there))
     return Allowance(allowed, max(limits.clip_bytes, limits.decoded_bytes), MAX_CPU_S)
@@ -144,7 +144,7 @@ def _unfit(error: Exception) -> InputError:
 
 
 def _reached(path: str) -> list[str]:
-    """A file or folder, and the targets of links in the folder. Only a user of this machine can give one with links."""
+    """A file or folder, and the targets of the folder's links, which only a local user can create."""
     found = [path]
     for folder, subfolders, files in os.walk(path, followlinks=True):
         if len(Path(folder).relative_to(path).parts) >= MAX_FOLDER_DEPTH:
@@ -199,7 +199,7 @@ def _notices(told: Any) -> tuple[Notice, ...]:
 
 
 def _protection(granted: list[str], allowance: Allowance) -> Notice:
-    """The protections in force while the clip was decoded, and those that the kernel did not grant."""
+    """The notice on the protections that were active during decoding, and on those that the kernel did not grant."""
     amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
     held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
     lacking = [each for each in PROTECTIONS if each not in granted]
@@ -215,7 +215,7 @@ def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _checked_depth(depth_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The depth, if it is finite and not negative. It is checked frame by frame because it is large."""
+    """The depth, after a check that it is finite and not negative, frame by frame because it is large."""
     if not all(bool(np.isfinite(frame).all()) and float(frame.min()) >= 0 for frame in depth_mm):
         raise ValueError("depth that is negative or not finite")
     return depth_mm

@@ -1,7 +1,7 @@
-"""How the decoding process confines itself before it opens files from outside.
+"""Confines the decoding process before it opens untrusted files.
 
-The limits hold on every system. Some protections depend on the kernel. Without them decoding goes on, and the report
-says so. The process cannot undo any of it.
+The limits apply on every system. Some protections depend on the kernel. Without them decoding continues, and the report
+lists them as missing. The process cannot undo any of it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PR_SET_NO_NEW_PRIVS = 38
 _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWNET = 0x40000000
 _CAPABILITY_VERSION = 0x20080522
-_CAP_DAC_READ_SEARCH = 1 << 2  # kept if held: a worker that runs as root gets files of other users
+_CAP_DAC_READ_SEARCH = 1 << 2  # kept if present: a worker that runs as root reads other users' files
 
 LIMITED_MEMORY = "limited memory"
 NO_NETWORK = "no network"
@@ -35,7 +35,7 @@ PROTECTIONS = (LIMITED_MEMORY, NO_NETWORK, NO_PROGRAMS, OWN_FILES)
 
 @dataclass(frozen=True)
 class Allowance:
-    """Limits of the process: memory, size of a file that it writes, seconds of all its cores together."""
+    """Limits of the process: memory, size of a file that it writes, CPU seconds over all cores."""
 
     memory_bytes: int
     file_bytes: int
@@ -43,19 +43,19 @@ class Allowance:
 
 
 def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
-    """Give up rights that decoding does not need. Returns the protections that were granted.
+    """Drop privileges that decoding does not need. Returns the protections that were granted.
 
-    Call it before the first thread starts. readable lists files and folders from outside; writable is the folder for
+    Call it before the first thread starts. readable lists the untrusted files and folders; writable is the folder for
     the results.
 
     Raises:
         OSError: a limit cannot be set.
-        RuntimeError: another thread runs, which would not be confined.
+        RuntimeError: another thread runs, which would remain unconfined.
     """
     _check_alone()
     die_with_parent()
     _gain_no_privileges()
-    _limit(resource.RLIMIT_CORE, 0)  # a dump would hold the clip
+    _limit(resource.RLIMIT_CORE, 0)  # a core dump would contain the clip
     _limit(resource.RLIMIT_FSIZE, allowance.file_bytes)
     _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU names the cause; SIGKILL follows
     _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
@@ -80,7 +80,7 @@ def _check_alone() -> None:
 
 
 def _limit(kind: int, soft: int, hard: int | None = None) -> None:
-    """Lower a limit. A lower one stays."""
+    """Lower a limit, unless it is lower already."""
     _, maximum = resource.getrlimit(kind)
     hard = soft if hard is None else hard
     hard = hard if maximum == resource.RLIM_INFINITY else min(hard, maximum)
@@ -103,7 +103,7 @@ def _gain_no_privileges() -> None:
 
 
 def _drop_capabilities() -> None:
-    """Drop all capabilities but one, also those in a user namespace of our own."""
+    """Drop all capabilities except _CAP_DAC_READ_SEARCH, also those in a user namespace of our own."""
     if not sys.platform.startswith("linux"):
         return
     libc = ctypes.CDLL(None, use_errno=True)
@@ -115,7 +115,7 @@ def _drop_capabilities() -> None:
 
 
 def _leave_network() -> bool:
-    """Move to an empty network namespace; an ordinary user needs a user namespace for it, too."""
+    """Move to an empty network namespace, within a user namespace if necessary; whether the kernel allowed it."""
     if not sys.platform.startswith("linux"):
         return False
     libc = ctypes.CDLL(None, use_errno=True)
@@ -123,7 +123,7 @@ def _leave_network() -> bool:
 
 
 def _libraries() -> list[Path]:
-    """Folders of Python and the libraries that it loads."""
+    """The folders of Python and of the libraries that it loads."""
     package = Path(__file__).resolve().parents[1]
     installed = (sys.prefix, sys.base_prefix, *(each for each in sys.path if "-packages" in each))
     return [package, *map(Path, (*installed, "/usr", "/lib", "/lib64"))]

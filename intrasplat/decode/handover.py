@@ -1,4 +1,4 @@
-"""The arrays that the decoding process leaves in its folder, as bare bytes: without a header nothing can be forged.
+"""Arrays from the decoding process, stored in its folder as bare bytes: without a header, none can be forged.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 EYES = ("left", "right")
 MASKS = ("tissue", "tissue_right")
-"""The arrays that a stereo clip may lack."""
+"""Names of the arrays that a stereo clip may lack."""
 
 _TYPES: dict[str, type[np.generic]] = {
     "left": np.uint8,
@@ -44,21 +44,21 @@ _SHAPES: dict[str, Callable[[int, int, int], tuple[int, ...]]] = {
 
 
 def write_arrays(folder: Path, arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
-    """Append each array to the file of its name. An array may come whole or frame by frame."""
+    """Append each array to the file of its name. An array may arrive whole or frame by frame."""
     files: dict[str, Any] = {}
     try:
         for name, array in arrays:
             if name not in files:
                 files[name] = (folder / name).open("xb")
             files[name].write(np.ascontiguousarray(array, dtype=_TYPES[name]).data)
-            files[name].flush()  # before more is asked for
+            files[name].flush()  # before the iterator computes the next one
     finally:
         for file in files.values():
             file.close()
 
 
 class ArrayFile:
-    """An array's file in the folder of a process that may still write it: frames are read out of it.
+    """Reads frames of an array from the file of a process that may still write it.
 
     Raises:
         ValueError: it is not a regular file.
@@ -72,7 +72,7 @@ class ArrayFile:
         weakref.finalize(self, os.close, self._descriptor)
 
     def frame(self, index: int) -> NDArray[Any]:
-        """One frame's part of the array. ValueError if the file does not reach so far."""
+        """One frame's part of the array. ValueError if the file is too short."""
         return self._read(self._shape[1:], index)
 
     def whole(self) -> NDArray[Any]:
@@ -96,7 +96,7 @@ class ArrayFile:
 def map_array(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[Any]:
     """The array of that name in a clip of `size` (T, H, W), mapped into memory. Writing to it changes no file.
 
-    The process that wrote it has ended. The file may be removed at once; the mapping lives as long as the array.
+    Call it after the writing process has ended. The file may be removed at once; the mapping lives with the array.
 
     Raises:
         ValueError: it is not a regular file, or its size is not the array's.
@@ -111,7 +111,7 @@ def map_array(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[An
 
 
 def _open(folder: Path, name: str) -> int:
-    """The descriptor of an array's file."""
+    """A file descriptor of an array's file."""
     descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

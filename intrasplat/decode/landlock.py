@@ -1,4 +1,4 @@
-"""An allow-list of files (Linux, Landlock): a decoder that is taken over cannot read other clips or keys."""
+"""An allow-list of files (Linux, Landlock): a compromised decoder cannot read other clips or keys."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _PATH_BENEATH = 1
 
 # rights (linux/landlock.h)
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
-_FILE_RIGHTS = _EXECUTE | 1 << 1 | _READ_FILE | 1 << 14 | 1 << 15  # the rights that a rule on a file may name
+_FILE_RIGHTS = _EXECUTE | 1 << 1 | _READ_FILE | 1 << 14 | 1 << 15  # the rights that a rule on a file may contain
 _RIGHTS_BY_VERSION = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 _READING = _EXECUTE | _READ_FILE | _READ_FOLDER
 
 
 def confine_files(readable: Sequence[Path], writable: Path) -> bool:
-    """Let this thread and those that it starts read only `readable` and change only `writable`.
+    """Allow this thread and those that it starts to read only `readable` and to change only `writable`.
 
     False if the kernel cannot. Paths are files or folders; missing ones are ignored. It needs PR_SET_NO_NEW_PRIVS.
     """

@@ -1,6 +1,6 @@
-"""What the decoding process does: open the clip, read its calibration, write down every frame.
+"""The work of the decoding process: opens the clip, reads its calibration, writes every frame to its folder.
 
-A stereo clip is told of before its frames are read, so that the parent can work on those that are there.
+A stereo clip is reported before its frames are read, so that the parent can process frames as they arrive.
 
 Symbols: T frames, H W pixels of one eye.
 """
@@ -22,15 +22,15 @@ from intrasplat.decode.reports import Reports
 from intrasplat.errors import InputError
 from intrasplat.options import ClipOptions
 
-_OPENING_SHARE = 0.5  # of the stage; a video is walked once to count its frames, and once to hand them over
+_OPENING_SHARE = 0.5  # of the stage; a video is read once to count its frames, and once to write them
 
 
 def read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[str, Any]:
-    """Write the clip's arrays into `folder`. Returns the rest of a clip with depth, for JSON; a stereo clip's is told
-    when it is opened, and masks and times are complete by then.
+    """Write the clip's arrays into `folder`. Returns the other data of a clip with depth, for JSON; those of a stereo
+    clip are reported when it is opened, after its masks and times are written.
 
     Raises:
-        MemoryError: there is too little, also where OpenCV says so.
+        MemoryError: there is too little memory, also if OpenCV reports it.
         InputError: the clip or its calibration cannot be used.
     """
     try:
@@ -47,7 +47,7 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
 
     def picture() -> None:
         nonlocal opened
-        opened += 1  # their number is not known yet: the share approaches its end without reaching it
+        opened += 1  # the total is unknown: the share approaches its end without reaching it
         reports.share = max(reports.share, _OPENING_SHARE * opened / (opened + max_frames))
         reports.picture()
 
@@ -56,7 +56,7 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
         register_layout(Path(file))
     paths = dict(request["paths"])
     given_calibration = paths.pop("calibration", None)
-    options = ClipOptions.model_construct(**request["options"])  # checked by the parent; layouts from outside are new
+    options = ClipOptions.model_construct(**request["options"])  # checked by the parent; may name a user's layout
     clip = open_clip(**paths, options=options, limits=limits)
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
     told = {
@@ -87,7 +87,7 @@ def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDAr
             done += 1
             share = done / (len(names) * clip.frame_count)
             reports.share = max(reports.share, _OPENING_SHARE + (1 - _OPENING_SHARE) * share)
-            reports.picture()  # so that a slow disk does not look like a decoder that hangs
+            reports.picture()  # so that a slow disk does not look like a hanging decoder
             yield name, frame
 
 
@@ -98,7 +98,7 @@ def _stereo_frames(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, ND
             break
         yield "left", left
         yield "right", right
-        reports.frames = found  # write_arrays asks for more when it has written these
+        reports.frames = found  # write_arrays requests the next one after writing these
         reports.picture()
     if found < clip.frame_count:
         raise InputError("clip", f"it ended after {found} of {clip.frame_count} frames.", "Give the whole recording.")

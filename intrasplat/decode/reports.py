@@ -1,4 +1,4 @@
-"""How the decoding process reports its progress to its parent: lines of JSON, which child.py describes."""
+"""Progress reports of the decoding process to its parent: lines of JSON, which child.py describes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Reports:
     """Reports progress to the parent, at most once every REPORT_PERIOD_S. Any thread may call it."""
 
     def __init__(self, stream: BinaryIO, granted: list[str]) -> None:
-        """granted: the protections in force, which are told with the clip."""
+        """granted: the active protections, which are reported with the clip."""
         self._stream, self._granted = stream, granted
         self._lock = threading.Lock()
         self._pictures = 0
@@ -22,7 +22,7 @@ class Reports:
         self.field = "clip"
         self.share = 0.0
         self.frames = 0
-        """Frames of both eyes that are complete in the files."""
+        """Number of frames of both eyes that are complete in the files."""
 
     def picture(self) -> None:
         """Count another decoded picture."""
@@ -33,13 +33,13 @@ class Reports:
                 self._report()
 
     def reading(self, field: str) -> None:
-        """Say that this input is read from now on."""
+        """Set the input that is read from now on."""
         with self._lock:
             self.field = field
             self._report()
 
     def opened(self, told: dict[str, Any]) -> None:
-        """Tell of the clip before its first frame."""
+        """Report the clip before its first frame."""
         with self._lock:
             self._send({"opened": told | {"granted": self._granted}})
 
@@ -49,7 +49,7 @@ class Reports:
             self._send({"result": result | {"granted": self._granted}})
 
     def fail(self, error: dict[str, Any]) -> None:
-        """Send the last line: what went wrong."""
+        """Send the last line: the error."""
         with self._lock:
             self._send({"error": error})
 

@@ -1,7 +1,7 @@
 """A filter of system calls (Linux, seccomp): no sockets, no other programs or processes, no access to other processes.
 
 It also forbids changing a file's permissions or times, which Landlock allows for every file of this user. It works in
-containers that forbid new namespaces. A filtered call fails with EPERM, so that a library that only tries it goes on.
+containers that forbid new namespaces. A filtered call fails with EPERM, so that a library that only probes it goes on.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 _PR_SET_SECCOMP = 22
 _MODE_FILTER = 2
 
-# classic BPF, of which the kernel accepts these: load a word of seccomp_data, jump, return
+# classic BPF instructions that the kernel accepts here: load a word of seccomp_data, jump, return
 _LOAD = 0x20
 _JUMP_IF_EQUAL = 0x15
 _JUMP_IF_ANY_BIT = 0x45
@@ -51,7 +51,7 @@ _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
     "setns": (308, 268),
     "mount": (165, 40),
     "bpf": (321, 280),
-    "io_uring_setup": (425, 425),  # would make sockets without the calls above
+    "io_uring_setup": (425, 425),  # could create sockets without the calls above
     "userfaultfd": (323, 282),
     "perf_event_open": (298, 241),
     "keyctl": (250, 219),
@@ -89,9 +89,9 @@ _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
     "utimensat": (280, 88),
 }
 _TGKILL = {"x86_64": 234, "aarch64": 131}  # abort() needs it
-_PRLIMIT64 = {"x86_64": 302, "aarch64": 261}  # getrlimit() and setrlimit() are made of it, and say 0 for this process
+_PRLIMIT64 = {"x86_64": 302, "aarch64": 261}  # getrlimit() and setrlimit() use it, with pid 0 for this process
 _CLONE = {"x86_64": 56, "aarch64": 220}
-_CLONE3 = 435  # its flags lie in memory, which a filter cannot read: "not there" makes libc use clone
+_CLONE3 = 435  # its flags lie in memory, which a filter cannot read: ENOSYS makes libc use clone
 
 
 class _Program(ctypes.Structure):
@@ -99,7 +99,7 @@ class _Program(ctypes.Structure):
 
 
 def forbid_network_and_programs() -> bool:
-    """Install the filter for this thread and those that it starts; False if the system has none.
+    """Install the filter for this thread and those that it starts; False if the system does not support it.
 
     It needs PR_SET_NO_NEW_PRIVS.
     """

@@ -1,4 +1,4 @@
-"""Depth clip and the motion of its tissue in; the coloured points with which training starts out. Verb: fuse.
+"""Depth clip and the motion of its tissue in; the coloured points from which training starts out. Verb: fuse.
 
 Symbols: T frames, H W pixels (row i, column j), N points, k stride in pixels. Lengths in mm, points in the world frame.
 Source of modes "paper" and "reference_only": Yang et al., Deform3DGS (MICCAI 2024), section "Motion-Aware Point Fusion"
@@ -51,7 +51,7 @@ class FusionSettings:
     """How points are chosen.
 
     mode               "paper": MAPF as published; "reference_only": the first training frame alone ("w/o MAPF");
-                       "fill": a grid on the first training frame and on what later keyframes show beside it; tissue
+                       "fill": a grid on the first training frame and on tissue that only later keyframes show; tissue
                        hidden there is read in later frames, at the positions that tracks give
     stride             "fill": pixels between neighbouring points
     motion_percentile  "paper": the threshold tau is this percentile of the nonzero differences on tissue
@@ -83,12 +83,11 @@ def fuse(
     moved: Mapping[int, Moved] = NO_TRACKS,
     right: Eye | None = None,
 ) -> PointCloud:
-    """The starting cloud of the training frames `train` (clip indices, rising). Same arguments, same bits.
+    """The initial point cloud from the training frames `train` (clip indices, rising). Same arguments, same bits.
 
     Args:
-        moved: for "fill", the keyframes and the tissue's displacement since each, of a single one since the first
-            training frame; empty: it rests.
-        right: for "fill", the right eye, where it teaches too.
+        moved: for "fill", the tissue's displacement since each keyframe, by keyframe; empty: the tissue rests.
+        right: for "fill", the right eye, if training uses it.
 
     Raises:
         InputError: no training frame has valid depth on tissue.

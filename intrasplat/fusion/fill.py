@@ -1,8 +1,8 @@
-"""Points for all the tissue that the clip shows: the first frame's, then what later frames show of the rest.
+"""Points for all tissue that the clip shows: the first frame's, then tissue that only later frames show.
 
-Tissue that is hidden in the first frame is read in a later frame, from where the tracks say it has moved to. Its point
-keeps its place among its neighbours in the first frame, so that neighbours there move alike. Where the camera moves on,
-later keyframes are searched likewise for what no point before shows.
+Tissue that is hidden in the first frame is read in a later frame, at the position to which the tracks say it has moved.
+Its point keeps its position among its neighbours in the first frame, so that neighbours there move alike. If the camera
+moves on, later keyframes add points for tissue that has none yet.
 
 Symbols: H W pixels (row i, column j), M cells, N points, k stride in pixels. Lengths in mm, points in the world frame.
 """
@@ -38,31 +38,31 @@ from intrasplat.motion.complete import complete_colour, complete_depth
 from intrasplat.motion.tracks import Moved
 
 EDGE_PX = 5
-"""Masks and stereo are unreliable this near to an instrument. Views from farther away are preferred."""
+"""Masks and stereo are unreliable this near to an instrument. Views with the instrument farther away are preferred."""
 MARGIN = 1 / 16
-"""Margin around the first frame, as a share of its sides, whose tissue gets points, too, if it comes into view."""
+"""Margin around the first frame, as a share of its sides. Its tissue gets points, too, if it comes into view."""
 MAX_VIEWS = 32
-"""Later frames, evenly spread, that are searched for hidden cells along the tracks."""
+"""Number of later frames, evenly spread, that are searched for hidden cells along the tracks."""
 IN_VIEW = 0.5
-"""What is no farther off the middle (points.off_middle) is in view."""
+"""A point is in view up to this distance from the middle (points.off_middle)."""
 MAX_FARTHER = 1.15
-"""A keyframe that shows tissue from so many times the least distance shows it as finely."""
+"""A keyframe counts as showing tissue equally finely up to this multiple of the smallest distance."""
 RIM_SHARE = 0.01
-"""Of the width: so far masks that were found may reach over the instrument's outline."""
+"""Share of the width by which masks that were found may extend over the instrument's outline."""
 HIDDEN, COMPLETED, MEASURED, CLEAR = range(4)
-"""How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident, far from masks."""
+"""How well a frame shows a cell, rising: not; depth completed; depth measured; depth confident and far from masks."""
 
 
 def fill(
     clip: DepthClip, frames: Sequence[int], stride: int, moved: Mapping[int, Moved], right: Eye | None = None
 ) -> PointCloud:
-    """A grid on the first frame's tissue; then each cell that it does not show, from the frame that shows it best.
+    """A grid of points on the first frame's tissue, and a point for each other cell from the frame that shows it best.
 
-    Of frames that show a cell equally well, the earliest is taken. A cell is k x k pixels. Its point comes from the
-    middle pixel, or from the pixel to which the tissue in the middle has moved. What only the right eye sees comes
-    from its frames. Where the camera moves, keyframes share the tissue: each gives what it shows best.
+    Among frames that show a cell equally well, the earliest is used. A cell is k x k pixels. Its point comes from the
+    middle pixel, or from the pixel to which the tissue in the middle has moved. Tissue that only the right eye sees
+    comes from its frames. If the camera moves, each keyframe gives the tissue that it shows best.
 
-    moved: the keyframes, and the displacement since each.
+    moved: the displacement since each keyframe, by keyframe.
     """
     first, later = frames[0], frames[1:]
     elsewhere = [index for index in later if not same_pose(clip, index, first)]
@@ -93,7 +93,7 @@ def fill(
 def _from_keyframes(
     clip: DepthClip, frames: Sequence[int], stride: int, moved: Mapping[int, Moved], coverage: _Coverage
 ) -> list[PointCloud]:
-    """Points for what keyframes show: of each what it shows best, then the rest; then what instruments hide there."""
+    """Points from keyframes: the tissue that each shows best, then the rest, then tissue that instruments hide."""
     parts = []
     for best in (True, False):
         for key, index in enumerate(moved):
@@ -112,8 +112,7 @@ def _from_keyframes(
 
 
 def _best_key(points_mm: NDArray[np.float32], clip: DepthClip, keys: Sequence[int]) -> NDArray[np.intp]:
-    """[N] which keyframe shows each point nearest to the middle, of those that are not much farther from it than
-    another."""
+    """For each point [N] the keyframe, among those near it (MAX_FARTHER), that shows it nearest to the middle."""
     off = np.stack([off_middle(points_mm, clip, index) for index in keys])
     depth_mm = np.stack([to_camera(points_mm, clip.world_from_camera[index])[:, 2] for index in keys])
     depth_mm[off > IN_VIEW] = np.inf
@@ -122,7 +121,7 @@ def _best_key(points_mm: NDArray[np.float32], clip: DepthClip, keys: Sequence[in
 
 
 def _shown(clip: Eye, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """[M] how well a frame shows its pixels (flat, [M]). A frame without any depth shows none."""
+    """How well a frame shows its pixels (flat, [M]): [M], HIDDEN to CLEAR; HIDDEN in a frame without any depth."""
     depth_mm, tissue = clip.depth_mm[index], clip.tissue[index]
     on_tissue = tissue.reshape(-1)[pixels]
     measured = on_tissue & (depth_mm.reshape(-1)[pixels] > 0)
@@ -137,12 +136,12 @@ def _shown(clip: Eye, index: int, pixels: NDArray[np.intp]) -> NDArray[np.uint8]
 def _along_tracks(
     clip: DepthClip, first: int, later: Sequence[int], cells: _Cells, moved: Moved
 ) -> Iterator[PointCloud]:
-    """Points for cells that the frame `first` does not show, each read where its tissue is when it is seen.
+    """Points for cells that the frame `first` does not show, read along the tracks in the frames that show them.
 
-    So neighbouring cells get neighbouring tissue, whenever each is seen. A guessed motion may never bring a cell into
-    sight. Such a cell gets the colour that a later frame shows in its place, and a completed depth. What no frame shows
-    stays empty, but for the rim of masks that were found: they may be too wide, and where neither camera nor instrument
-    moves their rim would be a hole. It gets the colour of the tissue beside it.
+    So neighbouring cells get neighbouring tissue, whenever each is seen. The estimated motion may bring a cell into
+    view in no frame. Such a cell gets the colour that a later frame shows at its position, and a completed depth. Cells
+    that no frame shows stay empty, except the rim of masks that were found. They may be too wide: if neither camera nor
+    instrument moves, the rim would be a hole. It gets the colour of adjacent tissue.
     """
     unseen = cells.in_view.copy()
 
@@ -174,7 +173,7 @@ def _along_tracks(
 
 
 def _guessed(place_mm: NDArray[np.float32], rgb: NDArray[np.float32], frame: int) -> PointCloud:
-    """Points [M, 3] and colours [M, 3] that no frame shows in this place."""
+    """A point cloud of positions and colours [M, 3] that no frame shows, with COMPLETED_CONFIDENCE."""
     return PointCloud(
         points_mm=place_mm,
         rgb=rgb,
@@ -188,7 +187,7 @@ def _guessed(place_mm: NDArray[np.float32], rgb: NDArray[np.float32], frame: int
 def _best_views(
     clip: DepthClip, later: Sequence[int], cells: _Cells, moved: Moved
 ) -> list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]:
-    """The best view of each cell that some frame shows: frames in order, each with cells [M'] and their pixels [M']."""
+    """The best view of each visible cell: frames in order, each with its cells [M'] and their pixels [M']."""
     best = np.full(len(cells.pixels), HIDDEN, np.uint8)
     frame, seen_at = np.full((2, len(best)), -1, np.intp)
     for index in later:
@@ -213,7 +212,7 @@ def _at_rest(index: int, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cells of the first frame, or beside it.
+    """Cells in the first frame or in the margin around it.
 
     world_mm  [M, 3]  tissue in the middle of the cell, at completed depth
     pixels    [M]     flat index of the middle pixel, or of the nearest pixel in the image
@@ -225,12 +224,12 @@ class _Cells:
     in_view: NDArray[np.bool_]
 
     def select(self, rows: NDArray[np.bool_]) -> _Cells:
-        """Those of the cells [M]."""
+        """The cells that `rows` [M] selects."""
         return _Cells(self.world_mm[rows], self.pixels[rows], self.in_view[rows])
 
 
 def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
-    """The cells that show no tissue in the first frame, and those of MARGIN around it."""
+    """The cells without tissue in the first frame, and the cells of the MARGIN around it."""
     k, measured = clip.intrinsics, is_measured(clip, first)
     sides = (k.height, k.width)
     beyond = [-(-int(side * MARGIN) // stride) * stride for side in sides]
@@ -257,10 +256,10 @@ def _middles(side: int, beyond: int, stride: int) -> NDArray[np.intp]:
 
 
 class _Coverage:
-    """Which cells of a view the points taken so far already cover."""
+    """Which cells of a view the points chosen so far cover."""
 
     def __init__(self, clip: DepthClip, stride: int, moved: Mapping[int, Moved]) -> None:
-        """moved: as for fill, of a camera that moves; empty: points count where they lie in the first frame."""
+        """moved: as for fill, if the camera moves; empty: points count at their position in the first frame."""
         self._clip, self._moved = clip, moved
         intrinsics = clip.intrinsics  # all eyes have one size
         self._width, self._stride = intrinsics.width, stride
@@ -278,9 +277,9 @@ class _Coverage:
         return self.pixels[~self._covered]
 
     def add(self, eye: Eye, index: int, pixels: NDArray[np.intp], key: int | None = None) -> PointCloud:
-        """The points of these middle pixels of one frame; from now on they cover their cells.
+        """The points of these middle pixels of one frame, which cover their cells from then on.
 
-        They follow the tracks of this keyframe; None: of the one that shows each best.
+        key: the keyframe whose tracks they follow; None: the one that shows each best.
         """
         self._look_from(eye, index)
         cloud = points_at(eye, index, pixels)
@@ -293,7 +292,7 @@ class _Coverage:
         return cloud
 
     def add_points(self, clouds: Iterable[PointCloud]) -> None:
-        """Count these points as covering the cells that they project into, from any pose."""
+        """Mark the cells that these points project into as covered, from any pose."""
         self._points += [_Covering.of(cloud, self._clip, self._moved) for cloud in clouds]
 
     def _look_from(self, eye: Eye, index: int) -> None:
@@ -307,17 +306,17 @@ class _Coverage:
         cells, _ = cells_of(points_mm, *view, self._stride)
         covered = np.zeros(self._shape, dtype=np.uint8)
         covered.reshape(-1)[cells] = 1
-        # Seen from another pose the grid is uneven: a gap of one cell between points is not a hole.
+        # From another pose the grid is uneven: a gap of one cell between points is not a hole.
         closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Covering:
-    """Points and where they are at any time.
+    """Points, and their positions at any time.
 
-    start_mm [N, 3]  where they would lie in their keyframes
-    motions          each keyframe's displacement, with which of the points [M] follow it and their pixels there [M]
+    start_mm [N, 3]  their positions in their keyframes
+    motions          per keyframe: its displacement, the indices [M] of the points that follow it, their pixels there
     """
 
     start_mm: NDArray[np.float32]
@@ -325,7 +324,7 @@ class _Covering:
 
     @classmethod
     def of(cls, cloud: PointCloud, clip: DepthClip, moved: Mapping[int, Moved]) -> _Covering:
-        """moved: empty if they rest where they lie in their keyframes."""
+        """moved: empty if the points rest at their positions in the keyframes."""
         if not moved:
             return cls(cloud.reference_mm, ())
         start_mm, motions = cloud.points_mm.copy(), []
@@ -339,7 +338,7 @@ class _Covering:
         return cls(start_mm, motions)
 
     def at(self, index: int) -> NDArray[np.float32]:
-        """[N, 3] where they are at a frame."""
+        """The points' positions [N, 3] at a frame."""
         points_mm = self.start_mm.copy() if self.motions else self.start_mm
         for since, rows, pixels in self.motions:
             if rows.size:

@@ -31,8 +31,8 @@ class PointCloud:
     rgb          [N, 3] float32  in [0, 1]
     confidence   [N]    float32  of the depth, in [0, 1]; COMPLETED_CONFIDENCE where the depth was completed
     frame        [N]    int32    clip index of the frame in which each point lay at points_mm
-    reference_mm [N, 3] float32  world: where it lay in its keyframe if the tracks say, else points_mm
-    key          [N]    int32    which of the keyframes (intrasplat/motion/keyframes.py) this is
+    reference_mm [N, 3] float32  world: its position in its keyframe if tracks give it, else points_mm
+    key          [N]    int32    number of that keyframe (intrasplat/motion/keyframes.py)
     """
 
     points_mm: NDArray[np.float32]
@@ -47,7 +47,7 @@ class PointCloud:
 
 
 def is_measured(clip: Eye, index: int) -> NDArray[np.bool_]:
-    """[H, W] tissue with valid depth."""
+    """Mask [H, W] of tissue with valid depth."""
     return np.asarray(clip.tissue[index] & (clip.depth_mm[index] > 0))
 
 
@@ -72,14 +72,14 @@ def cells_of(
 
 
 def nearest_pixels(points_mm: NDArray[np.floating], clip: Eye, index: int) -> NDArray[np.intp]:
-    """[N] flat index of the pixel of a frame that points (world) lie in, the nearest one if outside."""
+    """Flat index [N] of the pixel of a frame into which points (world) project, or of the nearest pixel if outside."""
     k, (column, row) = clip.intrinsics, _places(points_mm, clip, index)
     column, row = np.clip(np.floor(column), 0, k.width - 1), np.clip(np.floor(row), 0, k.height - 1)
     return np.asarray(row * k.width + column, np.intp)
 
 
 def off_middle(points_mm: NDArray[np.floating], clip: Eye, index: int) -> NDArray[np.floating]:
-    """[N] how far from the middle of a frame points (world) lie, as a share of its sides: up to 0.5 in view."""
+    """Distance [N] of projected points (world) from a frame's middle, as a share of its sides: at most 0.5 in view."""
     k, (column, row) = clip.intrinsics, _places(points_mm, clip, index)
     return np.asarray(np.maximum(np.abs(column / k.width - 0.5), np.abs(row / k.height - 0.5)))
 
@@ -97,8 +97,7 @@ def measured_pixels(clip: Eye, index: int) -> NDArray[np.intp]:
 
 
 def points_at(clip: Eye, index: int, pixels: NDArray[np.intp]) -> PointCloud:
-    """The points of one frame's tissue pixels (flat indices), with the first keyframe. Depth that was not measured is
-    completed."""
+    """The points of one frame's tissue pixels (flat indices), with key 0. Missing depth is completed."""
     depth_mm = clip.depth_mm[index].reshape(-1)[pixels]
     measured = depth_mm > 0
     if not measured.all():

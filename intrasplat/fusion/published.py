@@ -37,7 +37,7 @@ def motion_mask(clip: DepthClip, train: Sequence[int], percentile: float) -> NDA
 def published_fusion(
     clip: DepthClip, frames: Sequence[int], percentile: float, frame_share: float, random: np.random.Generator
 ) -> Iterator[PointCloud]:
-    """A sample of the points of every later training frame whose projection into the first one falls into F."""
+    """A sample of each later training frame's points whose projection into the first frame falls into F."""
     wanted = motion_mask(clip, frames, percentile)
     for index in frames[1:]:
         pixels = measured_pixels(clip, index)

@@ -1,4 +1,4 @@
-"""A picture and how near everything in it is come in; which pixels are instruments, and how sure that is, go out.
+"""A picture and its nearness (inverse depth) in; a mask of its instruments, and how sure it is, out.
 
 Verbs: find_instruments, Finder.of, with_instruments_found, load_segmenter, zipped_masks.
 """

@@ -1,4 +1,4 @@
-"""The instruments of a clip that came with its depth and without masks.
+"""Finds the instruments of a clip that has depth and no masks.
 
 Symbols: T frames, H W pixels; h w pixels of the coarse picture; nearness: 1 / depth.
 """
@@ -24,16 +24,16 @@ from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.notices import NoticeCode
 
 STAGE = "masks"
-"""The stage."""
+"""Name of the stage in progress reports."""
 
 
 def with_instruments_found(
     clip: DepthClip, measured: Sequence[int], hooks: Hooks, segmenter: Segmenter | None = None
 ) -> DepthClip:
-    """The clip with masks of its left eye, which it has none of. Each frame's are found by itself.
+    """The clip with masks of its left eye, for a clip without any. Frames are independent of each other.
 
     Args:
-        measured: frames that may tell the tissue's colour: those that are not held out.
+        measured: frames from which the tissue's colour may be measured: those that are not held out.
 
     Raises:
         Cancelled: hooks.should_stop said so.
@@ -69,7 +69,7 @@ def with_instruments_found(
 
 
 def nearness_of(coarse: Rgb, depth_mm: Image) -> Image:
-    """Nearness [h, w] of a picture [h, w, 3] from the depth [H, W] of its full form, 0 where it is invalid."""
+    """Nearness [h, w] of a coarse picture [h, w, 3], from the depth [H, W] at full size, where 0 is invalid."""
     size = coarse.shape[1::-1]
     valid = (depth_mm > 0).astype(np.float32)
     inverse = valid / np.maximum(depth_mm, np.float32(1e-3))

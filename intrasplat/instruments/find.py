@@ -1,4 +1,4 @@
-"""Instruments told from tissue in one picture: less red than tissue, in front of it, and coming in from the border.
+"""Finds instruments in one picture: less red than tissue, in front of it, and entering from the border.
 
 Symbols: H W pixels; h w pixels of the coarse picture; nearness: proportional to 1 / depth.
 """
@@ -18,43 +18,45 @@ Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
 
 COARSE_WIDTH, FINE_WIDTH = 160, 320
-"""Px: pictures are looked at this wide, first for instruments, then for their outlines."""
+"""Widths, px, of the reduced pictures in which instruments, then their outlines, are searched."""
 SMOOTHNESS, COLOUR_SIGMA = 5.0, 10.0
 MIN_WEIGHT = 1e-9
 BEHIND_SHARE = 0.26
-"""Of the picture's width: the tissue behind an instrument is the farthest of so wide a window."""
+"""Window, as a share of the width: the tissue behind an instrument has the least nearness in it."""
 DARK_LEVELS = 20.0
-"""Added to a sum of two colours, so that black has no colour."""
+"""Added to the denominator of redness, so that black has no colour."""
 MIN_REDNESS = 0.05
-"""Of tissue, as the median of its pixels; a picture of less has no colours."""
+"""Minimum median redness of tissue; with less, the picture has no colours."""
 GREY, SLIGHTLY_FRONT, FRONT = 0.45, 0.02, 0.10
-"""Redness of an instrument at most, relative to the tissue's; how much nearer it is at least than what is behind it."""
+"""Maximum redness of an instrument, relative to the tissue's; minimum relative nearness in front of the background, for
+a candidate and for a clear sign."""
 MIN_AREA = 0.001
 OUTLINE_PX, GAP_PX = 9, 2
-"""Window in which both sides of an outline are compared, and the width of the outline that belongs to neither."""
+"""Window in which both sides of an outline are compared; width of the outline that is ignored."""
 STEP, REDNESS_STEP = 0.04, 0.3
-"""Across an outline: relative fall of nearness, and rise of redness in parts of the tissue's."""
+"""Steps across an outline that count: relative fall of nearness; rise of redness, relative to the tissue's."""
 FRONT_BETWEEN, STEPS_BETWEEN, STEP_BETWEEN, COLOURED_BETWEEN = (0.2, 0.6), (0.4, 0.8), (0.02, 0.10), (0.3, 0.9)
-"""Between which values a candidate's signs turn from tissue's into an instrument's: the share of it that is in front;
-the share of its outline with a step in depth, and the median step; the share of its outline with a step in redness."""
+"""Values for certain tissue and certain instrument: share of a candidate that is in front; share of its outline with a
+step in depth; median step in depth; share of its outline with a step in redness."""
 ZONE_SHARE, TIP_SHARE, TIP_QUANTILE, LOCAL_SHARE = 0.0125, 0.05, 0.85, 0.2
-"""Of the width: how far the fine outline may leave the coarse one, at its tip, and how far tissue is compared."""
+"""Shares of the width, and a quantile: distance of the fine outline from the coarse one; the same at the tip; distance
+from the entry (quantile) where the tip starts; window of the surrounding tissue's redness."""
 MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
-"""Redness of the tissue around counts as so much at most; around a tip, only what is so much in front may be its."""
+"""Upper limit of the surrounding tissue's redness; minimum relative nearness of pixels added at a tip."""
 CLOSED_PX, GROWN_PX = 3, 3
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
-"""What is not in front may be an instrument that lies on the tissue: redness at most, relative to the tissue's; light
-at most, relative to the picture's, as highlights have no colour either; share of its outline with a step in redness."""
+"""Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
+because highlights have no colour either; minimum share of its outline with a step in redness."""
 REDDISH, REDDISH_STEP, MIN_REDDISH_OUTLINE, MIN_IN_FRONT = 0.7, 0.15, 0.6, 0.7
-"""What is in front may be an instrument that mirrors the tissue: its redness at most; the step in redness and the share
-of its outline that has it; how much its depth looks like an instrument's."""
+"""Signs of an instrument that reflects tissue: maximum relative redness; step in redness, and minimum share of its
+outline with it; minimum score of its depth."""
 UNSURE = 0.5
-"""How likely such a one is: enough to be masked."""
+"""Minimum score of a masked candidate; the score of instruments that reflect tissue."""
 
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """A picture of H W pixels as it is looked at: FINE_WIDTH and COARSE_WIDTH wide."""
+    """A picture of H W pixels, reduced to FINE_WIDTH and to COARSE_WIDTH."""
 
     size: tuple[int, int]
     fine: Rgb
@@ -62,7 +64,7 @@ class Looked:
 
     @classmethod
     def at(cls, rgb: Rgb) -> Looked:
-        """The picture [H, W, 3]."""
+        """The reduced forms of a picture [H, W, 3]."""
         height, width = rgb.shape[:2]
         fine = cv2.resize(rgb, (FINE_WIDTH, round(height * FINE_WIDTH / width)), interpolation=cv2.INTER_AREA)
         coarse_size = (COARSE_WIDTH, round(height * COARSE_WIDTH / width))
@@ -77,7 +79,7 @@ class TissueLook:
 
     @classmethod
     def of(cls, pictures: Iterable[Rgb]) -> TissueLook:
-        """The look of what is in most pixels of some pictures [H, W, 3]."""
+        """The tissue's colour in pictures [H, W, 3] that mostly show tissue."""
         return cls(float(np.median([np.median(_redness(Looked.at(each).coarse)) for each in pictures])))
 
 
@@ -85,9 +87,9 @@ class TissueLook:
 class FoundMask:
     """Instruments in a picture.
 
-    tool    [H, W]
+    tool    [H, W] True on instruments
     seen    share of the picture that might be instruments
-    clear   of that, what was told clearly: from 0 to `seen`
+    clear   the part of it that was classified clearly: from 0 to `seen`
     missed  share of the picture that has an instrument's colour and is not masked
     """
 
@@ -99,14 +101,14 @@ class FoundMask:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Pixels [h, w] without tissue's colour; likely: 0 looks like tissue, 1 like an instrument."""
+    """Pixels [h, w] without tissue's colour, and their score `likely`: 0 for tissue, 1 for an instrument."""
 
     pixels: Mask
     likely: float
 
 
 def smooth_nearness(rgb: Rgb, nearness: Image, trust: Image) -> Image:
-    """Nearness [h, w], filled and smoothed within areas of one colour of the picture [h, w, 3]; trust is in [0, 1]."""
+    """Nearness [h, w], filled and smoothed up to colour edges of the picture [h, w, 3]; trust [h, w] is in [0, 1]."""
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(rgb, SMOOTHNESS, COLOUR_SIGMA)
     weighted, weight = smoother.filter(nearness * trust), smoother.filter(trust)
     smooth: Image = weighted / np.maximum(weight, np.float32(MIN_WEIGHT))
@@ -117,7 +119,7 @@ def find_instruments(picture: Looked, nearness: Image, look: TissueLook) -> Foun
     """The instruments in a picture.
 
     Args:
-        nearness: [h, w] of its coarse form: smooth_nearness.
+        nearness: [h, w] at coarse size, as smooth_nearness gives it.
     """
     if look.redness < MIN_REDNESS:
         return FoundMask(np.zeros(picture.size, np.bool_), 1.0, 0.0)
@@ -131,7 +133,7 @@ def find_instruments(picture: Looked, nearness: Image, look: TissueLook) -> Foun
 
 
 def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Candidate]:
-    """What has no tissue's colour, is not behind its surroundings and touches the border; and what mirrors tissue."""
+    """Areas at the border without tissue's colour and not behind their surroundings; then areas that reflect tissue."""
     redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0)
     grey = cv2.morphologyEx((redness < GREY * look.redness).astype(np.uint8), cv2.MORPH_OPEN, _box(2))
     front = _in_front(nearness)
@@ -150,7 +152,7 @@ def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Can
 
 
 def _mirrors(pixels: Mask, front: Image, nearness: Image, redness: Image) -> bool:
-    """Whether an area looks like an instrument in the tissue's colour: by its depth, and a slight step in redness."""
+    """Whether an area looks like an instrument that reflects tissue: by depth and a slight step in redness."""
     (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
     if not near.size or float((around - own > REDDISH_STEP).mean()) < MIN_REDDISH_OUTLINE:
         return False
@@ -158,7 +160,7 @@ def _mirrors(pixels: Mask, front: Image, nearness: Image, redness: Image) -> boo
 
 
 def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
-    """The connected areas [h, w] of MIN_AREA and more; at_border: only those that touch the picture's border."""
+    """The connected areas [h, w] of at least MIN_AREA; at_border: only those that touch the picture's border."""
     height, width = part.shape
     count, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
     for j in range(1, count):
@@ -169,7 +171,7 @@ def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
 
 
 def _missed(picture: Looked, look: TissueLook, tool: Mask) -> float:
-    """Share of the picture outside the masks that has no colour, as instruments have none and hardly any tissue."""
+    """Share of the picture that is unmasked and colourless: instruments are, and hardly any tissue is."""
     height, width = picture.coarse.shape[:2]
     masked = cv2.resize(tool.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
     free = cv2.dilate(masked.astype(np.uint8), _box(OUTLINE_PX // 2 + 1)) == 0
@@ -185,14 +187,14 @@ def _missed(picture: Looked, look: TissueLook, tool: Mask) -> float:
 
 
 def _in_front(nearness: Image) -> Image:
-    """[h, w] how much nearer each pixel is than the tissue around it, as a share of that tissue's nearness."""
+    """Relative nearness [h, w] of each pixel in front of the surrounding tissue: (own - behind) / behind."""
     behind = cv2.morphologyEx(nearness, cv2.MORPH_OPEN, _box(round(BEHIND_SHARE * nearness.shape[1]) | 1))
     front: Image = (nearness - behind) / np.maximum(behind, np.float32(1e-6))
     return front
 
 
 def _likely(pixels: Mask, front: Image, nearness: Image, redness: Image) -> float:
-    """How much a candidate looks like an instrument: the weaker of what depth and colour say."""
+    """The score of a candidate in [0, 1]: the lower one of depth and colour."""
     (near, beyond), (own, around) = _across_outline(pixels, nearness, redness)
     if not near.size:
         return 0.0
@@ -201,7 +203,7 @@ def _likely(pixels: Mask, front: Image, nearness: Image, redness: Image) -> floa
 
 
 def _by_depth(front: Image, near: Image, beyond: Image) -> float:
-    """How much an area's depth looks like an instrument's: front [n] of its pixels, nearness across its outline."""
+    """Score in [0, 1] of an area's depth: front [n] of its pixels; nearness inside and outside its outline."""
     steps = (near - beyond) / np.maximum(beyond, np.float32(1e-6))
     signs = (
         _ramp(float((front > FRONT).mean()), FRONT_BETWEEN),
@@ -212,7 +214,7 @@ def _by_depth(front: Image, near: Image, beyond: Image) -> float:
 
 
 def _across_outline(pixels: Mask, *images: Image) -> list[tuple[Image, Image]]:
-    """Of each image [h, w] its means on both sides of the outline of some pixels, one value a pixel of the outline.
+    """For each image [h, w], its local means inside and outside the outline, one value per pixel of the outline.
 
     The outline at the picture's border does not count.
     """
@@ -232,15 +234,15 @@ def _across_outline(pixels: Mask, *images: Image) -> list[tuple[Image, Image]]:
 
 
 def _ramp(value: float, between: tuple[float, float]) -> float:
-    """0 below, 1 above, and straight between."""
+    """0 below the interval, 1 above it, linear inside."""
     low, high = between
     return min(max((value - low) / (high - low), 0.0), 1.0)
 
 
 def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask, look: TissueLook) -> Mask:
-    """[H, W] the candidates with the outline of their colour: half-way between their own and that of the tissue around.
+    """Mask [H, W] of the candidates, up to where redness is half-way between their own and the surrounding tissue's.
 
-    They grow by a rim, for matching and blur reach over the outline.
+    The mask grows by a rim, because matching and blur extend over the outline.
     """
     size = picture.fine.shape[1::-1]
     redness = cv2.GaussianBlur(_redness(picture.fine), (3, 3), 0) / np.float32(look.redness)
@@ -266,7 +268,7 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
 
 
 def _around_tip(pixels: Mask) -> Mask:
-    """What [h, w] is near the part of an instrument that is farthest from where it enters the picture."""
+    """Pixels [h, w] near an instrument's tip, the part farthest from where it enters the picture."""
     row, column = np.nonzero(pixels)
     height, width = pixels.shape
     enters = np.minimum.reduce([row, column, height - 1 - row, width - 1 - column]) <= 1
@@ -290,7 +292,7 @@ def _resized(pixels: Mask, size: tuple[int, int]) -> Bits:
 
 
 def _closed(bits: Bits, side_px: int) -> Bits:
-    """Gaps of less than side_px are closed, also at the picture's border."""
+    """The mask with gaps of less than side_px closed, also at the picture's border."""
     wide = cv2.copyMakeBorder(bits, side_px, side_px, side_px, side_px, cv2.BORDER_REPLICATE)
     closed: Bits = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _box(side_px))[side_px:-side_px, side_px:-side_px]
     return closed

@@ -1,4 +1,4 @@
-"""What finds a clip's instruments, a frame at a time, and what the report says of it."""
+"""The finder of a clip's instruments, one frame at a time, and its entries in the report."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import Masks
 
 MIN_SURE = 0.7
-"""Of what might be instruments, told clearly; below it the report warns."""
+"""The report warns if a smaller share of the possible instruments is clear."""
 MAX_UNSURE = 0.012
-"""Share of the picture that looks like instruments and is not told clearly; above it the report warns, however much of
-it is clear."""
+"""The report warns if a larger share of the picture may be instruments and is unclear, whatever the rest."""
 MAX_MISSED = 0.001
-"""Share of the picture that may be instruments and is not masked; above it the report warns. Clips whose instruments
-are all found or that have none have 0.0005 at most, those with one missed 0.002 and more."""
+"""The report warns if a larger share of the picture may be instruments and is not masked. Clips whose instruments are
+all found or that have none have 0.0005 at most, clips with a missed instrument 0.002 and more."""
 LOOKED_AT = 7
-"""Pictures that tell the tissue's colour."""
+"""Number of pictures from which the tissue's colour is measured."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Finder:
         return cls(TissueLook.of(pictures) if segmenter is None else None, segmenter)
 
     def __call__(self, rgb: Rgb, nearness: Callable[[Rgb], Image]) -> FoundMask:
-        """The instruments in a picture [H, W, 3]; nearness(coarse) is that of its coarse form."""
+        """The instruments in a picture [H, W, 3]; nearness(coarse) returns the nearness of its coarse form."""
         if self.segmenter is not None:
             return self.segmenter(rgb)
         assert self.look is not None
@@ -46,11 +45,11 @@ class Finder:
         return find_instruments(picture, nearness(picture.coarse), self.look)
 
     def told(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:
-        """What the report says: of masks, the assumption, and warnings.
+        """The report's entry on masks, the assumption, and warnings.
 
         Args:
-            share: of all pixels, which is masked.
-            found: [frames looked at, 3] seen, clear and missed (FoundMask).
+            share: masked share of all pixels.
+            found: [frames, 3] seen, clear and missed (FoundMask) of the searched frames.
         """
         seen, clear, missed = found.mean(axis=0)
         sure = float(clear / seen) if seen > 0 else 1.0
@@ -75,5 +74,5 @@ class Finder:
 
 
 def looked_at(frames: Sequence[int]) -> Sequence[int]:
-    """Those of a clip's frames whose pictures tell the tissue's colour."""
+    """The frames, out of those given, from which the tissue's colour is measured."""
     return frames[:: -(-len(frames) // LOOKED_AT)]

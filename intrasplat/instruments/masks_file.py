@@ -1,4 +1,4 @@
-"""The masks that were found, as a file that users correct and send with the clip again.
+"""The masks that were found, as a file that users can correct and send with the clip again.
 
 Symbols: T frames, H W pixels.
 """
@@ -18,15 +18,15 @@ from intrasplat.clip.recorded_masks import as_recorded
 from intrasplat.machine.mapped import let_go
 
 MAX_BYTES = 32 << 20
-"""Of the file. Masks that take more are not kept; a frame of 1920 x 1080 takes some 5 kB."""
+"""Maximum size of the file. Larger masks are not stored; a frame of 1920 x 1080 takes some 5 kB."""
 
 
 def zipped_masks(clip: DepthClip) -> bytes | None:
     """A zip with a PNG for each frame of the clip, if masks were found.
 
-    000000.png and so on are [H, W] in the pixels of the recorded left eye, 255 on instruments. A frame that nobody
-    looked at (left_out) has the mask of the nearest one that was. None where nothing was found, and where the file
-    would have more than MAX_BYTES. The same masks are the same bytes: ZipInfo's time is fixed.
+    000000.png and so on are [H, W] in the pixels of the recorded left eye, 255 on instruments. A skipped frame
+    (left_out) gets the mask of the nearest searched one. None if nothing was found, or if the file would exceed
+    MAX_BYTES. The same masks give the same bytes, because ZipInfo's time is fixed.
     """
     if clip.masks is None or not clip.masks.are_found or clip.masks.share == 0:
         return None
@@ -41,7 +41,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
 
 
 def _recorded_tools(clip: DepthClip) -> Iterator[NDArray[np.bool_]]:
-    """Where the recorded left eye shows instruments [H, W], frame by frame."""
+    """Masks of instruments [H, W] in the pixels of the recorded left eye, frame by frame."""
     maps = None if clip.rectification is None else clip.rectification.maps(*clip.tissue.shape[1:])
     looked_at = np.array(clip.used)
     for index in range(clip.frame_count):

@@ -1,6 +1,6 @@
-"""A network of one's own that finds instruments: an ONNX file, run by onnxruntime (extra `onnx`).
+"""A user's own network that finds instruments: an ONNX file, run by onnxruntime (extra `onnx`).
 
-Input: float32 [1, 3, h, w], RGB in [0, 1]; of any size, or of one that the file fixes, to which pictures are resized.
+Input: float32 [1, 3, h, w], RGB in [0, 1]; any size, or the size that the file fixes, to which pictures are resized.
 Output: float32 [1, 1, h, w] or [1, h, w], the probability of an instrument; or [1, C, h, w], scores of C classes, of
 which class 0 is tissue.
 """
@@ -22,7 +22,7 @@ from intrasplat.instruments.find import FoundMask, Rgb
 INSTALL = "Install intrasplat with its extra onnx: pip install 'intrasplat[onnx]'."
 CHECK = "Set INTRASPLAT_SEGMENTER (--segmenter) to an ONNX network as in docs/operations.md, or leave it unset."
 LIKELY = 0.1
-"""Probability from which a pixel counts as what might be an instrument."""
+"""Minimum probability of a pixel that counts as a possible instrument."""
 
 
 logger = logging.getLogger(__name__)
@@ -30,10 +30,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Segmenter:
-    """Finds instruments with a loaded network. Several threads may use it at once.
+    """Finds instruments with a loaded network. It is thread-safe.
 
-    session  onnxruntime's
-    size     width and height that the network asks for; None: any
+    session  the InferenceSession of onnxruntime
+    size     width and height of the network's input; None: any
     """
 
     session: Any
@@ -43,7 +43,7 @@ class Segmenter:
         """The instruments in a picture [H, W, 3].
 
         Raises:
-            UnavailableError: the network fails, or gives something else than it should.
+            UnavailableError: the network fails, or its output is not as described above.
         """
         height, width = rgb.shape[:2]
         given = rgb if self.size is None else cv2.resize(rgb, self.size, interpolation=cv2.INTER_AREA)
@@ -72,7 +72,7 @@ def load_segmenter(path: Path) -> Segmenter:
     except ImportError as error:
         raise UnavailableError("A segmenter is set, and onnxruntime is not installed.", INSTALL) from error
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # frames are found side by side
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # frames run in parallel
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:
@@ -88,7 +88,7 @@ def load_segmenter(path: Path) -> Segmenter:
 
 
 def _probability(answer: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Of an instrument [h, w]."""
+    """The probability [h, w] of an instrument."""
     planes = answer.reshape(-1, *answer.shape[-2:]) if answer.ndim in (3, 4) else answer
     if planes.ndim != 3 or not len(planes) or not np.issubdtype(planes.dtype, np.floating):
         raise UnavailableError(f"The segmenter gives {answer.dtype} {list(answer.shape)}, no [1, C, h, w].", CHECK)

@@ -1,6 +1,6 @@
-"""Options that cannot go with the files of an upload, found without a decoder.
+"""Detects options that contradict the files of an upload, without a decoder.
 
-The worker refuses the same, and more; a caller who hears it at once need not wait for the job to fail.
+Reconstruction makes the same checks and more. This early check saves the caller from waiting for the job to fail.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from intrasplat.options import ReconstructionOptions
 _OF_MANY_FILES = ("endonerf", "stereomis", "frames")
 """Layouts whose clip is a zip."""
 STEREO_VIDEOS = ("sbs", "tb")
-"""Layouts whose clip shows both eyes: a video of these, unlike a zip, can bring no calibration."""
+"""Layouts whose clip shows both eyes. A video, unlike a zip, cannot contain a calibration."""
 
 
 def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: Collection[str]) -> None:
-    """Return if the options can go with the files.
+    """Check that the options fit the files.
 
     Args:
-        files: an upload's, by part, each of which has passed check_file().
-        sent: the parts that came with the options; the others are those of an earlier job's clip.
+        files: the files of an upload by part, each of which has passed check_file().
+        sent: the parts that came with the options; the others belong to an earlier job's clip.
 
     Raises:
-        InputError: names the option, the clip if it lacks a file of the layout that was asked for, or the calibration
-            if a video is sure to be of two eyes and came without one.
+        InputError: names the option; the clip, if it lacks a file of the requested layout; or the calibration, if it is
+            missing for a video that certainly shows two eyes.
     """
     layout, clip = options.layout, files.get("clip")
     if clip is None and layout != "auto":
@@ -53,7 +53,7 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
 
 
 def calibration_missing() -> InputError:
-    """What is said of a video of two eyes that came without a calibration."""
+    """The error for a video of two eyes without a calibration."""
     return InputError(
         "calibration", "a video of two eyes needs a calibration.", "Add the calibration of this endoscope."
     )
@@ -64,6 +64,6 @@ def _is_zip(path: Path) -> bool:
 
 
 def _holds(path: Path, name: str) -> bool:
-    """Whether a zip holds a file of that name, in whatever folder."""
+    """Whether a zip contains a file of that name in any folder."""
     with zipfile.ZipFile(path) as archive:
         return any(PurePosixPath(each).name == name for each in archive.namelist())

@@ -1,6 +1,6 @@
-"""How large a clip may be: the service checks it at upload, the worker while decoding.
+"""Size limits of a clip. The service checks them at upload, the library during decoding.
 
-A 166 kB file can decode to 18 GB, so sizes are checked in the header and again while decoding.
+A 166 kB file can decode to 18 GB, so sizes are checked in the header and again during decoding.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ from dataclasses import dataclass, field
 from intrasplat.errors import LimitError
 from intrasplat.machine.memory_limit import memory_bytes
 
-MIN_SIDE_PX = 16  # stereo matching and the rasteriser's tiles need as much
+MIN_SIDE_PX = 16  # minimum for stereo matching and the rasteriser's tiles
 
 HELD_BYTES_PER_PIXEL = 18
-"""Bytes of a pixel of both eyes in every frame while a clip is reconstructed; one eye alone takes half.
+"""Bytes per pixel and frame for both eyes during reconstruction; one eye alone takes half.
 
-9 of each eye in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it. Where
-stereo makes the depth, frame by frame, the clip lies in files; a clip that has its depth is whole in memory first.
+Each eye takes 9 in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it. If
+stereo computes the depth, frame by frame, the clip lies in files; a clip that has depth is first in memory as a whole.
 """
 
 MAX_CLIP_BYTES = 8 * 1024**3  # of a clip in files, on any machine: more frames would train for too long
 
 MAX_MEMORY_BYTES = MAX_CLIP_BYTES  # of a clip with depth, on any machine
-MEMORY_PARTS = 2  # a clip gets one of this many parts of memory_bytes(); the rest is for the model
+MEMORY_PARTS = 2  # a clip may take 1 / MEMORY_PARTS of memory_bytes(); the rest is for the model
 
-EYES = 2  # of a stereo clip; the largest picture accepted holds both
+EYES = 2  # of a stereo clip; the largest accepted picture contains both
 
 MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and each frame's 17 numbers
-MAX_CALIBRATION_BYTES = 250_000  # a calibration has a few kB, with the points that it was made from some ten
+MAX_CALIBRATION_BYTES = 250_000  # a calibration has a few kB, or some ten with its calibration points
 MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and each pixel as uncompressed 16-bit RGBA
 
 
 def memory_for_clip_bytes() -> int:
-    """Memory that a clip may take here: half of the machine's or the container's, at most 8 GiB."""
+    """Maximum memory of a clip on this machine: half of the machine's or the container's, at most 8 GiB."""
     there = memory_bytes()
     return MAX_MEMORY_BYTES if there is None else min(MAX_MEMORY_BYTES, there // MEMORY_PARTS)
 
@@ -49,9 +49,9 @@ class ClipLimits:
     frames            frames of a clip
     duration_s        duration by the frame times
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
-    clip_bytes        bytes of the whole clip while it is reconstructed (HELD_BYTES_PER_PIXEL)
-    decoded_bytes     memory of a clip that has its depth, likewise, and bytes of everything in an archive once
-                      inflated; default: memory_for_clip_bytes()
+    clip_bytes        bytes of the whole clip during reconstruction (HELD_BYTES_PER_PIXEL)
+    decoded_bytes     memory of a clip that has depth, computed likewise, and inflated size of a whole archive;
+                      default: memory_for_clip_bytes()
     on_picture        called after each decoded picture, from any thread, as a sign of progress
     """
 
@@ -63,7 +63,7 @@ class ClipLimits:
     on_picture: Callable[[], None] = field(default=_ignore, compare=False)
 
     def numbers(self) -> dict[str, float]:
-        """The limits by their names, for another process."""
+        """The limits by name, for another process."""
         names = ("frames", "duration_s", "pixels_per_frame", "clip_bytes", "decoded_bytes")
         return {name: getattr(self, name) for name in names}
 
@@ -103,7 +103,7 @@ class ClipLimits:
         """LimitError if `frames` pictures of width x height pixels are too many or too large.
 
         eyes: number of eyes in a picture; 2 if it is not known yet.
-        has_depth: the clip lies whole in memory, not in files.
+        has_depth: the clip is in memory as a whole, not in files.
         """
         if frames > self.frames:
             raise LimitError(

@@ -1,7 +1,7 @@
-"""How deep a text seems to nest, told without a parser: those of JSON, YAML and XML call themselves for every level.
+"""Estimates the nesting depth of a text without a parser: parsers of JSON, YAML and XML recurse for every level.
 
-What hides its levels passes, and the parsers have to bear it: json raises RecursionError, and OpenCV reads in the
-process that decodes clips, whose death fails one job.
+A text can hide its levels from this estimate. Then json raises RecursionError, or OpenCV's parser crashes the decoding
+process, which fails one job.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ _OTHERS = bytes(set(range(256)) - set(_BRACKETS))
 _EMPTY_TAG = re.compile(rb"<[^<>]*/>")
 _SIGNS_OF_TAGS = ((b"</", b"]"), (b"<?", b""), (b"<!", b""), (b"<", b"["))
 MAX_COUNTED = 100
-"""More levels than a file of ours has. What nests deeper is told as deep as the brackets that are left are many."""
+"""More levels than a valid file has. Beyond it, the estimate is the number of remaining brackets."""
 
 
 def nesting(text: str) -> int:
-    """The levels of JSON, YAML and XML in a text by its signs: brackets, open tags, keys and dashes in one line.
+    """Estimated nesting depth of JSON, YAML or XML: by brackets, open tags, and keys and dashes in one line.
 
-    No bound: signs in strings and in comments count as others do, so they may open levels that are none, and close some
-    that are. Levels that YAML tells by indentation are not counted: a file of a megabyte cannot have many.
+    It is no bound: signs in strings and comments count, too, so they may add false levels or close true ones. Levels by
+    YAML indentation are not counted: a file of a megabyte cannot have many.
     """
     data = text.encode("ascii", "replace")
     deepest = max(_of_pairs(data.translate(_SQUARE, _OTHERS)), _of_tags(data))
@@ -36,10 +36,10 @@ def _of_tags(data: bytes) -> int:
 
 
 def _of_pairs(brackets: bytes) -> int:
-    """Levels of square brackets, those that nothing closes included.
+    """Levels of square brackets, unclosed ones included.
 
-    The innermost pairs are taken out again and again. A loop over the brackets would take a hundred times as long, and
-    other threads would wait for it.
+    Innermost pairs are removed repeatedly. A Python loop over the brackets would take a hundred times as long and block
+    other threads.
     """
     levels = 0
     while levels < MAX_COUNTED and b"[]" in brackets:
@@ -49,7 +49,7 @@ def _of_pairs(brackets: bytes) -> int:
 
 
 def _of_line(line: str) -> int:
-    """The most keys and dashes in a row: `- - a: b: 1` has four."""
+    """The longest run of keys and dashes: `- - a: b: 1` has four."""
     run = longest = 0
     for word in line.split():
         run = run + 1 if word == "-" or word.endswith(":") else 0

@@ -1,6 +1,6 @@
-"""A first check of uploaded files, without a decoder: what cannot be a clip is refused on arrival.
+"""First check of uploaded files without a decoder: files that cannot be a clip are refused on arrival.
 
-It reads only a few bytes. The files that pass are decoded in a confined process (intrasplat/decode/).
+It reads only a few bytes. Files that pass are decoded in a confined process (intrasplat/decode/).
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ JPEG_MAGIC = b"\xff\xd8\xff"
 _NPY_MAGIC = b"\x93NUMPY"
 _MATROSKA_SUFFIXES = frozenset({".mkv", ".webm"})
 _IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-_HEAD_BYTES = 32  # holds a PNG's size
+_HEAD_BYTES = 32  # contains a PNG's size
 _NPY_HEAD_BYTES = 4096  # NumPy writes 128; larger headers may attack their parser
-MAX_NESTING = 64  # of a calibration, whose own levels are four
+MAX_NESTING = 64  # of a calibration; valid ones have four levels
 _PLAIN_TEXT_REMEDY = "Give numbers only: our JSON, OpenCV YAML or XML, or StereoMIS ini."
 _ACTIVE_TEXT = {"<!entity": "declares XML entities", "<!doctype": "has an XML document type", "!!python": "names code"}
 
 _NOT_FINITE = re.compile(r"(?:nan|inf(?:inity)?)(?![\w\"'.=:-])")
 _BEFORE_A_NUMBER = re.compile(r"(?<![\w\"'./-])[-+]?\.?\Z")
 _COMMENT = re.compile(r"[#;].*|<!--(?:(?!<!--).)*?-->")
-"""The last of several beginnings counts: a search for the end from each of them would take the square of the length."""
+"""A comment starts at the last of several starts: a search for the end from each start would take quadratic time."""
 
 
 def check_file(path: Path, part: str, limits: ClipLimits) -> None:
-    """Check one part of an upload. The sender declares its kind by the ending of its name.
+    """Check one part of an upload. The suffix of its name declares its kind.
 
     Raises:
-        InputError: it is of another kind, damaged, or holds what no clip needs; its field is the part.
-        LimitError: its header declares more than is accepted.
+        InputError: it is of another kind, damaged, or contains files that no clip needs; its field is the part.
+        LimitError: its header declares more than the limits.
     """
     if path.stat().st_size == 0:
         raise InputError(part, f"{path.name} is empty (0 bytes).", "Send the file again.")
@@ -75,7 +75,7 @@ def check_calibration_text(text: str, field: str, label: str) -> None:
 
 
 def check_calibration_file(text: str, field: str, label: str) -> None:
-    """InputError for what is no text, what check_calibration_text() refuses, and numbers that are not finite."""
+    """InputError for data that is no text, text that check_calibration_text() refuses, and non-finite numbers."""
     if "\0" in text:
         raise InputError(field, f"{label} is not a text file.", _PLAIN_TEXT_REMEDY)
     check_calibration_text(text, field, label)
@@ -83,9 +83,9 @@ def check_calibration_file(text: str, field: str, label: str) -> None:
 
 
 def _check_numbers(text: str, field: str, label: str) -> None:
-    """InputError for a number that is none or not finite, as a calibration that failed writes it.
+    """InputError for NaN or an infinite number, as failed calibrations contain.
 
-    The other threads wait for each call of a pattern: none looks at what a plain search for the letters rules out.
+    A pattern search blocks other threads, so a plain search for the letters comes first.
     """
     small = text.lower()
     if "nan" not in small and "inf" not in small:
@@ -111,7 +111,7 @@ def _text_of(path: Path, part: str) -> str:
 
 
 def check_head(head: bytes, suffix: str, part: str, label: str) -> None:
-    """InputError if a file is no video, or its first bytes and the ending of its name disagree.
+    """InputError if a file is no video, or if its first bytes contradict its suffix.
 
     head: the first 12 bytes or more.
     """
@@ -157,12 +157,12 @@ def _check_image(head: bytes, name: str, part: str, limits: ClipLimits) -> None:
 
 
 def _is_litter(name: str) -> bool:
-    """Whether it is a file manager's own file, which the worker ignores."""
+    """Whether it is a file manager's own file, which clips ignore."""
     return "__MACOSX" in name or PurePosixPath(name).name.startswith(".")
 
 
 def _check_npy(head: bytes, name: str, part: str) -> None:
-    """InputError for an array with an odd header or of pickled objects, which run code when they are loaded."""
+    """InputError for an array with an unusual header or of pickled objects, which run code on loading."""
     if _is_litter(name):
         return
     header_bytes = int.from_bytes(head[8:10] if head[6:7] == b"\1" else head[8:12], "little")

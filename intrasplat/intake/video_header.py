@@ -1,7 +1,7 @@
 """Codec, size and duration in a video's header, read without a decoder.
 
-ISO base media (mp4, mov; ISO/IEC 14496-12) is a tree of boxes, Matroska and WebM (RFC 9559) a tree of elements. A video
-whose header does not tell is not refused here: the decoder in its confined process decides.
+ISO base media (mp4, mov; ISO/IEC 14496-12) is a tree of boxes, Matroska and WebM (RFC 9559) a tree of elements. If the
+header lacks a value, the video is not refused here: the decoder in its confined process decides.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _VIDEO_TYPE = 1
 
 @dataclass(frozen=True)
 class VideoTrack:
-    """A video track. Numbers are 0 if the header has none; `shown` is the display size."""
+    """A video track. Numbers are 0 if the header lacks them; `shown` is the display size."""
 
     codec: bytes
     width: int = 0
@@ -79,7 +79,7 @@ def is_matroska(path: Path) -> bool:
 
 
 def check_video(path: Path, field: str, label: str, limits: ClipLimits) -> VideoTrack:
-    """The track to decode. Files that need no decoder to be refused are refused here.
+    """The track to decode, after all checks that need no decoder.
 
     Raises:
         InputError: it is not a video, has no header, or its codec is not accepted.
@@ -140,14 +140,14 @@ def _iso_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
 
 
 def _box_size(head: bytes, max_bytes: int) -> tuple[int, int]:
-    """(bytes of the box's own header, bytes of the whole box)."""
+    """Bytes of the box's own header, and bytes of the whole box."""
     (size,) = struct.unpack_from(">I", head)
     if size == 1:
         (size,) = struct.unpack_from(">Q", head, 8)
         if size < 16:
             raise ValueError(f"a box of {size} bytes")
         return 16, size
-    if size == 0:  # up to the end
+    if size == 0:  # the box extends to the end of the file
         return 8, max_bytes
     if size < 8:
         raise ValueError(f"a box of {size} bytes")
@@ -155,7 +155,7 @@ def _box_size(head: bytes, max_bytes: int) -> tuple[int, int]:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(name, content) of the boxes side by side in data."""
+    """The (name, content) of consecutive boxes in data."""
     start = 0
     for _ in range(_MAX_PARTS):
         if start + 8 > len(data):
@@ -169,7 +169,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _inside(data: bytes, *path: bytes) -> bytes | None:
-    """Content of the first box at that path."""
+    """The content of the first box at that path."""
     for name in path:
         found = next((content for box, content in _boxes(data) if box == name), None)
         if found is None:
@@ -200,7 +200,7 @@ def _shown(trak: bytes) -> tuple[int, int]:
 
 
 def _samples(trak: bytes) -> int:
-    """Frames in the table of sample sizes; 0 in fragmented files, whose fragments hold the tables."""
+    """Number of frames in the table of sample sizes; 0 in fragmented files, whose tables are in the fragments."""
     table = _inside(trak, b"mdia", b"minf", b"stbl", b"stsz") or _inside(trak, b"mdia", b"minf", b"stbl", b"stz2")
     return 0 if table is None else int(struct.unpack_from(">I", table, 8)[0])
 
@@ -216,7 +216,7 @@ def _duration_s(trak: bytes) -> float:
 
 
 def _matroska_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
-    """The tracks described before the first pictures. ValueError if there are none."""
+    """The tracks that are described before the first pictures. ValueError if there are none."""
     data = file.read(min(file_bytes, _MAX_HEADER_BYTES))
     tracks: list[VideoTrack] = []
     duration_s = 0.0
@@ -253,7 +253,7 @@ def _track(entry: bytes) -> Iterator[VideoTrack]:
 
 
 def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(id, content) of the elements side by side in data; the last may be cut off, or of unknown size."""
+    """The (id, content) of consecutive elements in data; the last may be cut off or of unknown size."""
     start = 0
     for _ in range(_MAX_PARTS):
         if start >= len(data):
@@ -273,7 +273,7 @@ def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _length_of_number(first: int, max_length: int) -> int:
-    """Bytes of a number, by the leading zeros of its first byte."""
+    """Length of a number in bytes, by the leading zeros of its first byte."""
     length = 9 - first.bit_length()
     if length > max_length:
         raise ValueError("an element's size or name is none")

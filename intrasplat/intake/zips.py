@@ -1,7 +1,7 @@
-"""Untrusted zips: their directory is checked before any member is inflated.
+"""Opens untrusted zips, after a check of their directory before any member is inflated.
 
-Members are refused that could reach outside (absolute paths, "..", links), hide their content (encryption, nested
-archives, duplicates, overlaps), or exceed the limits. The service checks a zip at upload, and the worker once more.
+Members are refused that could escape the archive (absolute paths, "..", links), hide their content (encryption, nested
+archives, duplicates, overlaps), or exceed the limits. The service checks a zip at upload, the library once more.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_RATIO = 200  # inflated to compressed: about 1 for pictures, 10 for text, 10
 MAX_BYTES_OF_ANY_RATIO = 1 << 20  # smaller members may have any ratio
 
 UNREADABLE = (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error)
-"""Exceptions of zipfile for a damaged member; ValueError is for a name that is no UTF-8."""
+"""Exceptions of zipfile for a damaged member; ValueError is for a name that is not UTF-8."""
 
 _END = struct.Struct("<4s4H2LH")  # end of central directory (APPNOTE 4.3.16)
 _END_64 = struct.Struct("<4sQ2H2L4Q")  # (4.3.14)
@@ -42,7 +42,7 @@ def open_zip(
 
     Raises:
         InputError: it is damaged, or a member is refused. The error names `field` and `label`.
-        LimitError: it holds too many members, or they inflate to too much.
+        LimitError: it has too many members, or their inflated size is too large.
     """
     try:
         _check_directory(path, field, label)
@@ -68,7 +68,7 @@ def _checked(
     names: set[str] = set()
     for entry in entries:
         _check_member(entry, field, label, nested)
-        known = entry.filename.lower()  # two names that differ in case are one file on some systems
+        known = entry.filename.lower()  # names that differ only in case are one file on some systems
         if known in names:
             raise InputError(field, f"{label} holds {entry.filename!r} twice.", _AGAIN)
         names.add(known)
@@ -115,11 +115,11 @@ def _directory_size(file: BinaryIO, file_bytes: int) -> tuple[int, int]:
 
 
 def _check_member(entry: zipfile.ZipInfo, field: str, label: str, nested: Collection[str]) -> None:
-    """InputError for a member that could reach outside the archive or hide what it holds."""
+    """InputError for a member that could escape the archive or hide its content."""
     name = entry.filename
     problem = None
     kind = stat.S_IFMT(entry.external_attr >> 16)
-    # zipfile cuts names at NUL, so the stored name is checked, too
+    # zipfile truncates names at NUL, so the stored name is checked, too
     if any(ord(letter) < 32 for letter in entry.orig_filename) or "\\" in entry.orig_filename:
         problem = "has a name with a backslash or a control character"
     elif name.startswith("/") or re.match(r"[A-Za-z]:", name):

@@ -1,7 +1,7 @@
-"""How large a model the scene needs: how many bases its motion has, and how far apart its Gaussians start.
+"""Model size that the scene needs: the number of bases, and the distance between Gaussians at the start.
 
-Both choices minimise the squared error of the picture that each is expected to leave, in squared grey levels (of 255) a
-channel of a tissue pixel. They are made before training, from training frames alone (docs/decisions/motion.md).
+Both choices minimise the expected squared error of the picture, in squared grey levels (of 255) per channel of a tissue
+pixel. They use training frames alone and precede training (docs/decisions/motion.md).
 
 Symbols: B bases.
 """
@@ -25,32 +25,32 @@ from intrasplat.motion.trials import CELLS, BasisValues, FitError, Trial, mean_e
 BASES = (3, 5, 9, 13, 17, 25, 33, 49, 65, 97, 129, 161, 193)
 """Numbers of bases to choose from, besides REST."""
 REST = 1
-"""One basis is a constant: the scene neither moves nor changes its light."""
+"""One basis is a constant: neither motion nor illumination of the scene changes."""
 FRAMES_A_BASIS = 3
-"""Training frames per basis where too few tracks can be trusted to try numbers of bases."""
+"""Training frames per basis if too few tracks are reliable for cross-validation."""
 MIN_FRAMES_A_BASIS = 2
-"""Each basis has more training frames than this. With fewer, training frames gain what held-out frames lose."""
+"""Each basis has more training frames than this. With fewer, the model overfits: held-out frames get worse."""
 USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 4
-"""More than USUAL_BASES have so many training frames each: a model's memory grows with its bases."""
+"""Beyond USUAL_BASES, each basis needs this many training frames: a model's memory grows with its bases."""
 MAX_MOTION_LEFT = 0.5
 """No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
 MIN_GAIN_DB = 0.25
-"""More bases, or more points, have to lower the expected error of the picture by more than this."""
+"""More bases, or more points, must lower the expected error of the picture by more than this."""
 MAX_COARSENING = 4
-"""Points are at most this many times as far apart as in the finest grid: light may reveal detail later."""
+"""Largest stride over the finest stride: changing illumination may reveal detail later."""
 MAX_POINTS = 80_000
 """Points per image in the finest grid that was measured."""
 TRAINED_SHARE = 0.1
-"""Trained Gaussians leave about this share of the squared error of a grid of colours as fine as they start. Measured on
-a still clip at 2 to 4 pixels, where 0.04 to 0.14 were left."""
+"""Squared error of trained Gaussians, as a share of that of a grid of colours at their starting distance. Measured on a
+still clip at 2 to 4 pixels: 0.04 to 0.14."""
 MIN_TRIAL_CELLS = 30
 MIN_TRIAL_FRAMES = 8
-"""With fewer cells or frames, the error in validation frames says nothing."""
+"""With fewer cells or frames, the error in validation frames is meaningless."""
 
 
 @dataclass(frozen=True)
 class BasisChoice:
-    """A number and why, in words for the report."""
+    """The chosen number and the reason, a text for the report."""
 
     count: int
     reason: str
@@ -58,10 +58,10 @@ class BasisChoice:
 
 @dataclass(frozen=True)
 class BasisTrials:
-    """Error of each number of bases in validation frames; empty where too few tracks can be trusted.
+    """Error of each number of bases in validation frames; empty if too few tracks are reliable.
 
-    tracked  of the tracks
-    resting  of tracks at rest, if the pictures fit these as well as the tracks; else empty
+    tracked  errors for the tracks
+    resting  errors for tracks at rest, if the pictures fit these as well as the tracks; else empty
     """
 
     tracked: Mapping[int, FitError]
@@ -82,14 +82,14 @@ def try_bases(
     basis_values: BasisValues,
     max_bases: int | None = None,
 ) -> BasisTrials:
-    """The error of each number of bases up to max_bases, in validation frames. tracks: of each keyframe.
+    """The error of each number of bases up to max_bases, in validation frames. tracks: those of each keyframe.
 
-    Every fourth training frame is a validation frame. The tracks in the others are fitted by three quarters of B bases;
-    the error is the fit's difference from the tracks in the validation frames. There are more than MIN_FRAMES_A_BASIS
-    training frames for each basis.
+    Every fourth training frame is a validation frame. Three quarters of B bases are fitted to the tracks in the other
+    frames; the error is the fit's difference from the tracks in the validation frames. Each basis has more than
+    MIN_FRAMES_A_BASIS training frames.
 
-    The tracks of a single keyframe are noise if moving along them brings the pictures of the validation frames no more
-    than MIN_GAIN_DB nearer than rest does, with the largest number of bases. The result then has `resting`.
+    The tracks of a single keyframe count as noise if they predict the pictures of the validation frames at most
+    MIN_GAIN_DB better than rest does, with the largest number of bases. The result then has `resting`.
     """
     if len(train) < MIN_TRIAL_FRAMES:
         return BasisTrials({})
@@ -101,10 +101,10 @@ def try_bases(
     numbers = sorted({REST, min(limit, BASES[0]), *(each for each in BASES if each <= limit)})
     with ThreadPoolExecutor(cores()) as pool:
         tracked = dict(zip(numbers, pool.map(partial(mean_error, trials), numbers), strict=True))
-    if len(tracks) > 1:  # the camera moved on: no picture rests
+    if len(tracks) > 1:  # several keyframes: the camera moved, so no picture rests
         return BasisTrials(tracked)
     at_rest = [Trial.of(resting(tracks[0], clip, train), clip, train, basis_values)]
-    if len(at_rest[0].places) < MIN_TRIAL_CELLS:  # instruments hide the tissue's places: rest cannot be judged
+    if len(at_rest[0].places) < MIN_TRIAL_CELLS:  # instruments cover the tissue: rest cannot be tested
         return BasisTrials(tracked)
     error, error_at_rest = (mean_picture_error(each, numbers[-1]) for each in (trials, at_rest))
     if error_at_rest > error * 10 ** (MIN_GAIN_DB / 10):
@@ -115,12 +115,12 @@ def try_bases(
 def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int | None = None) -> BasisChoice:
     """The smallest number of bases whose expected error is within MIN_GAIN_DB of the least.
 
-    The expected error is that in validation frames plus the floor, which the Gaussians leave whatever moves. `frames`
+    The expected error is that in validation frames plus the floor, the error of the Gaussians without motion. `frames`
     is the number of training frames.
 
-    The largest number tried, if none follows the motion: even the best leaves more of the motion than the floor and
-    more than MAX_MOTION_LEFT of what the smallest number leaves. Changes of light do not count here, because more bases
-    do not help against a lamp that flickers. Without trials, one basis for every FRAMES_A_BASIS frames.
+    If no number follows the motion, the largest number tried is chosen: even the best leaves a motion error above the
+    floor and above MAX_MOTION_LEFT of what the smallest number leaves. Changes of illumination do not count here,
+    because more bases do not model a flickering lamp. Without trials, one basis for every FRAMES_A_BASIS frames.
     """
     errors = trials.tracked
     if not errors:
@@ -146,7 +146,7 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
 
 
 def _bases_limit(frames: int, max_bases: int | None) -> BasisChoice:
-    """The largest number of bases that may be tried, and what limits it."""
+    """The largest number of bases to try, and what limits it."""
     limits = [
         BasisChoice(BASES[-1], "the most there are to choose from"),
         BasisChoice(max_bases or BASES[-1], "the most that the preset allows"),
@@ -156,7 +156,7 @@ def _bases_limit(frames: int, max_bases: int | None) -> BasisChoice:
 
 
 def _most_bases(frames: int) -> int:
-    """The largest number of bases that so many training frames bear."""
+    """The largest number of bases for this number of training frames."""
     return min((frames - 1) // MIN_FRAMES_A_BASIS, max(USUAL_BASES, frames // LONG_FRAMES_A_BASIS))
 
 
@@ -164,11 +164,10 @@ def _most_bases(frames: int) -> int:
 
 
 def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_error: float) -> BasisChoice:
-    """Pixels between points: the largest stride whose expected error in these frames is within MIN_GAIN_DB of the
-    finest's.
+    """The largest stride (px between points) whose expected error in these frames is within MIN_GAIN_DB of the finest.
 
-    It is at most MAX_COARSENING times the finest. motion_error is what the motion leaves whatever the points, in
-    squared grey levels.
+    It is at most MAX_COARSENING times the finest. motion_error, in squared grey levels, is the error of the motion
+    alone.
     """
     errors = {stride: mean_floor_error(clip, keys, stride) for stride in range(finest, MAX_COARSENING * finest + 1)}
     allowed = (errors[finest] + motion_error) * 10 ** (MIN_GAIN_DB / 10)
@@ -182,7 +181,7 @@ def choose_stride(clip: DepthClip, keys: Sequence[int], finest: int, motion_erro
 
 
 def floor_error(clip: DepthClip, index: int, stride: int) -> float:
-    """The error, in squared grey levels, that Gaussians which start stride px apart leave in one frame's tissue.
+    """Expected error, in squared grey levels, of one frame's tissue with Gaussians that start stride px apart.
 
     It is TRAINED_SHARE of the error of a grid of mean colours with linear interpolation between them.
     """

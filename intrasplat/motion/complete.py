@@ -1,4 +1,4 @@
-"""Depth and colour where none was seen: a smooth membrane between the surroundings.
+"""Completion of missing depth and colour: a smooth membrane between the surroundings.
 
 Symbols: H W pixels. Lengths in mm.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 RELAXATIONS = 12
-"""Jacobi sweeps a pyramid level. They are few because the coarser level has already solved the long waves."""
+"""Jacobi sweeps per pyramid level. Few suffice, because the coarser level has solved the low frequencies."""
 
 
 def complete_depth(
@@ -19,7 +19,7 @@ def complete_depth(
     """Depth [H, W] on all tissue: measured where valid, elsewhere a membrane between its surroundings; 0 off tissue.
 
     The membrane is the harmonic function (zero Laplacian) of inverse depth, which is linear over the image for a plane.
-    Nothing valid on tissue gives zeros.
+    The result is zero if no depth on tissue is valid.
     """
     known = valid & tissue & (depth_mm > 0)
     if not known.any():
@@ -30,7 +30,7 @@ def complete_depth(
 
 
 def complete_colour(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Colour [H, W, 3] in [0, 1]: the picture's on tissue, of which it needs some; elsewhere a membrane."""
+    """Colour [H, W, 3] in [0, 1]: the picture's on tissue, which must not be empty; elsewhere a membrane."""
     planes = [_membrane(plane, tissue) for plane in cv2.split(rgb / np.float32(255))]
     return np.stack(planes, axis=-1)
 

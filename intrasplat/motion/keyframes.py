@@ -1,7 +1,7 @@
-"""Keyframes: training frames whose views together hold what the clip shows, and the tracks that start in them.
+"""Keyframes: training frames whose views together cover the clip, and the tracks that start in them.
 
-A fixed camera has one, the first training frame. Where the camera moves on, tissue that comes into view has its tracks
-from the keyframe that shows it, through the frames that see enough of that keyframe.
+A clip of a fixed camera has one keyframe, the first training frame. If the camera moves on, tissue that comes into view
+is tracked from the keyframe that shows it, through the frames that see enough of that keyframe.
 
 Symbols: K training frames, M sampled pixels of a frame.
 """
@@ -24,14 +24,15 @@ SAMPLE_SHARE = 1 / 32
 MAX_NEW_SHARE = 0.5
 """A frame becomes a keyframe if more than this share of its tissue lies in no earlier keyframe's view."""
 MAX_NEARER = 1.3
-"""A keyframe that is more than this times as far from the tissue as the frame does not count as showing it."""
+"""A keyframe counts as showing tissue up to this multiple of the frame's distance from it."""
 MIN_OVERLAP = 0.2
-"""Tracks of a keyframe go to the frames that show at least this share of its tissue."""
+"""A keyframe is tracked to the frames that show at least this share of its tissue."""
 
 
 def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int]]]:
-    """Places of keyframes among the training frames, each with those of the frames to follow it to. Tissue counts as at
-    rest. Those that show it from nearby come first, else the earlier ones.
+    """Indices (into `train`) of the keyframes, each with the indices of the frames to which it is tracked.
+
+    The tissue is taken as at rest. Keyframes that show it from nearby come first, else the earlier ones.
     """
     poses = clip.world_from_camera[list(train)]
     if (poses == poses[0]).all():
@@ -61,7 +62,7 @@ def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int
 def track_keyframes(
     clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None
 ) -> list[Tracks]:
-    """The tracks of each keyframe. As track, whose on_progress it has."""
+    """The tracks of each keyframe. on_progress is called as by `track`."""
     followed, tracks = keyframes(clip, train), list[Tracks]()
     total, done = sum(len(places) for _, places in followed), 0
     for key, places in followed:
@@ -76,7 +77,7 @@ def track_keyframes(
 
 
 def _tissue_mm(clip: DepthClip, index: int) -> Reals:
-    """[M, 3] world: sampled places of the tissue that a frame shows, where its depth is measured."""
+    """Sampled tissue points [M, 3] of a frame where its depth is measured, world frame, mm."""
     height, width = clip.tissue.shape[1:]
     step = max(1, round(width * SAMPLE_SHARE))
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step].reshape(2, -1)
@@ -88,7 +89,7 @@ def _tissue_mm(clip: DepthClip, index: int) -> Reals:
 
 
 def _depth_in_view(clip: DepthClip, points_mm: Reals, world_from_camera: Reals) -> Reals:
-    """[M] camera z of points that lie within a camera's image, mm; infinity for those outside."""
+    """Camera z [M], mm, of points within a camera's image; infinity for points outside."""
     k, (x, y, z) = clip.intrinsics, to_camera(points_mm, world_from_camera).T
     ahead = np.maximum(z, 1e-6)
     column, row = k.fx * x / ahead + k.cx, k.fy * y / ahead + k.cy

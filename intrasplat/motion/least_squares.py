@@ -1,4 +1,4 @@
-"""Least squares with bases that are local in time: only near ones overlap, so the normal equations are a narrow band.
+"""Least squares with bases that are local in time: only near bases overlap, so the normal equations are banded.
 
 Symbols: K times, N series, C channels, B bases, W neighbours that overlap a basis on each side.
 """
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 STEADINESS = 0.02
-"""Weight of the differences between neighbouring bases; a fully trusted frame has 1. It carries motion across gaps."""
+"""Weight of the differences between neighbouring bases; a fully trusted frame has 1. It bridges gaps in tracks."""
 RIDGE = 1e-3
 """Weight of the squared basis weights: it keeps the system solvable."""
 NO_OVERLAP = 1e-9
-"""Bases whose product is nowhere larger do not overlap; it is next to nothing beside RIDGE."""
+"""Bases whose product never exceeds this do not overlap; it is negligible against RIDGE."""
 
 
 def fit_series(series: NDArray[np.floating], confidence: NDArray[np.floating], basis: Reals) -> Reals:
@@ -35,7 +35,7 @@ def fit_series(series: NDArray[np.floating], confidence: NDArray[np.floating], b
 
 
 def _normal(confidence: Reals, basis: Reals) -> list[Reals]:
-    """The diagonals of the normal equations: the d-th is [B - d, N], of each basis with the d-th after it."""
+    """The diagonals of the normal matrix: the d-th, [B - d, N], couples each basis with the d-th after it."""
     bases = basis.shape[1]
     band = []
     for apart in range(bases):
@@ -52,9 +52,9 @@ def _normal(confidence: Reals, basis: Reals) -> list[Reals]:
 
 
 def _solve(band: list[Reals], right: Reals) -> None:
-    """Turn right [B, N, C] into the solutions of N systems, all at once: L D L' in place (Golub and Van Loan 4.3).
+    """Solve N banded systems at once by L D L' (Golub and Van Loan 4.3), in place: right [B, N, C] gets the solutions.
 
-    The systems are positive definite, so nothing is pivoted.
+    The systems are positive definite, so no pivoting is needed.
     """
     bases = len(right)
     for j in range(bases):

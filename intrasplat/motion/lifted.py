@@ -1,4 +1,4 @@
-"""A clip's frames on the coarse grid, and the flow between two of them lifted to 3D.
+"""A clip's frames on the coarse grid, and optical flow between two of them lifted to 3D.
 
 Symbols: h w cells of the coarse grid.
 """
@@ -22,18 +22,18 @@ ROUND_TRIP_PX = 1.0
 SMOOTH_PX = 4.0
 """Standard deviation of the Gaussian mean of displacements, in px of the coarse grid: depth is noisy."""
 COLOUR_SMOOTH_PX = 2.0
-"""The same for changes of colour: light varies over smaller patches than motion does."""
+"""The same for changes of colour: illumination varies over smaller patches than motion does."""
 SURROUNDINGS = 0.1
 """Weight of the wider surroundings' mean in an average; full trust has 1."""
 LOST, LOST_SMOOTH_PX = 0.1, 1.0
-"""A track of less confidence ends on the surface that surrounds it; px of the coarse grid over which that eases in."""
+"""A track of less confidence is lost and ends on the surrounding surface; width of the transition, px of the grid."""
 PARALLAX_SMOOTH_PX = 4.0
-"""Standard deviation of the Gaussian mean of what the camera's motion does to the picture, px of the coarse grid."""
+"""Standard deviation of the Gaussian mean of the flow due to camera motion, px of the coarse grid."""
 MIN_DEPTH_MM = 1e-3
 
 
 def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
-    """[h, w, ...] means of the cells of step by step pixels. Cell (i, j) starts at pixel (step i, step j).
+    """Means [h, w, ...] over cells of step by step pixels. Cell (i, j) starts at pixel (step i, step j).
 
     Pixels beyond the last whole cell are ignored.
     """
@@ -43,7 +43,7 @@ def cell_means(image: NDArray[Any], step: int) -> NDArray[Any]:
 
 
 class PointGrid:
-    """The coarse grid: the pixels that it samples and their rays. h w cells, step pixels apart."""
+    """The coarse grid of h w cells, step pixels apart: the pixels that it samples and their rays."""
 
     def __init__(self, clip: DepthClip, step: int) -> None:
         height, width = clip.tissue.shape[1:]
@@ -55,20 +55,20 @@ class PointGrid:
         """[h, w, 3] points at depth 1, camera axes."""
 
     def cells_at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Column and row in the grid, not rounded, of what lies at (x, y) at depth 1, camera axes."""
+        """Column and row in the grid, not rounded, of points (x, y, 1) in camera axes."""
         height, width = self.rays.shape[:2]
         (left, top, _), (right, bottom, _) = self.rays[0, 0], self.rays[-1, -1]
         return (x - left) * ((width - 1) / (right - left)), (y - top) * ((height - 1) / (bottom - top))
 
     def sample(self, values: NDArray[Any]) -> NDArray[Any]:
-        """[h, w] the cells' middle pixels of an image; a view."""
+        """The cells' middle pixels [h, w] of an image, as a view."""
         return values[self.step // 2 :: self.step, self.step // 2 :: self.step][: self.size[1], : self.size[0]]
 
 
 class CoarseFrame:
     """A frame on the coarse grid: colour, grey, depth, points (world, mm), and the confidence of depth and mask.
 
-    Where no tissue is measured, depth is completed from around; it is 0 in a frame without any.
+    Missing depth is completed from the surroundings; it is 0 in a frame without any depth.
     """
 
     def __init__(self, clip: DepthClip, index: int, grid: PointGrid) -> None:
@@ -89,7 +89,7 @@ class CoarseFrame:
         return np.array_equal(self.axes, other.axes) and np.array_equal(self.place_mm, other.place_mm)
 
     def parallax(self, other: CoarseFrame) -> Floats:
-        """[h, w, 2] the flow to the other frame if the tissue rested, smoothed: depth is noisy."""
+        """Flow [h, w, 2] to the other frame for tissue at rest, smoothed because depth is noisy."""
         x, y, z = np.moveaxis((self.points_mm - other.place_mm) @ other.axes, -1, 0)
         z = np.maximum(z, MIN_DEPTH_MM)
         column, row = self.grid.cells_at(x / z, y / z)
@@ -99,20 +99,20 @@ class CoarseFrame:
 
 
 class Flows:
-    """Optical flow (DIS) from one frame to others and back. In order of time: the last flow starts the next.
+    """Optical flow (DIS) from one frame to others and back. Call in order of time: each flow initialises the next.
 
-    What the camera's motion explains is taken out of the pictures first, for flow finds no patches that are turned,
-    larger or far away.
+    The pictures are first warped by the flow due to camera motion, because DIS cannot match patches that are rotated,
+    scaled or far away.
     """
 
     def __init__(self, start: CoarseFrame) -> None:
         self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._start = start
         self._left: Floats | None = None
-        """[h, w, 2] the last flow without the parallax."""
+        """Last flow [h, w, 2] without the parallax."""
 
     def to(self, target: CoarseFrame) -> tuple[Floats, Floats]:
-        """[h, w, 2] the flow to another frame, and from there."""
+        """Flows [h, w, 2] to another frame and back."""
         start, last = self._start, None if self._left is None else self._left.copy()
         if target.stands_at(start):
             self._left = self._solver.calc(start.grey, target.grey, last)
@@ -124,24 +124,24 @@ class Flows:
 
 
 def _seen_along(grey: NDArray[np.uint8], flow: Floats, outside: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[h, w] the picture at the ends of the flow; beyond its edges, that of `outside`."""
+    """The picture [h, w] sampled at the ends of the flow; beyond its edges, `outside`."""
     height, width = grey.shape
     inside = ((_ends(flow) >= 0) & (_ends(flow) <= (width - 1, height - 1))).all(-1)
     return np.where(inside, _at_end(grey, flow), outside)
 
 
 def _joined(left: Floats, parallax: Floats) -> Floats:
-    """[h, w, 2] the flow of which `left` remained beside the parallax."""
+    """The total flow [h, w, 2] from the parallax and the remaining flow `left`."""
     return np.asarray(left + _at_end(parallax, left), np.float32)
 
 
 def _at_end(values: NDArray[Any], flow: Floats) -> NDArray[Any]:
-    """values [h, w, ...] at the ends of the flow."""
+    """values [h, w, ...] sampled at the ends of the flow."""
     return np.asarray(cv2.remap(values, _ends(flow), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _ends(flow: Floats) -> Floats:
-    """[h, w, 2] column and row to which the flow leads."""
+    """Column and row [h, w, 2] to which the flow leads."""
     height, width = flow.shape[:2]
     return flow + np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
 
@@ -149,7 +149,7 @@ def _ends(flow: Floats) -> Floats:
 def lifted(
     reference: CoarseFrame, target: CoarseFrame, forward: Floats, backward: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Displacement (mm), change of colour and confidence of every reference cell, from the flows there and back."""
+    """Displacement (mm), change of colour and confidence of every reference cell, from forward and backward flow."""
     rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
     x, y = columns + forward[..., 0], rows + forward[..., 1]
 
@@ -163,24 +163,24 @@ def lifted(
     confidence = reference.trust * trust * (trust > 0.5) * agree
     point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
     displacement = averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)
-    if target.depth_mm.any():  # else nobody knows its surface
+    if target.depth_mm.any():  # otherwise its surface is unknown
         displacement = _onto_surface(reference, target, displacement, confidence)
     colour = averaged(np.subtract(at_target(target.rgb), reference.rgb), confidence, COLOUR_SMOOTH_PX)
     return displacement, colour, np.minimum(confidence, 1).astype(np.float32)
 
 
 def _onto_surface(reference: CoarseFrame, target: CoarseFrame, displacement: Floats, confidence: Floats) -> Floats:
-    """The displacement [h, w, 3] with the ends of lost tracks on target's surface, along the line of sight.
+    """The displacement [h, w, 3], with the ends of lost tracks moved along the line of sight onto target's surface.
 
-    What hides stays on the surface around it: a displacement that is guessed from farther away, where tissue may be
-    pulled towards the camera, would lift it into free space.
+    Hidden tissue thus stays on the surrounding surface. A displacement extrapolated from farther away, where tissue may
+    be pulled towards the camera, would lift it into free space.
     """
     end_mm = (reference.points_mm + displacement - target.place_mm) @ target.axes
     z = np.maximum(end_mm[..., 2], MIN_DEPTH_MM)
     x, y = target.grid.cells_at(end_mm[..., 0] / z, end_mm[..., 1] / z)
     surface_mm = cv2.remap(target.depth_mm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     lost = cv2.GaussianBlur((confidence < LOST).astype(np.float32), (0, 0), LOST_SMOOTH_PX)
-    if not target.stands_at(reference):  # what left the view is on no surface that is known
+    if not target.stands_at(reference):  # the surface is unknown outside the view
         lost *= (x >= 0) & (y >= 0) & (x <= lost.shape[1] - 1) & (y <= lost.shape[0] - 1)
     along_mm = end_mm * (lost * (surface_mm / z - 1))[..., None]
     return np.asarray(displacement + along_mm @ target.axes.T, np.float32)

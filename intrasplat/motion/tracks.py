@@ -1,12 +1,11 @@
-"""Motion known before training: optical flow from a keyframe, the reference, lifted to 3D by stereo depth.
+"""Tracks of the tissue before training: optical flow from a keyframe, the reference, lifted to 3D by stereo depth.
 
 Dense flow (DIS) from the reference to every training frame that sees enough of it gives each reference pixel a track.
-Forward and backward flow check each other. A track's displacements and changes of colour are averages of its trusted
-neighbours, over a wider area where few are trusted. fit_tracks fits the bases of a motion to them.
-Held-out frames are never read.
+Forward and backward flow check each other. A track's displacements and changes of colour are averages over its trusted
+neighbours, over a wider area where few are trusted. fit_tracks fits the bases of a motion to them. Held-out frames are
+never read.
 
-Symbols: T training frames, K of them followed; h w pixels of the coarse grid on which flow is computed; N points, B
-bases.
+Symbols: T training frames, K of them tracked; h w pixels of the coarse grid, on which flow runs; N points, B bases.
 """
 
 from __future__ import annotations
@@ -38,32 +37,31 @@ from intrasplat.motion.lifted import (
 )
 
 Moved = Callable[[int, NDArray[np.intp]], Floats]
-"""Displacements [M, 3] mm (world) of what a keyframe's pixels (flat, [M]) show, to a training frame."""
+"""moved(frame, pixels): displacement [M, 3] mm (world) of a keyframe's pixels (flat, [M]) to a training frame."""
 
 FLOW_WIDTH = 320
 """Maximum width in px at which flow is computed: the clip is reduced by the smallest whole factor that fits."""
 MIN_GRID_SIDE = 16
 """Minimum cells along the coarse grid's shorter side, which DIS needs; a smaller clip is not reduced."""
 GUESSED = 0.02
-"""Minimum confidence of a track when a motion starts from it: the surroundings' displacement is better than none."""
+"""Minimum confidence of a track that initialises a motion: the surroundings' displacement is better than none."""
 CHAINS = 2
-"""Parts of the clip that are tracked in parallel. It does not depend on the number of cores, because each flow starts
-from the one before."""
+"""Parts of the clip that are tracked in parallel. The number is fixed, because each flow initialises the next one."""
 POINTS_AT_ONCE, FRAMES_AT_ONCE = 4096, 128
-"""Points that are fitted together in a clip of so many frames; in a longer one fewer, for their tracks take memory."""
+"""Points that are fitted together in a clip of FRAMES_AT_ONCE frames; fewer in a longer clip, to limit memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Displacement of a reference's pixels to training frames, and how their colour changed on the way.
+    """Displacement and change of colour of a reference frame's pixels in training frames.
 
-    displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours, 0 without any; a lost one ends on
+    displacement_mm [K, h, w, 3]  world axes, mm; mean of the trusted neighbours, 0 without any; lost tracks end on
                                   the frame's surface
     colour          [K, h, w, 3]  colour there minus colour in the reference, RGB in [0, 1]; mean likewise
     confidence      [K, h, w]     in [0, 1]; 0 where the track is lost, hidden or without depth
     step_px                       clip pixels between neighbouring cells of the grid
-    reference                     place of the reference among all training frames
-    places                        [K] those of the frames followed, rising; None: K are all training frames
+    reference                     index of the reference among all training frames
+    places                        [K] indices of the tracked frames, rising; None: all training frames are tracked
     """
 
     displacement_mm: Floats
@@ -75,18 +73,18 @@ class Tracks:
 
     @classmethod
     def empty(cls, places: Sequence[int], grid: tuple[int, ...], step_px: int, reference: int = 0) -> Tracks:
-        """Tracks of zeros, in files (intrasplat/machine/mapped.py)."""
+        """Tracks filled with zeros, stored in files (intrasplat/machine/mapped.py)."""
         displacement_mm, colour = (mapped_zeros((len(places), *grid, 3), np.float32) for _ in range(2))
         confidence = mapped_zeros((len(places), *grid), np.float32)
         return cls(displacement_mm, colour, confidence, step_px, reference, places)
 
     @property
     def followed(self) -> NDArray[np.intp]:
-        """[K] places of the frames followed among all training frames."""
+        """Indices [K] of the tracked frames among all training frames."""
         return np.array(range(len(self.confidence)) if self.places is None else self.places, np.intp)
 
     def let_go(self, place: int) -> None:
-        """Take a frame's part out of memory. It comes back when it is asked for."""
+        """Release a frame's part from memory. It is read back from its file on access."""
         for values in (self.displacement_mm, self.colour, self.confidence):
             let_go(values[place])
 
@@ -120,10 +118,10 @@ def track(
     """Tracks of one training frame's tissue through the others. They do not depend on `threads` (None: cores).
 
     Args:
-        reference: the place of that frame in train.
-        places: those of the frames to follow it to, rising, with its own; None: all.
-        on_progress: gets the share of frames done. Threads of this function call it, one at a time. What it raises
-            ends the tracking and is raised here.
+        reference: the index of that frame in train.
+        places: indices of the frames to track, rising, including the reference; None: all.
+        on_progress: gets the share of frames done. Threads of this function call it, one at a time. An exception that
+            it raises ends the tracking and is raised here.
     """
     step = min(-(-clip.intrinsics.width // FLOW_WIDTH), max(1, min(clip.tissue.shape[1:]) // MIN_GRID_SIDE))
     grid = PointGrid(clip, step)
@@ -158,7 +156,7 @@ def track(
 
 
 class _Helpers:
-    """Free threads that lift flows to 3D for the threads that compute them: lifting takes longer."""
+    """Extra threads that lift flows to 3D for the threads that compute flow, because lifting takes longer."""
 
     def __init__(self, count: int) -> None:
         self._free = Semaphore(max(count, 0))
@@ -166,7 +164,7 @@ class _Helpers:
         self._jobs: deque[Future[None]] = deque()
 
     def run(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Run work(*arguments) in a helper, or here if all are busy. Raises what earlier work raised."""
+        """Run work(*arguments) in a helper thread, or here if all are busy. Raises exceptions of earlier work."""
         if not self._free.acquire(blocking=False):
             work(*arguments)
             return
@@ -186,7 +184,7 @@ class _Helpers:
 
 
 def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
-    """The tracks as a function for fusion: to a frame that was not followed as to the nearest one that was.
+    """The tracks as a function for fusion. An untracked frame gets the displacement to the nearest tracked one.
 
     train lists the clip's training frames; width is the clip's in px.
     """
@@ -201,9 +199,9 @@ def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:
 
 
 def resting(tracks: Tracks, clip: DepthClip, train: Sequence[int]) -> Tracks:
-    """The tracks if nothing had moved: no displacement, and the change of colour in place.
+    """Tracks under the hypothesis of rest: no displacement, and the change of colour at the same pixel.
 
-    The confidence is the tracks' where a cell shows only tissue, else 0.
+    The confidence is that of `tracks` where a cell shows only tissue, else 0.
     """
     (frames, *grid), step = tracks.confidence.shape, tracks.step_px
     followed = tracks.followed
@@ -240,15 +238,15 @@ def fit_tracks(
     point.
 
     Args:
-        basis: [T, B] value of every basis at every training time, of T.
+        basis: [T, B] value of every basis at every training time.
         pixels: [N] flat pixel indices (row * width + column) of the points in the reference frame.
         width: of the clip, px.
-        share_px: points in the same square of this many pixels share the weights of its first pixel.
+        share_px: points in the same square with sides of share_px share the weights of its first pixel.
         guessed: minimum confidence g_k in the frame of the highest mean confidence; in the other frames g_k is smaller
             in proportion to their mean confidence. A displacement guessed from the surroundings is better than none.
 
     Returns:
-        weights [N, B, 6]: 3 of the displacement in mm, 3 of the colour; and support [N]: mean confidence of each track.
+        weights [N, B, 6]: 3 for the displacement in mm, 3 for the colour; support [N]: mean confidence of each track.
     """
     rows, columns = (place // share_px * share_px for place in np.divmod(pixels, width))
     shared, member = np.unique(rows * width + columns, return_inverse=True)

@@ -1,7 +1,6 @@
 """Cross-validation of the number of bases: bases fitted to some training frames predict the tracks in the others.
 
-Symbols: T training frames; K of them followed by tracks, k of these validation frames; n sampled cells of the tracks'
-grid, B bases.
+Symbols: T training frames; K of them tracked, k of these validation frames; n sampled cells of the grid, B bases.
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ from intrasplat.motion.tracks import Tracks
 
 Reals = NDArray[np.float64]
 BasisValues = Callable[[int, Sequence[float], Sequence[float]], Reals]
-"""(B, times trained on, times) -> [len(times), B] values of B bases that were placed for the times trained on."""
+"""(B, training times, times) -> [len(times), B] values of B bases that are placed for the training times."""
 
 CELLS = 1000
-"""Tracks on which bases are tried, of all keyframes."""
+"""Number of tracks, over all keyframes, on which bases are tried."""
 VALIDATE_EVERY, FIRST_VALIDATED = 4, 2
 """Every fourth training frame, from the third on, is a validation frame; bases are fitted to the others."""
 MIN_TRACK_CONFIDENCE = 0.3
-"""Mean confidence that a track needs to take part."""
+"""Minimum mean confidence of a track that is used."""
 
 
 @dataclass(frozen=True)
 class FitError:
     """Mean squared error of a number of bases in validation frames, in squared grey levels per channel.
 
-    motion  error of the displacement, times the picture's slope where the track starts
+    motion  error of the displacement times the picture's gradient where the track starts
     light   error of the change of colour along the track
     """
 
@@ -52,9 +51,9 @@ class Trial:
     """A sample of the trusted tracks, evenly spread over them, and which training frames are validation frames.
 
     reference                   the keyframe in which the tracks start
-    followed         [K]        places among the training frames
-    places           [n]        pixels of the reference, flat
-    world_mm         [n, 3]     where they start
+    followed         [K]        indices of the tracked frames among the training frames
+    places           [n]        flat pixel indices in the reference
+    world_mm         [n, 3]     start positions of the tracks
     displacement_mm  [K, n, 3]
     colour           [K, n, 3]  change, in grey levels
     confidence       [K, n]
@@ -79,7 +78,7 @@ class Trial:
     def of(
         cls, tracks: Tracks, clip: DepthClip, train: Sequence[int], basis_values: BasisValues, cells: int = CELLS
     ) -> Trial:
-        """train are the clip's training frames; at most so many cells are sampled."""
+        """The trial for the clip's training frames `train`, with at most `cells` sampled cells."""
         _, height, width = tracks.confidence.shape
         step, reference = tracks.step_px, train[tracks.reference]
         rows, columns = np.divmod(np.arange(height * width), width)
@@ -112,11 +111,11 @@ class Trial:
 
     @property
     def weight(self) -> float:
-        """What the tracks count in the validation frames."""
+        """Total weight of the tracks in the validation frames."""
         return float(self.confidence[self.validation].sum())
 
     def error(self, bases: int) -> FitError:
-        """The error of so many bases in the validation frames."""
+        """The error of this number of bases in the validation frames."""
         displacement_mm, colour = self._predicted(bases)
         off_mm = self.displacement_mm[self.validation] - displacement_mm
         motion = (self._grey_per_mm() @ off_mm[..., None])[..., 0]
@@ -124,10 +123,10 @@ class Trial:
         return FitError(self._mean_square(motion), self._mean_square(light))
 
     def picture_error(self, bases: int) -> float:
-        """Mean squared difference per channel, in grey levels, of pictures and prediction in the validation frames.
+        """Mean squared difference per channel, in squared grey levels, of picture and prediction in validation frames.
 
-        The picture is read where so many bases place the tracks. The prediction is the colour where the tracks start
-        plus the predicted change.
+        The picture is read at the track positions that this number of bases predicts. The prediction is the colour at
+        the start of the track plus the predicted change.
         """
         displacement_mm, colour = self._predicted(bases)
         k, start = self.clip.intrinsics, self.clip.rgb[self.reference].reshape(-1, 3)[self.places]
@@ -156,12 +155,12 @@ class Trial:
         return predicted[..., :3], predicted[..., 3:]
 
     def _mean_square(self, off: Reals) -> float:
-        """Of [k, n, 3] in the validation frames; a track counts by its confidence."""
+        """Mean square of errors [k, n, 3] in the validation frames, weighted by the tracks' confidence."""
         weight = self.confidence[self.validation]
         return float((np.square(off).mean(-1) * weight).sum() / max(weight.sum(), 1e-9))
 
     def _grey_per_mm(self) -> Reals:
-        """[n, 3 channels, 3 axes] grey levels by which the picture changes at a track's start as the tissue moves."""
+        """Picture gradient at the track starts [n, 3 channels, 3 axes], grey levels per mm of tissue motion."""
         k, pose = self.clip.intrinsics, self.clip.world_from_camera[self.reference]
         across, along, z = to_camera(self.world_mm, pose).T[..., None]
         right, down, away = pose[:3, :3].T  # camera axes in the world
@@ -174,7 +173,7 @@ class Trial:
 
 
 def mean_error(trials: Sequence[Trial], bases: int) -> FitError:
-    """The error of so many bases in the validation frames, over the tracks of all trials."""
+    """The error of this number of bases in the validation frames, over the tracks of all trials."""
     errors, shares = [trial.error(bases) for trial in trials], _shares(trials)
     return FitError(
         sum(share * each.motion for share, each in zip(shares, errors, strict=True)),
@@ -188,13 +187,13 @@ def mean_picture_error(trials: Sequence[Trial], bases: int) -> float:
 
 
 def _shares(trials: Sequence[Trial]) -> list[float]:
-    """What each trial counts of all."""
+    """Each trial's share of the total weight."""
     total = sum(trial.weight for trial in trials)
     return [trial.weight / total if total else 1 / len(trials) for trial in trials]
 
 
 def _slopes(rgb: NDArray[np.uint8], step: int) -> Reals:
-    """[h, w, 3, 2] grey levels per clip pixel to the right and down, on the tracks' grid of h w cells."""
+    """Picture gradient [h, w, 3, 2], grey levels per clip pixel right and down, on the tracks' grid of h w cells."""
     small = cell_means(rgb, step).astype(np.float32)
     slopes = [cv2.Scharr(small, cv2.CV_32F, int(axis == 0), int(axis == 1)) / (32 * step) for axis in range(2)]
     return np.stack(slopes, axis=-1).astype(np.float64)

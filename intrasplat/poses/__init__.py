@@ -1,6 +1,6 @@
-"""A clip with depth in; the same clip with its camera's poses out, estimated if nobody gave them and the camera moves.
+"""A clip with depth in; the same clip with camera poses out. They are estimated if none are given and the camera moves.
 
-Verbs: with_poses; camera_rests, and find_path of estimate.py.
+Verbs: with_poses; camera_rests; estimate.find_path.
 """
 
 from intrasplat.poses.posed import placed, with_poses

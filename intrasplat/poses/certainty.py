@@ -1,4 +1,4 @@
-"""How sure a path is: the standard deviation of its places and turns after one rigid motion laid it on the truth.
+"""Expected error of a camera path: standard deviation of positions and rotations after one rigid motion aligns it.
 
 Symbols: K frames.
 """
@@ -14,19 +14,19 @@ from intrasplat.poses.rigid import Reals, cross
 from intrasplat.poses.trajectory import ARM_MM
 
 BETWEEN_AXES = float(np.sqrt(2) * ARM_MM)
-"""A turn moves two of three axes that end ARM_MM away."""
+"""A rotation moves two of three axes, whose ends lie ARM_MM away."""
 
 
 def by_place_and_turn(of_twists: Reals, poses: Reals) -> Reals:
-    """The covariance [6 K, 6 K] of places (mm) and turns (radians), from that of twists, left to poses [K, 4, 4]."""
+    """Covariance [6 K, 6 K] of positions (mm) and rotations (rad), from that of twists applied left of poses."""
     slopes = block_diag(*_slopes(poses))
     return np.asarray(slopes @ of_twists @ slopes.T)
 
 
 def aligned_sigma(covariance: Reals, poses: Reals, asked: Sequence[int] | None = None) -> tuple[float, float]:
-    """(mm, degrees) root mean square over the frames of what a covariance [6 K, 6 K] of places and turns expects.
+    """Expected error (mm, degrees), root mean square over frames, from a covariance [6 K, 6 K] of positions, rotations.
 
-    What moves all cameras alike is no error, as in trajectory_error. asked: the frames that count, instead of all K.
+    A motion common to all cameras is no error, as in trajectory_error. asked: the frames that count; None: all K.
     """
     if asked is not None:
         rows = (6 * np.asarray(asked)[:, None] + np.arange(6)).ravel()
@@ -41,7 +41,7 @@ def aligned_sigma(covariance: Reals, poses: Reals, asked: Sequence[int] | None =
 
 
 def _slopes(poses: Reals) -> Reals:
-    """[K, 6, 6] derivative of place and turn by a twist."""
+    """[K, 6, 6] derivative of position and rotation by a twist."""
     slopes = np.tile(np.eye(6), (len(poses), 1, 1))
     for each, place in zip(slopes, poses[:, :3, 3], strict=True):
         each[:3, 3:] = -cross(place)

@@ -1,8 +1,8 @@
-"""Keyframes, the links between frames, and a first guess of every camera from them.
+"""Keyframes, links between frames, and an initial estimate of every camera from them.
 
-A keyframe is followed while most of it stays in view; the next one starts where less than KEY_OVERLAP of it is left.
-Each frame is linked to the keyframe before it and to the one after it; keyframes that show the same tissue at other
-times are linked, too, so that a camera that returns ends where it was.
+A keyframe is followed while most of it stays in view. The next keyframe starts where less than KEY_OVERLAP of it is
+visible. Each frame is linked to the keyframe before it and to the one after it. Loop closure: keyframes that show the
+same tissue at other times are linked, too, so that a camera that returns gets the same pose again.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from intrasplat.poses.rigid import Reals, align, exp, inverse, log
 
 KEY_OVERLAP = 0.6
 KEY_FRAMES = 16
-"""Frames after which the next keyframe starts at the latest: the noise of one frame's depth is not in all poses."""
+"""Most frames between keyframes, so that the depth noise of one frame does not enter all poses."""
 LOOP_OVERLAP, MIN_OVERLAP = 0.5, 0.25
-"""Predicted share of a keyframe in another one's view for a link; the share found below which a link is dropped."""
+"""Minimum predicted overlap of two keyframes for a loop link; minimum measured overlap of any link."""
 
 MAX_LOOKS, MAX_LOOPS = 32, 64
-"""Keyframes among which such pairs are sought, and the most links between them."""
+"""Most keyframes among which loop pairs are searched, and most links between them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Frames that are linked, and where their cameras are if all tissue were rigid.
+    """Linked frames, and their camera poses under the assumption that all tissue is rigid.
 
     frames             [K]       indices in the clip, rising
     world_from_camera  [K, 4, 4] mm; the world is the first one's camera
@@ -49,7 +49,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
     flow = None
 
     def linked(i: int, last: int) -> tuple[FrameLink, float]:
-        """The link from the present keyframe, which places frame i, and the share of the keyframe that it explains."""
+        """Link the current keyframe to frame i, which sets i's pose; also the share of the keyframe that agrees."""
         key, start = keys[-1], inverse(_ahead(poses, last, i)) @ poses[keys[-1]]
         link = frames.link(key, i, frames.predicted(key, start)[0] if flow is None else flow)
         aligned = align(frames.camera, link.before, link.after, link.trust, start)
@@ -57,7 +57,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
         return link, link.agreeing(aligned.residual_px)
 
     def turn_to(i: int) -> None:
-        """Make frame i the present keyframe."""
+        """Make frame i the current keyframe."""
         links.extend(_from_behind(frames, i, [each for each in train if keys[-1] < each < i]))
         keys.append(i)
 
@@ -80,7 +80,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
 
 
 def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:
-    """Where the camera is in a frame after the last one if it goes on as it went."""
+    """The camera pose in a later frame, extrapolated at constant velocity."""
     before = max((each for each in poses if each < last), default=last)
     if before == last:
         return poses[last]
@@ -99,7 +99,7 @@ def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Frame
 
 
 def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[FrameLink]:
-    """Links between keyframes that are no neighbours and see the same tissue: those that should see most of it."""
+    """Links between non-adjacent keyframes that see the same tissue, those of the largest predicted overlap."""
     some = spread(keys, MAX_LOOKS)
     pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]
     shares = {(a, b): frames.predicted(a, inverse(poses[b]) @ poses[a])[1] for a, b in pairs}

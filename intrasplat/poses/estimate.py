@@ -1,9 +1,9 @@
 """The camera's path, estimated from a stereo clip.
 
-Training frames alone decide on the path and on what the tissue does. Any other frame, a held-out one above all, gets
-its pose from its own picture against them, one by one, and changes nothing else.
+Training frames alone determine the path and the tissue's motion. Every other frame, held-out frames included, is
+aligned by itself with the fitted frames and changes nothing else.
 
-Symbols: T frames of the clip, K frames that are fitted together, S courses of the tissue's deformation.
+Symbols: T frames of the clip, K frames that are fitted together, S time courses of the tissue's deformation.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, between, inverse, log
 
 MAX_FITTED = 128
-"""Frames that are fitted together; in a longer clip the others are placed between them."""
+"""Most frames that are fitted together; in a longer clip the others are aligned with them one by one."""
 CHAINING, FITTING = 0.45, 0.45
 """Shares of the progress."""
 MIN_AGREEING, GOOD = 0.15, 0.4
-"""A frame is sure if such a share of a keyframe's tissue is found in it where the fit expects it.
-A frame that is placed asks no second one with the last share."""
+"""A frame's pose is reliable from the first share of a keyframe's tissue that is found where the fit expects it.
+From the second share on, a frame is aligned with one fitted frame only."""
 MOVED_MM, MOVED_DEG = 1.2, 0.6
-"""Root mean square about its mean below which a camera counts as fixed."""
+"""A camera whose root mean square about its mean is smaller counts as fixed."""
 UNSURE_MM, UNSURE_DEG = 1.25, 1.0
-"""Standard deviations beyond which camera and tissue may have been confused."""
+"""Beyond these standard deviations, motion of camera and tissue may have been confused."""
 LARGE_MM, LARGE_DEG = 12.0, 6.0
-"""Without a course to go by, such tissue may be all that moves, up to these sizes."""
+"""Without a time course of the deformation, motion up to these sizes may be the tissue's alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,14 @@ class FoundPath:
     """The camera's path.
 
     world_from_camera  [T, 4, 4] mm; the world is the first training frame's camera
-    sigma_mm, sigma_deg  standard deviation that is expected of it, after one rigid motion laid it on the truth
-    alone_mm, alone_deg  the same without what follows the tissue's courses
+    sigma_mm, sigma_deg  expected error (standard deviation) after one rigid motion aligns the path with the true one
+    alone_mm, alone_deg  root mean square of the path without the part that follows the tissue's time courses
     extent_mm, extent_deg  largest distance and angle between two cameras; path_mm: length of the path
     spread_mm, spread_deg  root mean square about the mean
-    rigid_fit_mm  median distance by which tissue that moves as the fit says misses its place
-    tissue_mm   root mean square of the common motion that was given to the tissue
-    period_frames  of the tissue's motion, or None
-    unsure      frames whose pose is not to be relied on
+    rigid_fit_mm  median distance between the fit's prediction and the tissue, where tissue moves as fitted
+    tissue_mm   root mean square of the rigid motion that was assigned to the tissue
+    period_frames  period of the tissue's motion; None: no period was found
+    unsure      frames whose pose is unreliable
     """
 
     world_from_camera: Reals
@@ -76,7 +76,7 @@ class FoundPath:
 
     @property
     def moves(self) -> bool:
-        """Whether the camera moved, beyond doubt."""
+        """Whether the camera certainly moved."""
         large = self.extent_mm > LARGE_MM or self.extent_deg > LARGE_DEG
         return self.seems_to_move and (self.period_frames is not None or large or not self.confused)
 
@@ -93,7 +93,8 @@ def find_path(
     """The path of the clip's camera.
 
     Args:
-        train: rising; the frames that decide. All others are placed against them.
+        train: the frames, rising, that determine the path. All others are aligned with them.
+        on_progress: gets the share done.
     """
     with one_opencv_thread():
         return _found(clip, train, on_progress)
@@ -128,14 +129,14 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
 
 
 def _unknown(count: int) -> FoundPath:
-    """No path: no two frames show the same tissue."""
+    """The result where no two frames show the same tissue: a camera at rest, no frame reliable."""
     still = np.tile(np.eye(4), (count, 1, 1))
     nothing = dict.fromkeys((each.name for each in fields(FoundPath) if each.type == "float"), 0.0)
     return FoundPath(still, period_frames=None, unsure=tuple(range(count)), **nothing)
 
 
 def _apart(used: Sequence[int], fit: Fit, links: Sequence[FrameLink]) -> list[int]:
-    """The frames that no chain of links, each of which finds enough tissue where the fit expects it, ties to most."""
+    """Frames outside the largest connected component. Only links that find enough tissue as the fit expects count."""
     place = {index: k for k, index in enumerate(used)}
     tied = [
         (place[link.a], place[link.b])
@@ -150,7 +151,7 @@ def _apart(used: Sequence[int], fit: Fit, links: Sequence[FrameLink]) -> list[in
 
 
 def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index: int) -> tuple[Reals, float]:
-    """A frame's camera, from its own picture against the nearest fitted frames; the share that agrees."""
+    """A frame's camera pose, aligned with the nearest fitted frames, and the share of tissue that agrees."""
     course, guess = fit.field.course_at(index, used), between(used, fit.poses, index)
     found = []
     for number in np.argsort(np.abs(np.asarray(used) - index), kind="stable")[:2]:
@@ -159,7 +160,7 @@ def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index:
         points = frames.camera.points_mm(link.before)
         world = points @ pose[:3, :3].T + pose[:3, 3]
         moved = world + fit.field.displacement(world, course - fit.field.courses[number])
-        seen = frames.camera.seen((moved - pose[:3, 3]) @ pose[:3, :3])  # as that frame would see it
+        seen = frames.camera.seen((moved - pose[:3, 3]) @ pose[:3, :3])  # measurements if the camera stayed at `pose`
         aligned = align(frames.camera, seen, link.after, link.trust, np.eye(4))
         share = link.agreeing(aligned.residual_px)
         found.append((share, gauge.tissue_at(course) @ pose @ inverse(aligned.motion)))
@@ -200,10 +201,10 @@ def _told(
 
 
 def _sigma(fit: Fit, gauge: Gauged, half_mm: float, sure: Sequence[int]) -> tuple[float, float]:
-    """(mm, degrees) expected of the path where it is sure: by the noise of the links, and by the choice of the gauge.
+    """Expected error (mm, degrees) of the reliable frames: from the links' noise and from the split of common motion.
 
-    If no course explains what deforms, nothing tells the tissue's rigid motion, of the size usual for such a
-    deformation, from the camera's.
+    If no time course explains the deformation, the tissue's rigid motion cannot be separated from the camera's. Its
+    usual size for such a deformation is then added.
     """
     covariance = by_place_and_turn(fit.grams.covariance(fit.field), fit.poses) + gauge.covariance
     mm, deg = aligned_sigma(covariance, fit.poses, sure)
@@ -214,12 +215,12 @@ def _sigma(fit: Fit, gauge: Gauged, half_mm: float, sure: Sequence[int]) -> tupl
 
 
 def _alone(values: Reals, courses: Reals) -> float:
-    """Root mean square of [K, 3] without what follows the tissue's courses [K, S]."""
+    """Root mean square of values [K, 3] after regression on the tissue's courses [K, S]."""
     known = np.concatenate([np.ones((len(values), 1)), courses], axis=1)
     rest = values - known @ np.linalg.lstsq(known, values, rcond=None)[0]
     return float(np.sqrt(np.square(rest).sum(1).mean()))
 
 
 def _extent(values: Reals) -> float:
-    """The largest distance between two of [K, 3]."""
+    """The largest distance between two of the values [K, 3]."""
     return float(max(np.linalg.norm(values - each, axis=1).max() for each in values))

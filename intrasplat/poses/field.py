@@ -1,9 +1,8 @@
-"""A smooth motion of the tissue: u(x, t) = sum_s A_s phi(x) h_s(t), with polynomials phi of the place, courses h_s in
-time.
+"""A smooth motion of the tissue: u(x, t) = sum_s A_s phi(x) h_s(t), polynomials phi of position, time courses h_s.
 
-What of u is a rigid motion of all tissue may as well be the camera's (intrasplat/poses/common_motion.py).
+The rigid part of u may be the camera's motion as well (intrasplat/poses/common_motion.py).
 
-Symbols: K frames, M places, F polynomials, S courses. Lengths in mm, in the world.
+Symbols: K frames, M positions, F polynomials, S time courses. Lengths in mm, in the world frame.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from intrasplat.poses.rigid import Reals, cross
 
 HARMONICS = 2
 USUAL_MM, SMOOTH = 6.0, 1.4
-"""Standard deviation that a coefficient is expected to have: of degree d it is USUAL_MM / SMOOTH^d."""
+"""Prior standard deviation of a coefficient of degree d: USUAL_MM / SMOOTH^d."""
 SAMPLED = 5
-"""Places along each axis at which the size of a deformation is measured."""
+"""Positions along each axis at which the size of a deformation is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +27,10 @@ class DeformationField:
     """A motion of the tissue.
 
     degree   of the polynomials in x and y
-    middle, half  [2] mm: the middle and half the extent of the tissue seen, by which places are scaled
-    weight   [S, 3 F]
-    courses  [K, S] of any unit
-    period   in frames, of courses that are sines and cosines or came from them; None: there is no motion
+    middle, half  [2] mm: the middle and half the extent of the visible tissue; positions are scaled by them
+    weight   [S, 3 F] the coefficients A
+    courses  [K, S] in any unit
+    period   in frames, of courses that are sines and cosines or were fitted from them; None: there is no motion
     """
 
     degree: int
@@ -53,12 +52,12 @@ class DeformationField:
 
     @property
     def ridge(self) -> Reals:
-        """[3 F] inverse variance that each coefficient is expected to have."""
+        """[3 F] prior inverse variance of each coefficient."""
         return np.asarray(np.square(SMOOTH**self.degrees / USUAL_MM))
 
     @property
     def rigid(self) -> Reals:
-        """[3 F, 6] the coefficients of six motions that move a flat tissue rigidly: along the axes, and about them."""
+        """[3 F, 6] the coefficients of the six rigid motions of flat tissue: along the axes, and about them."""
         found = np.zeros((3 * powers_of(self.degree), 6))
         found[:3, :3] = np.eye(3)
         for axis, turn in enumerate(np.eye(3)):  # the polynomials 1, y, x
@@ -82,11 +81,11 @@ class DeformationField:
         return np.asarray(self.powers(places_mm) @ (change @ self.weight).reshape(-1, 3))
 
     def course_at(self, frame: float, frames: Sequence[int]) -> Reals:
-        """[S] the courses at a frame beside those fitted [K]."""
+        """[S] the courses at any frame. frames: the K fitted frames."""
         return np.array([np.interp(frame, frames, course) for course in self.courses.T])
 
     def sizes_mm(self, depth_mm: float) -> Reals:
-        """[S] root mean square of the deformation by a course of 1; a rigid motion is no deformation."""
+        """[S] root mean square of the deformation for a course of 1, without its rigid part."""
         sides = np.linspace(-0.8, 0.8, SAMPLED)
         flat = np.stack(np.meshgrid(sides, sides), axis=-1).reshape(-1, 2) * self.half + self.middle
         places = np.concatenate([flat, np.full((len(flat), 1), depth_mm)], axis=1)
@@ -99,7 +98,7 @@ class DeformationField:
 
 
 def powers_of(degree: int) -> int:
-    """F, the polynomials of a degree."""
+    """F, the number of polynomials up to a degree."""
     return (degree + 1) * (degree + 2) // 2
 
 

@@ -1,8 +1,8 @@
 """Cameras and the tissue's motion, fitted together to all links.
 
-Whatever moves unlike the rest loses weight: a match by its residual, a piece of tissue by those of all its links (its
-rigidity). The tissue's motion starts from sines and cosines of the period that explains the links best, if one does;
-where free courses in time explain the links better, as of a pull, they are taken.
+Outliers lose weight: a match by its residual, a cell of tissue by the residuals of all its links (its rigidity). The
+tissue's motion starts from sines and cosines of the period that explains the links best. If free time courses explain
+the links better, as for a pull, they replace the sines.
 
 Symbols: K frames, L links, M matches of a link.
 """
@@ -22,33 +22,33 @@ from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, exp
 
 ROUGH_PX, FINE_PX = (4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 0.8, 0.8)
-"""Largest residual at which a match has a quarter of its weight, round by round: before the tissue's motion is known,
-and with it."""
+"""Maximum robust scale of each round, the residual at which a match has a quarter of its weight: rounds without the
+tissue's motion, then rounds with it."""
 SETTLING = 4
-"""Rounds with the last of them until a wide pan has settled: without them it is 0.1 degrees farther off."""
+"""Extra rounds at the last scale, until a wide pan has converged: without them it is 0.1 degrees farther off."""
 TUNED, FOLLOWED = (2, 4), (1, 2, 3)
-"""Of the fine rounds: those that tune the period, and those that follow the courses where they are free."""
+"""Indices of the fine rounds that tune the period, and of those that fit free courses."""
 DEGREE, WIDE_DEGREE, WIDE = 3, 5, 1.5
-"""Of the polynomials; the second where the clip shows tissue so many times as wide or as high as a view."""
+"""Degree of the polynomials. The second applies where the tissue is more than WIDE times as wide or high as a view."""
 PERIODS, MIN_PERIOD_FRAMES, MIN_PERIODS = 48, 8.0, 1.25
-"""Periods that are tried; the shortest; how often the longest fits into the clip."""
+"""Number of periods that are tried; the shortest; how often the longest fits into the clip."""
 NEAR = np.linspace(0.94, 1.06, 25)
-"""Times the last period: those that are tried to tune it."""
+"""Factors on the current period that are tried to tune it."""
 MIN_EXPLAINED = 0.08
-"""Share of what rigid tissue leaves unexplained that a period must explain: of still tissue it is below 0.01."""
+"""Share of the residual of rigid tissue that a period must explain; still tissue has less than 0.01."""
 MIN_GAIN = 0.05
-"""Share of the loss that free courses must save: of breathing they cost 0.01, of a pull they save 0.06."""
+"""Share of the loss that free courses must save: with breathing they cost 0.01, with a pull they save 0.06."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Cameras and motion that explain the links.
+    """Cameras and tissue motion that explain the links.
 
     poses        [K, 4, 4] world_from_camera; the world is the first frame's camera
     field        the tissue's motion
-    middle_mm    [3] the middle of the tissue seen
-    residual_px, weight  of each link [M]: lengths of the residuals, robust weights
-    grams        what the links say of what is left to explain
+    middle_mm    [3] the middle of the visible tissue
+    residual_px, weight  for each link [M]: lengths of the residuals, robust weights
+    grams        Gram matrices of the links at this solution
     """
 
     poses: Reals
@@ -60,13 +60,13 @@ class Fit:
 
 
 def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], None] = lambda share: None) -> Fit:
-    """Cameras and the tissue's motion. on_progress gets the share of the rounds done, and what it raises is raised."""
+    """Cameras and the tissue's motion. on_progress gets the share of rounds done; its exceptions pass through."""
     fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX) + SETTLING
     for done, scale_px in enumerate(ROUGH_PX):
         on_progress(done / rounds)
         fitting.improve(scale_px)
     best, periodic = fitting, fitting.find_period(FINE_PX[0])
-    free = copy(fitting)  # nothing is changed in place
+    free = copy(fitting)  # a shallow copy is enough: no step changes an array in place
     for place, scale_px in enumerate(FINE_PX):
         on_progress((len(ROUGH_PX) + place) / rounds)
         (fitting.tune if periodic and place in TUNED else fitting.improve)(scale_px)
@@ -81,7 +81,7 @@ def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], No
 
 
 class _Fitting:
-    """A fit that is still being improved."""
+    """A fit in progress."""
 
     def __init__(self, camera: StereoCamera, chain: Chain) -> None:
         self.camera, self.links, self.poses = camera, chain.links, chain.world_from_camera
@@ -109,7 +109,7 @@ class _Fitting:
         self._move(twists, replace(self.field, weight=self.field.weight + bend))
 
     def follow(self, scale_px: float) -> None:
-        """One step of cameras and field, and then of cameras and courses."""
+        """One step of the field's weights, then one of cameras and free courses."""
         grams = self._measured(scale_px)
         _, bend = grams.solved(self.field)
         field = replace(self.field, weight=self.field.weight + bend)
@@ -120,7 +120,7 @@ class _Fitting:
         self._move(twists, replace(field, courses=even * root, weight=size / root @ field.weight))
 
     def tune(self, scale_px: float) -> None:
-        """One step of cameras and field with the best period near the present one."""
+        """One step of cameras and field with the best period near the current one."""
         assert self.field.period is not None
         self._start_with(self._measured(scale_px).without(self.field), self.field.period * NEAR)
 
@@ -145,12 +145,12 @@ class _Fitting:
         return float((trust * squared / (1 + squared)).sum() / trust.sum())
 
     def result(self) -> Fit:
-        """The fit as it is now."""
+        """The current fit."""
         grams = self._measured(FINE_PX[-1])
         return Fit(self.poses, self.field, self.middle_mm, self.residual_px, self.weight, grams)
 
     def _start_with(self, grams: Grams, periods: Reals) -> None:
-        """Take the best of the periods and solve for the field anew. grams: as without any field."""
+        """Use the best of the periods and solve for the field anew. grams: those of the links without a field."""
         period = float(periods[np.argmax(grams.explained(self.field, periods.tolist()))])
         courses, count = waves(self.frames, period), self.field.weight.shape[1]
         field = replace(self.field, period=period, courses=courses, weight=np.zeros((2 * HARMONICS, count)))
@@ -162,7 +162,7 @@ class _Fitting:
         self.poses = np.stack([exp(each) @ pose for each, pose in zip(twists, self.poses, strict=True)])
 
     def _measured(self, scale_px: float) -> Grams:
-        """What the links say now; notes residuals, weights and rigidity."""
+        """The links' Gram matrices at the current solution; updates residuals, weights and rigidity."""
         courses = self.field.courses
         found = [
             link_gram(
@@ -181,12 +181,12 @@ class _Fitting:
         return Grams(np.stack([each.gram for each in found]), self.incidence, self.frames)
 
     def _some(self, link: FrameLink, pose: Reals) -> Reals:
-        """Every sixteenth match of a link in the world."""
+        """Points of every sixteenth match of a link, world frame, mm."""
         return self.camera.points_mm(link.before[::16]) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def rigidity(links: Sequence[FrameLink], weight: Sequence[Reals]) -> dict[int, Reals]:
-    """By first frame: of each of its cells the squared mean of the weights in all its links; a half counts beside."""
+    """For each first frame: per cell, the squared mean weight over its links, with one prior observation of a half."""
     cells = 1 + max(int(link.cells.max(initial=0)) for link in links)
     total = {link.a: np.full(cells, 0.5) for link in links}
     count = {link.a: np.ones(cells) for link in links}

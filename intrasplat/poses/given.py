@@ -1,8 +1,8 @@
-"""Given poses that jump to and fro, and the same path without the jumps.
+"""Jitter in given poses, and the same path without it.
 
-The pictures place each frame among its neighbours to a tenth of a millimetre, but leave open where the whole path goes
-(intrasplat/poses/common_motion.py); given poses err the other way. So the path that was found is laid on the given one
-by a motion that changes slowly.
+The path found in the pictures is precise from frame to frame, to a tenth of a millimetre, but may drift as a whole
+(intrasplat/poses/common_motion.py). Given poses may jitter but do not drift. So a slowly changing motion aligns the
+found path with the given one.
 
 Symbols: T frames.
 """
@@ -20,28 +20,28 @@ from intrasplat.poses.rigid import Reals, exp, inverse, log
 from intrasplat.poses.trajectory import ARM_MM
 
 MIN_JITTER = 0.0015
-"""Of the picture's width: how far given poses must jump to be steadied, 1 px of 640."""
+"""Jitter from which given poses are smoothed, as a share of the picture's width: 1 px of 640."""
 MAX_JITTER = 0.003
-"""Of the picture's width: jumps that harm the model, 2 px of 640."""
+"""Jitter that harms the model, as a share of the picture's width: 2 px of 640."""
 ROUGHNESS = (1.0, 1.6)
-"""Change of step over step, and third difference over change of step: independent errors have 1.7 and 1.8, a hand that
-shakes 0.6 and 1.5. The second notices errors beside a fast motion."""
+"""Second difference over first, and third over second. Independent errors have 1.7 and 1.8, a shaking hand 0.6 and 1.5.
+The second ratio detects errors beside a fast motion."""
 AVERAGE = np.sqrt(6) * np.sqrt(8 / (3 * np.pi))
-"""Mean change of step over the deviation of each pose, over its three axes, if poses err independently."""
+"""Mean norm of the second difference over the deviation per pose, for independent errors on three axes."""
 MIN_RUNS = 2
 WINDOWS, ORDER = (5, 7, 9, 15, 21, 31), 2
-"""Frames over which the motion between both paths may be smoothed, by a polynomial of this order."""
+"""Windows, in frames, and polynomial order of the Savitzky-Golay filters that are tried."""
 
 
 def jitter_mm(clip: DepthClip, train: Sequence[int]) -> tuple[float, float]:
-    """By how much a frame's pose errs at the tissue if poses err independently, and the tissue's depth, both in mm.
+    """The error of each pose at the tissue, for independent errors, and the tissue's median depth, both in mm.
 
-    Looked at is the point on the optical axis at the tissue's median depth, which errors of place and of angle move.
-    (0, 0) if it moves as smoothly from frame to frame as that of a camera does.
+    Measured at the point on the optical axis at that depth: errors of position and of rotation both move it.
+    (0, 0) if it moves from frame to frame as smoothly as with a real camera.
     """
     wanted, pose = set(train), clip.world_from_camera
     runs = [index for index in train if {index - 1, index + 1, index + 2} <= wanted]
-    if (pose == pose[:1]).all():  # the camera stands still
+    if (pose == pose[:1]).all():
         return 0.0, 0.0
     depths = (clip.depth_mm[index][clip.tissue[index] & (clip.depth_mm[index] > 0)] for index in clip.one_by_one(runs))
     known = [float(np.median(each)) for each in depths if each.size]
@@ -60,7 +60,7 @@ def jitter_mm(clip: DepthClip, train: Sequence[int]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Steadied:
-    """A path [T, 4, 4] without its jumps; by how much it jumps against what the pictures show, and what is left, mm."""
+    """A path [T, 4, 4] without jitter; the jitter against the found path, and what is left of it, both in mm."""
 
     world_from_camera: Reals
     jumps_mm: float
@@ -68,11 +68,11 @@ class Steadied:
 
 
 def steadied(given: Reals, found: Reals, unsure: Sequence[int]) -> Steadied:
-    """The given path [T, 4, 4] without its jumps: the found one, moved by what lies between both over some frames.
+    """The given path [T, 4, 4] without jitter: the found path, moved by the smoothed motion between the two paths.
 
-    What lies between changes slowly but for the jumps, which its second differences show. The window of a
-    Savitzky-Golay filter is the one that leaves least of them and follows the slow part best, by how well it predicts a
-    frame from the others. Frames whose place was not found stay where they were given; so does a clip too short.
+    That motion is slow drift plus jitter; its second differences measure the jitter. A Savitzky-Golay filter smooths
+    it. The window is the one with the least expected error: jitter that passes plus drift that the filter loses, as
+    leave-one-out prediction shows it. Unsure frames keep their given pose, and so does a clip too short.
     """
     count = len(given)
     sure = np.setdiff1d(np.arange(count), unsure)
@@ -92,5 +92,5 @@ def steadied(given: Reals, found: Reals, unsure: Sequence[int]) -> Steadied:
 
 
 def _squared(twists: Reals) -> float:
-    """Mean square of what twists [N, 6] move at the tissue, mm^2."""
+    """Mean squared displacement by twists [N, 6] at a distance of ARM_MM, mm^2."""
     return float(np.square(twists * np.repeat([1.0, ARM_MM], 3)).sum(1).mean())

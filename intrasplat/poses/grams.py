@@ -1,8 +1,8 @@
-"""What the matches of all links say of cameras and tissue: Gram matrices, and the normal equations that they give.
+"""Gram matrices of the links, and the normal equations of cameras and tissue motion that follow from them.
 
-A link's residuals are linear in the twist of its cameras, left to world_from_camera, and in the field's coefficients;
-its Gram matrix holds all products of those columns and the residual. For any courses in time it gives the normal
-equations without another look at the matches.
+A link's residuals are linear in the twist of its cameras, applied left of world_from_camera, and in the field's
+coefficients. Its Gram matrix holds all products of those columns and the residual. It gives the normal equations for
+any time courses without another pass over the matches.
 
 Symbols: K frames, L links, M matches, F polynomials, S courses; G = 7 + 3 F columns: twist, coefficients, residual.
 """
@@ -20,11 +20,12 @@ from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, inverse, weighted_median
 
 INDEPENDENT, NOISE_PX = 0.05, 0.35
-"""Share of the matches that tell something of their own, for flow and depth err alike over some pixels; their noise."""
+"""Share of matches that count as independent, because errors of flow and depth are correlated over some pixels; noise
+of a match."""
 MIN_SCALE_PX = 0.5
-"""Of the residual at which a match has a quarter of its weight: the least."""
+"""Minimum robust scale: the residual at which a match has a quarter of its weight."""
 HELD, FREE = 1e9, 1e-6
-"""Added to the normal equations: of the first camera, which is the world, and of all others."""
+"""Added to the diagonal of the normal equations: fixes the first camera, which is the world, and damps all others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +46,14 @@ def link_gram(
     scale_px: float,
     rigidity: Reals | None,
 ) -> LinkGram:
-    """What a link says at the present poses [4, 4] of its frames and the present field.
+    """A link's Gram matrix at the current poses [4, 4] of its frames and the current field.
 
-    Slopes are taken where the second frame sees a match: the noise of its depth and that of the residual, in which the
-    first frame's depth stands, are independent, and do not draw the cameras together.
+    Derivatives are taken at the match's position in the second frame. The residual contains the first frame's depth;
+    its noise is independent of the second frame's, so that noise does not bias the cameras towards each other.
 
     Args:
-        change: [S] of the courses from the first frame to the second.
-        scale_px: largest residual at which a match has a quarter of its weight; else twice the median.
+        change: [S] change of the courses from the first frame to the second.
+        scale_px: maximum residual at which a match has a quarter of its weight; twice the median residual if less.
         rigidity: weight of each cell of the first frame, or None.
     """
     from_a, from_b = poses
@@ -83,7 +84,7 @@ def link_gram(
 
 
 def _columns(field: DeformationField) -> Reals:
-    """[3 F + 4, G] the columns in terms of the polynomials and z, each along three axes, and the residual."""
+    """[3 F + 4, G] the columns as combinations of the polynomials and z, each along three axes, and the residual."""
     count = field.weight.shape[1]  # 3 F
     columns = np.zeros((count + 4, 7 + count))
     columns[:count, 6:-1] = np.eye(count)
@@ -93,7 +94,7 @@ def _columns(field: DeformationField) -> Reals:
     coordinates[0, [0, 2]] = field.middle[0], field.half[0]
     coordinates[1, [0, 1]] = field.middle[1], field.half[1]
     coordinates[2, -1] = 1
-    for axis in range(3):  # a turn w moves p by w x p
+    for axis in range(3):  # a rotation w moves p by w x p
         one, two = (axis + 1) % 3, (axis + 2) % 3
         columns[two : count + 3 : 3, 3 + axis] += coordinates[one]
         columns[one : count + 3 : 3, 3 + axis] -= coordinates[two]
@@ -114,7 +115,7 @@ class Grams:
     frames: Reals
 
     def solved(self, field: DeformationField) -> tuple[Reals, Reals]:
-        """Steps: twists [K, 6] of the cameras and changes [S, 3 F] of the field's weights, courses as they are."""
+        """Steps for fixed courses: twists [K, 6] of the cameras and changes [S, 3 F] of the field's weights."""
         factor, right = cho_factor(self._twists()), self._residuals()
         if not len(field.weight):
             return cho_solve(factor, right).reshape(-1, 6), np.zeros_like(field.weight)
@@ -126,7 +127,7 @@ class Grams:
         return (cho_solve(factor, right) - through @ bend).reshape(-1, 6), bend.reshape(field.weight.shape)
 
     def followed(self, field: DeformationField) -> tuple[Reals, Reals]:
-        """Steps: twists [K, 6] of the cameras and changes [K, S] of the field's courses, weights as they are."""
+        """Steps for fixed weights: twists [K, 6] of the cameras and changes [K, S] of the field's courses."""
         kinds, count = len(field.weight), len(self.frames)
         columns = np.zeros((7 + kinds, self.gram.shape[1]))
         columns[:6, :6], columns[6:-1, 6:-1], columns[-1, -1] = np.eye(6), -field.weight, 1
@@ -143,9 +144,9 @@ class Grams:
         return found[:, :6], found[:, 6:]
 
     def covariance(self, field: DeformationField) -> Reals:
-        """[6 K, 6 K] of the cameras' twists, whatever the field does but for rigid motions of all tissue.
+        """[6 K, 6 K] covariance of the cameras' twists. The field is marginalised, without rigid motions of all tissue.
 
-        Those and the cameras are told apart by the gauge, not by links.
+        Links cannot separate those motions from the cameras'; common_motion.py does.
         """
         normal, kinds = self._twists(), len(field.weight)
         if kinds:
@@ -167,15 +168,15 @@ class Grams:
         return float(np.sqrt(np.mean(squares)))
 
     def without(self, field: DeformationField) -> Grams:
-        """What the links would say if the field were not there."""
+        """The Gram matrices without the field."""
         return self.shifted(-(self.change(field) @ field.weight))
 
     def with_weights(self, field: DeformationField, added: Reals) -> Grams:
-        """What the links say after the field's weights were changed by [S, 3 F]."""
+        """The Gram matrices after a change [S, 3 F] of the field's weights."""
         return self.shifted(self.change(field) @ added)
 
     def shifted(self, moved: Reals) -> Grams:
-        """What the links say after the tissue of each was moved by coefficients [L, 3 F]."""
+        """The Gram matrices after the tissue of each link was moved by coefficients [L, 3 F]."""
         lift = np.tile(np.eye(self.gram.shape[1]), (len(moved), 1, 1))
         lift[:, -1, 6:-1] = moved
         return replace(self, gram=lift @ self.gram @ lift.transpose(0, 2, 1))
@@ -185,12 +186,12 @@ class Grams:
         return -(self.incidence @ field.courses)
 
     def unexplained(self) -> float:
-        """Squared residuals that are left whatever the cameras are."""
+        """Sum of squared residuals at the best cameras."""
         right = self._residuals()
         return float(self.gram[:, -1, -1].sum() - right @ cho_solve(cho_factor(self._twists()), right))
 
     def explained(self, field: DeformationField, periods: Sequence[float]) -> list[float]:
-        """How much of that a field of each period explains; the links are those without any field."""
+        """How much a field of each period lowers that sum. Call it on Gram matrices without a field."""
         factor, right = cho_factor(self._twists()), self._residuals()
         found = []
         for period in periods:
@@ -209,7 +210,7 @@ class Grams:
         return normal
 
     def _by_frame(self, gram: Reals) -> Reals:
-        """[n K, n K] normal matrix of n unknowns a frame, whose differences the links [L, n, n] measure."""
+        """[n K, n K] normal matrix of n unknowns per frame, whose differences the links [L, n, n] measure."""
         count, size = len(self.frames), gram.shape[1]
         blocks = np.zeros((count, count, size, size))
         first, second = self.incidence.argmax(1), self.incidence.argmin(1)
@@ -218,11 +219,11 @@ class Grams:
         return np.asarray(blocks.transpose(0, 2, 1, 3).reshape(count * size, -1))
 
     def _residuals(self) -> Reals:
-        """[6 K] right side of the twists."""
+        """[6 K] right side of the normal equations of the twists."""
         return np.asarray(-np.einsum("lk,li->ki", self.incidence, self.gram[:, :6, -1]).ravel())
 
     def _bends(self, courses: Reals) -> tuple[Reals, Reals, Reals]:
-        """Of the weights [S 3 F]: normal matrix, its block [6 K, S 3 F] with the twists, right side."""
+        """For the weights [S 3 F]: normal matrix, its block [6 K, S 3 F] with the twists, right side."""
         change = -(self.incidence @ courses)
         links, kinds = change.shape
         bends = self.gram.shape[1] - 7

@@ -22,32 +22,32 @@ FLOW_WIDTH = 320
 MATCH_STEP = 5
 """Cells of the grid between neighbouring matches."""
 PATCH_PX = 11
-"""Side of the patches by which the flow is refined: dense flow is smoother than the tissue's, and takes 4 % of the
-parallax for a turn of the camera. Wider patches are too smooth, too."""
+"""Side of the patches that refine the flow. Dense flow is smoother than the true motion, and attributes 4 % of the
+parallax to a rotation of the camera. Wider patches are too smooth as well."""
 SHADE_PX, CONTRAST, MIN_SPREAD = 10.0, 40.0, 10.0
-"""Width over which shades are taken out before patches are compared; the standard deviation that textures get then,
-levels of 255; what is added to theirs, so that noise does not grow."""
+"""Contrast normalisation before patches are compared: width of the local mean and deviation; target standard deviation
+in levels of 255; what is added to the measured one, so that noise is not amplified."""
 MAX_OFF = 25.0
-"""Mean difference of two patches in levels of those; unrelated textures have 27 or more, most matches 5 to 20."""
+"""Maximum mean difference of two patches, in those levels; unrelated textures have 27 or more, most matches 5 to 20."""
 LOST = -1e4
-"""The place of a patch that was not found."""
+"""Position of a patch that was not found."""
 ROUND_TRIP_PX = 1.0
-"""A difference of this much between a patch's way there and back halves the trust in its match."""
+"""A forward-backward difference of this much halves the trust in a match."""
 MIN_TRUST, MIN_MATCH_TRUST = 0.5, 0.1
-"""Confidence of depth that a match needs at both ends; what is left of it for a match to count."""
+"""Minimum confidence of depth at both ends of a match; minimum trust of a match that counts."""
 AGREES_PX = 1.5
-"""Residual below which a match is where it is expected."""
+"""Residual below which a match agrees with the fit."""
 PSEUDO_BASELINE_MM = 4.3
-"""Where depth was given: as of a stereo camera whose eyes stand so far apart."""
+"""Given depth is converted to the disparity of a stereo camera with this baseline."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
     """A frame on the coarse grid.
 
-    grey, even  [h, w] grey levels, and those without shades
+    grey, even  [h, w] grey levels, and the same with even contrast
     disparity   [h, w] px of the grid, 0 where there is none
-    trust       [h, w] in it, 0 to 1; 0 off tissue
+    trust       [h, w] confidence of the disparity, 0 to 1; 0 off tissue
     """
 
     grey: NDArray[np.uint8]
@@ -60,12 +60,12 @@ class TrackedFrame:
 class FrameLink:
     """Matches from frame a to frame b.
 
-    cells  [M]     which of a's cells with depth; a has the same in all links
+    cells  [M]     indices among a's cells with depth, which are the same in all links of a
     before [M, 3]  (column, row, disparity) in a, px of the coarse grid
     after  [M, 3]  in b
     trust  [M]     in [0, 1]
     overlap        share of a's cells with depth that were found in b
-    flow [h, w, 2] to start another link's from
+    flow [h, w, 2] an initial flow for another link
     """
 
     a: int
@@ -78,12 +78,12 @@ class FrameLink:
     flow: Floats = field(repr=False)
 
     def agreeing(self, residual_px: Reals) -> float:
-        """The share of a's cells with depth found where they were expected; residual_px [M] of the matches."""
+        """The share of a's cells with depth that match as expected. residual_px [M]: of the matches."""
         return self.overlap * float(np.mean(residual_px < AGREES_PX)) if len(residual_px) else 0.0
 
 
 class Frames:
-    """The clip's frames on the coarse grid, made on demand and kept, and links between them."""
+    """The clip's frames on the coarse grid, computed on demand and cached, and links between them."""
 
     def __init__(self, clip: DepthClip) -> None:
         k = clip.intrinsics
@@ -120,7 +120,7 @@ class Frames:
         self._kept.pop(index, None)
 
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
-        """Matches from frame a to frame b. start: a guess of the flow [h, w, 2], which is not changed."""
+        """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""
         one, two = self.frame(a), self.frame(b)
         flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
         columns, rows = self._matched(one)
@@ -154,7 +154,7 @@ class Frames:
         return FrameLink(a, b, cells, before, after, trust[cells].astype(np.float64), overlap, flow)
 
     def predicted(self, a: int, b_from_a: Reals) -> tuple[Floats, float]:
-        """The flow [h, w, 2] of frame a's tissue if it were rigid, and the share of it that stays in view."""
+        """The flow [h, w, 2] of frame a's tissue if it is rigid, and the share of it that stays in view."""
         one = self.frame(a)
         height, width = one.disparity.shape
         rows, columns = (each.ravel() for each in np.mgrid[0:height:8, 0:width:8])
@@ -172,7 +172,7 @@ class Frames:
         return flow, float((inside & known).sum() / known.sum())
 
     def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Columns and rows [M'] of the frame's cells that are matched: those with a depth to rely on."""
+        """Columns and rows [M'] of the frame's cells that are matched: those with confident depth."""
         height, width = frame.grey.shape
         rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
         known = frame.trust[rows, columns] > MIN_TRUST
@@ -180,7 +180,7 @@ class Frames:
 
 
 def _patches(one: NDArray[np.uint8], two: NDArray[np.uint8], places: Floats, guess: Floats) -> Floats:
-    """Where the patches at places [M, 2] of one picture are in another, from a guess; not smoothed, as flow is."""
+    """Positions [M, 2] in picture `two` of the patches at `places` in picture `one` (Lucas-Kanade, from a guess)."""
     if not len(places):
         return guess
     found, status, off = cv2.calcOpticalFlowPyrLK(
@@ -198,7 +198,7 @@ def _patches(one: NDArray[np.uint8], two: NDArray[np.uint8], places: Floats, gue
 
 
 def even_contrast(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture without what the lamp does: it moves with the camera, and so do shades."""
+    """The picture with locally even brightness and contrast: shading by the lamp moves with the camera."""
     off = grey - cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SHADE_PX)
     spread = np.sqrt(cv2.GaussianBlur(off * off, (0, 0), SHADE_PX))
     return np.asarray(np.clip(128 + CONTRAST * off / (spread + MIN_SPREAD), 0, 255), np.uint8)

@@ -1,4 +1,4 @@
-"""A clip gets its camera's poses: those it brought, a fixed camera's, or an estimated path."""
+"""Sets a clip's camera poses: those given with the clip, those of a fixed camera, or an estimated path."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from intrasplat.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
 from intrasplat.poses.still import camera_rests
 from intrasplat.report import CameraPoses
 
-if TYPE_CHECKING:  # a fixed camera needs none of it
+if TYPE_CHECKING:  # imported when needed: a fixed camera needs none of it
     from intrasplat.poses.estimate import FoundPath
 
 STAGE = "poses"
 MIN_FRAMES = 2
 WORTH = 0.7
-"""Share of the jumps that steadied poses may still be off by; with more, the given ones stay."""
+"""Smoothed poses replace the given ones only if less than this share of the jitter remains."""
 MAX_UNSURE = 0.5
-"""Share of a clip's frames whose pose may be unsure; with more, there is no path."""
+"""With a larger share of unsure frames, the path is rejected."""
 
 
 def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings) -> DepthClip:
-    """The clip with its poses and what the report says of them; a clip that has been here stays as it is.
+    """The clip with its poses and their entry for the report. A clip whose poses are set is returned unchanged.
 
-    A camera that is fixed leaves all arrays as they are. timings get poses_s.
+    A fixed camera leaves all arrays unchanged. timings get poses_s.
 
     Raises:
-        InputError: options.poses asks for given poses, and the clip brought none.
+        InputError: options.poses asks for given poses, and the clip has none.
         Cancelled: hooks.should_stop said so.
     """
     brought = clip.right is None  # only layouts with depth bring poses
@@ -65,7 +65,7 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
 
 
 def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
-    """The clip with the poses that it brought, and a warning if they jump by so much that the model suffers."""
+    """The clip with its given poses, and a warning if their jitter harms the model."""
     clip = replace(clip, poses=CameraPoses(source="given"))
     if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
         return clip
@@ -77,7 +77,7 @@ def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
 
 
 def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
-    """The clip with the poses that it brought, without their jumps if they jump to and fro and the pictures tell."""
+    """The clip with its given poses; jitter is removed if the pictures show that the camera did not move so."""
     jumps_mm, depth_mm = jitter_mm(clip, train)
     if clip.intrinsics.fx * jumps_mm <= MIN_JITTER * clip.intrinsics.width * depth_mm:
         return _as_given(clip, 0.0, depth_mm)
@@ -85,7 +85,7 @@ def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
 
     found = find_path(clip, train, lambda share: hooks.report_stage(STAGE, share))
     steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure)
-    if steady.jumps_mm < WORTH * jumps_mm:  # the pictures show the same: the camera itself shakes
+    if steady.jumps_mm < WORTH * jumps_mm:  # the found path has the same jitter: the camera itself shakes
         return _as_given(clip, 0.0, depth_mm)
     text = f"poses: the given ones jump to and fro by about {jumps_mm:.2f} mm at the tissue from frame to frame; "
     if len(found.unsure) > MAX_UNSURE * clip.frame_count or steady.left_mm > WORTH * jumps_mm:
@@ -102,7 +102,7 @@ def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
 
 
 def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
-    """The clip with the path, or at rest if that explains it as well."""
+    """The clip with the found path, or with a fixed camera if that explains the clip as well."""
     if len(found.unsure) > MAX_UNSURE * clip.frame_count:
         text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "
         text += "tissue with texture and depth is common to them. The camera was taken as fixed."
@@ -148,7 +148,7 @@ def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings:
 
 
 def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
-    """The clip with both eyes at these poses [T, 4, 4] of the left one, mm."""
+    """The clip with these poses [T, 4, 4] of the left eye, mm; the right eye moves along."""
     right = clip.right
     if right is not None:
         left_from_right = np.linalg.inv(clip.world_from_camera[0]) @ right.world_from_camera[0]
@@ -157,7 +157,7 @@ def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip
 
 
 def _told(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
-    """What the report repeats of a path."""
+    """A path's entry in the report."""
     frame_s = float(np.median(np.diff(clip.frame_times_s)))
     return CameraPoses(
         source=source,

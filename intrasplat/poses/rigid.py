@@ -1,8 +1,8 @@
 """Rigid motions of a stereo camera and their robust estimation from matches between two frames.
 
 Symbols: M matches. A twist [6] is (v, w): translation in mm, rotation in radians; exp maps it to a motion [4, 4].
-A measurement [3] is (column, row, disparity) in px of the coarse grid: what a stereo camera sees of a point, with noise
-of about one size in all three, which depth in mm has not (its noise grows with the square of the depth).
+A measurement [3] is (column, row, disparity) of a point in px of the coarse grid. Its noise is about the same in all
+three, unlike that of depth in mm, which grows with the square of the depth.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 STEPS = 8
-"""Gauss-Newton steps at most for one link."""
+"""Maximum number of Gauss-Newton steps for one link."""
 MIN_SCALE_PX, MAX_SCALE_PX = 0.25, 2.0
-"""Of the residual, in px of the coarse grid, at which a match has half its weight: least and largest."""
+"""Limits of the robust scale, the residual at which a match has half its weight, in px of the coarse grid."""
 LONGEST = np.repeat([20.0, 0.2], 3)
-"""The most that one step changes a coordinate, mm and radians: matches that contradict each other lead nowhere."""
+"""Maximum change of a coordinate in one step, mm and radians: contradictory matches must not make it diverge."""
 CONVERGED = 1e-5
 """Length of a twist (mm, and radians times 100) at which the steps end."""
 
@@ -69,9 +69,9 @@ def inverse(motion: Reals) -> Reals:
 
 
 def between(frames: Sequence[int] | Reals, poses: Reals, index: float) -> Reals:
-    """The pose [4, 4] at a frame if the camera moves evenly between those before and after it.
+    """The pose [4, 4] at a frame, interpolated at constant velocity between the poses before and after it.
 
-    frames [K] rise, or are times; poses are [K, 4, 4].
+    frames [K] (or times) rise; poses are [K, 4, 4].
     """
     after = int(np.searchsorted(frames, index))
     if after in {0, len(frames)}:
@@ -82,7 +82,7 @@ def between(frames: Sequence[int] | Reals, poses: Reals, index: float) -> Reals:
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """The camera of the coarse grid: focal lengths and centre in its px, and the eyes' distance in mm."""
+    """The camera of the coarse grid: focal lengths and principal point in its px, and the baseline in mm."""
 
     fx: float
     fy: float
@@ -123,10 +123,10 @@ class StereoCamera:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A motion [4, 4] of the points of one frame to another's camera, and how well it explains the matches.
+    """A motion [4, 4] of one frame's points into another frame's camera axes, and how well it explains the matches.
 
     residual_px [M]     length of each match's residual
-    weight      [M]     what each counted
+    weight      [M]     robust weight of each match
     information [6, 6]  inverse covariance of the motion's twist, from the residuals' own size
     """
 
@@ -139,10 +139,9 @@ class Aligned:
 def align(camera: StereoCamera, before: Reals, after: Reals, trust: Reals, start: Reals) -> Aligned:
     """The rigid motion that takes measurements before [M, 3] to those after [M, 3].
 
-    Iteratively reweighted least squares with the weights of Geman and McClure, whose scale follows the median residual,
-    and is at most half as large from step to step until it is small: a start far off must not hold on to matches that
-    are wrong and fit by chance.
-    trust [M] multiplies the weights; start [4, 4] is the first guess.
+    Iteratively reweighted least squares with Geman-McClure weights. The scale follows the median residual, and
+    at least halves per step down to MAX_SCALE_PX, so that a poor start does not lock onto matches that fit by chance.
+    trust [M] multiplies the weights; start [4, 4] is the initial estimate.
     """
     points = camera.points_mm(before)
     motion, there = start, camera.slopes(camera.points_mm(after))
@@ -165,7 +164,7 @@ def align(camera: StereoCamera, before: Reals, after: Reals, trust: Reals, start
             break
     spread = float((weight * squared).sum() / max(3 * weight.sum(), 1e-9))
     u, _, vt = np.linalg.svd(motion[:3, :3])
-    motion[:3, :3] = u @ vt  # rounding would double from one frame to the next
+    motion[:3, :3] = u @ vt  # re-orthonormalise: rounding errors would double from frame to frame
     return Aligned(motion, np.sqrt(squared), weight, normal / max(spread, 1e-4))
 
 

@@ -1,4 +1,4 @@
-"""Whether the camera stands still, seen in a few frames: most of a fixed camera's picture rests most of the time."""
+"""Tests with a few frames whether the camera is fixed: most of a fixed camera's picture rests most of the time."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from intrasplat.motion.lifted import cell_means
 
 LOOK_WIDTH = 160
 LOOKS = 8
-"""Frames that are looked at, spread over the clip."""
+"""Number of frames that are compared, spread over the clip."""
 RESTING_PX, RESTING_SHARE = 0.25, 0.4
-"""Flow below which tissue rests, px of the small picture, and the share of textured tissue that must rest, in half of
-the frames looked at."""
+"""Tissue with less flow (px of the small picture) rests. This share of textured tissue must rest in half of the frames
+compared."""
 MOVED_PX = 0.8
-"""Root mean square over the frames of the median flow, below which a camera counts as fixed: half a degree."""
+"""A camera counts as fixed below this root mean square over frames of the median flow: half a degree."""
 MIN_SEEN = 0.1
-"""Share of the picture that must show textured tissue."""
+"""Minimum share of the picture with textured tissue."""
 MIN_CONTRAST = 3.0
-"""Standard deviation of a patch's grey levels for its flow to tell something."""
+"""Minimum standard deviation of a patch's grey levels for its flow to count."""
 
 
 def camera_rests(clip: DepthClip, train: Sequence[int]) -> bool:
-    """Whether so much of the picture rests that only a fixed camera explains it. False: look closer."""
+    """Whether so much of the picture rests that the camera must be fixed. False: the path has to be estimated."""
     step = -(-clip.intrinsics.width // LOOK_WIDTH)
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
 

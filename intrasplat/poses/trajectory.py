@@ -1,6 +1,6 @@
-"""Camera paths as TUM files, and how far one path is from another.
+"""Camera paths as TUM files, and the error of one path against another.
 
-A TUM file has a line `timestamp tx ty tz qx qy qz qw` a frame: seconds, metres, world_from_camera. Lines that begin
+A TUM file has one line `timestamp tx ty tz qx qy qz qw` per frame: seconds, metres, world_from_camera. Lines that start
 with # are comments.
 
 Symbols: T frames.
@@ -20,15 +20,15 @@ from intrasplat.poses.rigid import Reals, between, inverse
 
 MM_PER_M = 1000.0
 ARM_MM = 60.0
-"""How much a turn counts beside a place when two paths are laid on each other: as much as it moves what is so far away.
-Places alone do not fix the turn of a path that only turns, or that runs along a line."""
+"""Alignment of two paths weighs a rotation by how far it moves a point at this distance. Positions alone do not
+determine the rotation of a path that only rotates or that runs along a line."""
 LATE_S, MAX_GAP_S = 0.02, 0.25
-"""How far a frame may lie from the nearest pose of a path, unless it lies between two that are no farther apart."""
+"""A frame must lie within LATE_S of a pose, or between two poses that are at most MAX_GAP_S apart."""
 
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Absolute trajectory error, root mean square after one rigid motion laid one path on the other."""
+    """Absolute trajectory error, root mean square after one rigid motion aligns one path with the other."""
 
     mm: float
     deg: float
@@ -37,8 +37,8 @@ class TrajectoryError:
 def trajectory_error(found: Reals, true: Reals) -> TrajectoryError:
     """The error of a path [T, 4, 4] against the true one, world_from_camera in mm.
 
-    The rigid motion is that of least squares over places and, ARM_MM away, axes. Stereo knows
-    the scale, so it is not fitted.
+    The rigid motion minimises the squared error of positions and of axis ends ARM_MM away. The scale is not fitted,
+    because stereo measures it.
     """
     centred = [path[:, :3, 3] - path[:, :3, 3].mean(0) for path in (found, true)]
     spread = np.einsum("ti,tj->ij", centred[1], centred[0])
@@ -98,10 +98,10 @@ def _is_number(word: str) -> bool:
 
 
 def at_times(times_s: Reals, poses: Reals, wanted_s: Reals) -> Reals:
-    """The poses [T, 4, 4] of a path at the times wanted, which both count from one moment: evenly between its own.
+    """The poses [T, 4, 4] of a path at the times wanted, interpolated. Both times count from the same moment.
 
     Raises:
-        InputError: the path's times do not rise, or it has no poses about a time.
+        InputError: the path's times do not rise, or it has no pose near a time.
     """
     remedy = "Give a pose for each frame, or a path that begins with the clip and lasts as long, with 5 poses a second."
     if not (np.diff(times_s) > 0).all():

@@ -1,4 +1,4 @@
-"""Stereo clip in, files or frames; depth in mm and its confidence for every frame out.
+"""Stereo clip (files or frames) in; depth in mm and its confidence for every frame out.
 
 Verbs: open_with_depth, match_eyes, estimate_depth.
 """

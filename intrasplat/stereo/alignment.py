@@ -22,18 +22,18 @@ Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image,
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """The signature of `map` for one argument."""
 
-FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as good, in a third of the time
+FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as accurate, in a third of the time
 FEATURES = 1500
 RATIO = 0.8  # Lowe's ratio test
 MAX_MATCH_DY_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
-MAX_CORRECTION_PX = 8.0  # beyond it the calibration belongs to other frames
-MAX_EQUAL_ROWS_PX = 1.0  # row difference of frames that are rectified already
+MAX_CORRECTION_PX = 8.0  # a larger row shift means that the calibration belongs to other frames
+MAX_EQUAL_ROWS_PX = 1.0  # row difference below which frames count as rectified already
 SWAPPED_SHARE = 0.8
 COARSE_WIDTH = 176  # px; wide enough for tissue, so that a search of all disparities takes milliseconds
 MAX_DISPARITY_SHARE = 0.6  # of the width: beyond it the eyes overlap too little
-MIN_EVIDENCE = 0.8  # of a match that counts
-MIN_TEXTURE = 8.0  # mean |gradient| in grey levels; below it matches are chance
+MIN_EVIDENCE = 0.8  # minimum evidence of a match that counts
+MIN_TEXTURE = 8.0  # mean |gradient| in grey levels; below it matches are random
 RANGE_PERCENTILES = (0.5, 99.5)
 RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every disparity of the clip
 
@@ -56,7 +56,7 @@ class Features:
 
 
 def find_features(image: Grey, max_width_px: int = FEATURE_WIDTH) -> Features:
-    """Features of the image, reduced to max_width_px if it is wider."""
+    """Features of the image, which is reduced to max_width_px if it is wider."""
     scale = min(1.0, max_width_px / image.shape[1])
     small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(small, None)
@@ -66,7 +66,7 @@ def find_features(image: Grey, max_width_px: int = FEATURE_WIDTH) -> Features:
 
 
 def match_features(left: Features, right: Features) -> NDArray[np.float64]:
-    """[M, 4] x_left, y_left, x_right, y_right of matches that pass the ratio test and lie on similar rows."""
+    """Matches [M, 4] (x_left, y_left, x_right, y_right) that pass the ratio test and lie on similar rows."""
     if not len(left.points) or len(right.points) < 2:
         return np.zeros((0, 4))
     pairs = [
@@ -83,11 +83,11 @@ def match_features(left: Features, right: Features) -> NDArray[np.float64]:
 def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_rows_px: float = 0.0) -> RowShift:
     """The shift between the eyes' rows from matches [M, 4] of several frames.
 
-    infinity_px is the disparity of a point infinitely far away; real points have more. equal_rows_px is the shift that
+    infinity_px is the disparity of a point at infinity; real points have more. equal_rows_px is the shift that
     rectification gives to points on equal rows of the recorded frames.
 
     Raises:
-        InputError: the frames are rectified already, the eyes look swapped, or their rows differ by more than
+        InputError: the frames are rectified already, the eyes seem to be swapped, or their rows differ by more than
             MAX_CORRECTION_PX.
     """
     dy = matches[:, 3] - matches[:, 1]
@@ -123,9 +123,9 @@ def choose_range(
     depth_range_mm: tuple[float, float],
     agreed: Agreed,
 ) -> tuple[float, float]:
-    """The disparity range (low, high) in px of rectified pairs, from a coarse search of all that their depths may have.
+    """The disparity range (low, high) in px of rectified pairs, from a coarse search over depth_range_mm.
 
-    Only textured pixels count on which both matching directions agree.
+    Only textured pixels count at which both matching directions agree.
 
     Raises:
         InputError: no pair has matching points.
@@ -162,7 +162,7 @@ def outside_share(
     focal_baseline_px_mm: float,
     depth_range_mm: tuple[float, float],
 ) -> float:
-    """Share of the matches [M, 4] on equal rows that lie nearer or farther than depth_range_mm; 0 if there are few."""
+    """Share of the matches [M, 4] on equal rows whose depth is outside depth_range_mm; 0 if there are few."""
     on_row = np.abs(matches[:, 3] - matches[:, 1] - shift.shift_px) < MAX_EQUAL_ROWS_PX
     if on_row.sum() < MIN_MATCHES:
         return 0.0
@@ -171,7 +171,7 @@ def outside_share(
 
 
 def _densest(values: NDArray[np.float64]) -> float:
-    """Median of the 2 px window with the most values: a robust start if most matches are wrong."""
+    """Median of the 2 px window with the most values: a robust initial value even if most matches are wrong."""
     ordered = np.sort(values)
     counts = np.searchsorted(ordered, ordered + 2.0, side="right") - np.arange(len(ordered))
     first = int(np.argmax(counts))
@@ -179,7 +179,7 @@ def _densest(values: NDArray[np.float64]) -> float:
 
 
 def _check_recorded(shift_px: float, equal_rows_px: float) -> None:
-    """Refuse frames whose rows match as recorded and no longer after rectification: they are rectified already."""
+    """Refuse frames whose rows match before rectification but not after it: they are rectified already."""
     if abs(equal_rows_px) <= 2 * MAX_EQUAL_ROWS_PX or abs(shift_px - equal_rows_px) > MAX_EQUAL_ROWS_PX:
         return
     raise InputError(
@@ -207,7 +207,7 @@ def agreed_disparities(
 ) -> tuple[Image, NDArray[np.bool_]]:
     """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree.
 
-    each: a pool's map does pairs side by side.
+    each: a thread pool's map matches pairs in parallel.
     """
 
     def of_pair(pair: tuple[Grey, Grey]) -> tuple[Image, NDArray[np.bool_]]:

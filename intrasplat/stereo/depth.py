@@ -42,21 +42,21 @@ from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
 
-if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
+if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
 
 FinderOf = Callable[[Iterable[NDArray[np.uint8]]], Finder]
 
 STAGE = "stereo"
 COMPILATION = "compile"
-"""The stage until the GPU's kernels have run once: the first run may compile them."""
+"""The stage that is reported until the GPU's kernels have run once, because the first run may compile them."""
 DECODING_SHARE, MEASURING_SHARE = 0.2, 0.1  # of the stage's progress
 RANGE_PAIRS, ALIGNMENT_PAIRS = 7, 3
-"""Pairs, spread over the measured frames. A pair costs 10 ms for the range and 250 ms for the alignment."""
+"""Number of pairs, spread over the measured frames. A pair costs 10 ms for the range and 250 ms for the alignment."""
 WARN_OUTSIDE_SHARE = 0.1
 WARN_SURE_SHARE = 0.5
 MIN_SURE_SHARE = 0.005
-"""The share of tissue that must have sure depth: unrelated images have 0.0003 by chance."""
+"""Minimum share of tissue with sure depth: unrelated images have 0.0003 by chance."""
 
 
 def estimate_depth(
@@ -70,23 +70,23 @@ def estimate_depth(
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
     finder_of: FinderOf | None = None,
 ) -> DepthClip:
-    """Depth and confidence of every frame. How the eyes differ in turn, rows (up to 8 px) and colour is corrected.
+    """Depth (mm) and confidence of every frame, corrected for rotation, row shift (up to 8 px) and colour of the eyes.
 
-    What the eyes differ by and the disparity range are common to all frames. They are measured on measured_frames alone
-    (None: on all); for the rest, a frame's depth depends on its own pair only. So frames outside measured_frames do not
-    change the depth of others. With leave_out, those of measured_frames that show nothing new
-    (intrasplat/clip/sampling.py) get no depth. On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches
-    many pairs at once. finder_of makes what finds the instruments of a clip without masks, from some of its pictures;
-    each frame's are found by itself, before it is matched. None: `clip.tissue` is right.
+    The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
+    on all). Otherwise a frame's depth depends on its own pair only, so frames outside measured_frames do not change the
+    depth of others. With leave_out, measured frames that show nothing new (intrasplat/clip/sampling.py) get no depth.
+    On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
+    finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
+    matching. None: `clip.tissue` is used.
 
-    `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| left after the correction),
+    `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| after the correction),
     min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and
-    depth_sure_share (those with confidence SURE or more). Nothing outside depth_range_mm is searched or becomes depth.
+    depth_sure_share (those with confidence SURE or more). Depth outside depth_range_mm is neither searched nor kept.
 
     Raises:
-        ValueError: measured_frames is empty or names a frame that does not exist.
-        InputError: there is no depth, the frames are rectified already, the eyes look swapped, or their rows differ by
-            more than 8 px.
+        ValueError: measured_frames is empty or contains a frame that does not exist.
+        InputError: there is no depth, the frames are rectified already, the eyes seem to be swapped, or their rows
+            differ by more than 8 px.
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
@@ -106,7 +106,7 @@ def estimate_depth(
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
         wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
-        order = sorted(wanted, key=lambda i: i != first)  # frame `first` may be shown at once
+        order = sorted(wanted, key=lambda i: i != first)  # frame `first` is shown as soon as it has depth
         jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
         for done, (i, job) in enumerate(jobs, start=1):
             _check_stop(hooks)
@@ -149,7 +149,7 @@ def estimate_depth(
 def _receive(
     clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
-    """Left and right frames [T, H, W, 3], from one pass over the source, and the matching features of some [M, 4].
+    """Left and right frames [T, H, W, 3] from one pass over the source, and feature matches [M, 4] of frames `aligned`.
 
     Features are searched while later frames arrive.
     """
@@ -186,7 +186,7 @@ def _plan(
     depth_range_mm: tuple[float, float],
     finder: Finder | None,
 ) -> tuple[Registration, MatchPlan, float]:
-    """How the eyes differ, and the disparity range, from a few pairs spread over the measured frames; outside_share."""
+    """The registration of the eyes and the disparity range, from a few pairs of the measured frames; outside_share."""
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
     agreed: Agreed = partial(agreed_disparities, each=pool.map)
     if device == "cuda":
@@ -213,17 +213,16 @@ def _plan(
 
 
 Jobs = Iterable[tuple[int, Future[None]]]
-"""Frames, each with the job after which it is finished."""
+"""Pairs of a frame and the job that finishes it."""
 
 
 def _match_all(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor) -> Jobs:
-    """Match the pairs side by side, begun in this order."""
+    """Match the pairs in parallel, started in this order."""
     return [(i, pool.submit(work.match, i)) for i in order]
 
 
 def _match_on_device(work: FrameWork, order: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> Jobs:
-    """Match the first pair alone, then as many at once as their cost volumes fit into memory; the pool finishes each
-    frame."""
+    """Match the first pair alone, then batches whose cost volumes fit into memory; the pool finishes each frame."""
     from intrasplat.stereo.cuda import depth_of, frames_at_once
 
     clip, matched = work.clip, work.matched
@@ -268,7 +267,7 @@ def _warnings(sure_share: float) -> tuple[Notice, ...]:
 
 
 def _scale_assumption(clip: RectifiedClip) -> Notice:
-    """The assumption about the baseline: a wrong one scales every distance, and no picture shows it."""
+    """The assumption about the baseline: an error in it scales every distance and is invisible in the pictures."""
     text = f"scale: the calibration's baseline of {clip.baseline_mm:.4g} mm; every distance is as right as it is"
     return Notice.info(NoticeCode.BASELINE, text)
 

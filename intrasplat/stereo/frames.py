@@ -1,4 +1,4 @@
-"""One frame of both eyes at a time: matched, its depth moved to the right eye, dropped beside instruments.
+"""Work on one frame of both eyes: match it, transfer depth to the right eye, drop depth beside instruments.
 
 Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. depth_mm = fx baseline_mm / (d - offset).
 """
@@ -21,13 +21,13 @@ from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import Registration
 from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over
 
-if TYPE_CHECKING:  # matching itself needs no calibration, nor what reads one
+if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
 
 SURE = 128
-"""Of confidence's 255: at least so much is a depth to rely on."""
+"""Minimum confidence, of 255, of a reliable depth."""
 BESIDE_PX = 6
-"""Tissue this near to an instrument gets no depth: matching windows reach over the edge and find the instrument."""
+"""Tissue this near to an instrument gets no depth: matching windows overlap the edge and match the instrument."""
 
 
 def grey_of(rgb: NDArray[np.uint8]) -> Grey:
@@ -38,13 +38,13 @@ def grey_of(rgb: NDArray[np.uint8]) -> Grey:
 
 @dataclass(frozen=True, eq=False)
 class FrameWork:
-    """What is common to the frames of a clip, and the clip that they fill, each by itself and in any order.
+    """Data common to all frames of a clip, and the clip that they fill. Frames are independent, in any order.
 
-    matched  the clip with both eyes; its pictures are there, and each frame's depth after finish(i)
-    label    [H, W] what is painted into both eyes' pictures
-    finder   finds the instruments of a clip without masks; None: the clip's own tell
-    counts   [T, 3] pixels of tissue, those with depth, those with sure depth
-    sure     [T, 3] `seen`, `clear` and `missed` of what the finder found
+    matched  the clip with both eyes; it has all pictures, and each frame's depth after finish(i)
+    label    [H, W] labels that are painted into both eyes' pictures
+    finder   finds the instruments of a clip without masks; None: the clip has masks
+    counts   [T, 3] number of tissue pixels, of those with depth, of those with sure depth
+    sure     [T, 3] `seen`, `clear` and `missed` of each FoundMask
     """
 
     clip: RectifiedClip
@@ -72,9 +72,9 @@ class FrameWork:
         plan: MatchPlan,
         finder: Finder | None = None,
     ) -> FrameWork:
-        """Before the first frame. The right eye lies on the calibrated baseline, turned as it was measured.
+        """The work before its first frame. The right eye has the calibrated baseline and the measured rotation.
 
-        Labels are found in the measured frames alone.
+        Labels are searched in the measured frames alone.
         """
         count, shape = clip.frame_count, rgb.shape[:3]
         middle, sometime_tissue = measured[len(measured) // 2], np.zeros(shape[1:], np.bool_)
@@ -104,12 +104,12 @@ class FrameWork:
         return cls(clip, plan, registration, matched, right, label, finder)
 
     def greys(self, i: int) -> tuple[Grey, Grey]:
-        """The pair to match. The right picture has its final colours from here on."""
+        """The pair to match. Sets the final colours of the right picture."""
         self.right.rgb[i] = self.registration.recoloured(self.right.rgb[i])
         return grey_of(self.matched.rgb[i]), self.registration.rectified(grey_of(self.right.rgb[i]))
 
     def tell_tissue(self, i: int, right: Grey) -> NDArray[np.bool_]:
-        """The tissue [H, W] of a frame's left eye, in the matched clip from here on. right: of greys(i)."""
+        """The tissue [H, W] of a frame's left eye, which is also stored in the matched clip. right: of greys(i)."""
         tissue: NDArray[np.bool_] = self.matched.tissue[i]
         if self.matched.tissue is not self.clip.tissue:
             tissue[:] = self.clip.tissue[i]
@@ -132,7 +132,7 @@ class FrameWork:
         self.finish(i)
 
     def finish(self, i: int) -> None:
-        """Move a frame's depth to the right eye; drop it beside instruments; count."""
+        """Transfer a frame's depth to the right eye, drop it beside instruments, and count pixels."""
         left, right, registration = self.matched, self.right, self.registration
         focal_baseline, offset_px = self.clip.intrinsics.fx * self.clip.baseline_mm, self.clip.disparity_offset_px
         moved_mm, moved_trust = moved_depth(left.depth_mm[i], left.depth_confidence[i], focal_baseline, offset_px)
@@ -155,7 +155,7 @@ def to_depth(
     focal_baseline: float,
     depth_range_mm: tuple[float, float],
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm and confidence [H, W]; both are 0 at invalid pixels."""
+    """Depth focal_baseline / beyond_infinity_px in mm, and confidence [H, W]; both are 0 at invalid pixels."""
     nearest_mm, farthest_mm = depth_range_mm
     valid = confidence >= MIN_CONFIDENCE
     valid &= (beyond_infinity_px >= focal_baseline / farthest_mm) & (beyond_infinity_px <= focal_baseline / nearest_mm)
@@ -166,7 +166,7 @@ def to_depth(
 def drop_beside_instruments(
     tissue: NDArray[np.bool_], depth_mm: NDArray[np.float32], confidence: NDArray[np.uint8]
 ) -> None:
-    """Set depth and confidence [H, W] of the tissue within BESIDE_PX of what is not tissue to 0, in place."""
+    """Set depth and confidence [H, W] to 0, in place, on tissue within BESIDE_PX of other pixels."""
     side = 2 * BESIDE_PX + 1
     if not tissue.all():
         beside = tissue & (cv2.dilate((~tissue).astype(np.uint8), np.ones((side, side), np.uint8)) > 0)

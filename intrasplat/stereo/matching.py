@@ -2,10 +2,10 @@
 
 Symbols: H W pixels of one eye; d disparity, x_left - x_right in px of the full image; h w pixels the matcher works on.
 
-Semi-global matching (Hirschmueller 2008; OpenCV's form with five paths) runs on half the resolution or less, where it
-costs an eighth, on pictures of even contrast. An edge-aware weighted-least-squares filter (Min et al. 2014,
-cv2.ximgproc) smooths what both eyes agree on and fills the rest. One Lucas-Kanade step along the row at full resolution
-then restores the sub-pixel part that the reduction lost (docs/decisions/stereo-depth.md has figures).
+Semi-global matching (Hirschmueller 2008; OpenCV's form with five paths) runs at half the resolution or less, where it
+costs an eighth, on contrast-normalised pictures. An edge-aware weighted-least-squares filter (Min et al. 2014,
+cv2.ximgproc) smooths disparities on which both eyes agree and fills the rest. One Lucas-Kanade step along the row at
+full resolution then restores the sub-pixel part that the reduction lost (docs/decisions/stereo-depth.md has figures).
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 Grey = NDArray[np.uint8]  # [H, W]
 Image = NDArray[np.float32]  # [H, W]
 
-MATCHING_WIDTH = 480  # px; wider images are matched smaller by a whole factor: 2 for 640, 3 for 1280
+MATCHING_WIDTH = 480  # px; wider images are reduced by a whole factor: 2 for 640, 3 for 1280
 BLOCK_PX = 5
-SPARE_STEPS = 1.5  # of the range's margin, dropped if they would cost sixteen more disparities
-DISPARITY_STEPS = 16  # a px: the unit of OpenCV's matchers
+SPARE_STEPS = 1.5  # this much of the range's margin is dropped if it would cost sixteen more disparities
+DISPARITY_STEPS = 16  # per px: the unit of OpenCV's matchers
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8, 64  # SGBM's P1, P2 per block pixel
 PREFILTER_CAP = 127
-AGREEMENT_PX = 1  # of the reduced image: by more the disparities of both eyes contradict each other
+AGREEMENT_PX = 1  # of the reduced image: largest difference between the disparities of both directions
 CONTRAST_PX, CONTRAST, NOISE = 11, 25.0, 5.0
-"""Even contrast: grey levels less their mean over the window, times CONTRAST over (their deviation there + NOISE)."""
+"""Contrast normalisation: (level - window mean) * CONTRAST / (window standard deviation + NOISE)."""
 ROUGHNESS_PX, ROUGHNESS_PER_PX2 = 5, 0.256
-"""Side of the window, and how much trust a variance of the disparity of 1 px^2 within it costs: jumps are not sharp."""
-ENDS_PX = 1.0  # so near the ends of the range a match may lie beyond them
-EVIDENCE_PX, EVIDENCE_TEXTURE = 7, 3.0  # window, and mean squared gradient (grey levels) of half the trust
-BESIDE_INSTRUMENTS_PX = 3  # of the reduced image: matching windows reach over the edge and find the instrument
-SURE_TRUST, SURFACE_PERCENTILE = 0.3, 25  # of the matches that tell the disparity of tissue behind instruments
+"""Side of the window, and the trust lost per px^2 of disparity variance in it: matches near depth edges are blurred."""
+ENDS_PX = 1.0  # a match this near an end of the range may be a point beyond it
+EVIDENCE_PX, EVIDENCE_TEXTURE = 7, 3.0  # window, and mean squared gradient (grey levels) that gives half the trust
+BESIDE_INSTRUMENTS_PX = 3  # of the reduced image: matching windows overlap the edge and match the instrument
+SURE_TRUST, SURFACE_PERCENTILE = 0.3, 25  # matches and percentile that give the tissue's disparity near instruments
 SATURATED_TRUST = 0.02  # highlights move with the eye: a match there may not be the surface
-SMOOTHNESS, COLOUR_SIGMA = 10.0, 10.0  # of the edge-aware filter
-MIN_WEIGHT = 1e-12  # where the filter finds no match far around
-REFERENCE_WIDTH = 640  # px at which windows and gradients are stated: wider images have wider, flatter edges
+SMOOTHNESS, COLOUR_SIGMA = 10.0, 10.0  # parameters of the edge-aware filter
+MIN_WEIGHT = 1e-12  # below it, no trusted match is within the filter's reach
+REFERENCE_WIDTH = 640  # px; windows and gradients refer to this width: wider images have wider, flatter edges
 REFINE_WINDOW_PX, HIGH_PASS_PX = 11, 15
 REFINE_DAMPING = 20.0  # grey levels squared: below this mean squared gradient the matcher's own value wins
-MAX_REFINEMENT_PX = 1.0  # beyond it the linearisation of one step does not hold
-BLACK_LEVEL, BLACK_PX = 10, 5  # where the mean over the window is black, nothing is seen
+MAX_REFINEMENT_PX = 1.0  # beyond it the linearisation of one step is invalid
+BLACK_LEVEL, BLACK_PX = 10, 5  # no confidence where the mean over the window is at most this level
 SATURATED_LEVEL = 250
-MAX_DEVIATION_PX, UNKNOWN_DEVIATION_PX = 3.0, 1.0  # the latter where the eyes disagree
+MAX_DEVIATION_PX, UNKNOWN_DEVIATION_PX = 3.0, 1.0  # the latter where the matching directions disagree
 DOUBT_AT_LEAST_PX, DOUBT_BY_DEVIATION = 0.03, 0.37
 EVIDENCE_AT_LEAST, DOUBT_BY_EVIDENCE = 0.1, 0.3
 NOISE_AT_LEAST = 0.02
-"""The expected error: powers of deviation (px of the reduced image), of evidence, and noise over gradient; fitted."""
+"""Fitted model of the expected error: offset and power of deviation (reduced px) and of evidence; offset of noise."""
 ERROR, ERROR_PX = 1.0, 0.5
-"""Of the expected error: its measured factor, and how large it is where confidence is a half."""
-TEXTURE_FOR_TRUST = 1.0  # mean squared gradient (grey levels squared) below which a match is no more than smooth
-UNSURE_TRUST = 0.25  # where highlights hide the surface or one eye does not see it
+"""Measured factor of the expected error; expected error at which confidence is a half."""
+TEXTURE_FOR_TRUST = 1.0  # below this mean squared gradient (grey levels squared) confidence falls: nothing to match
+UNSURE_TRUST = 0.25  # factor on confidence where highlights hide the surface or one eye does not see it
 MIN_CONFIDENCE = 12  # of 255: below it a depth is a guess
 
 
@@ -61,7 +61,7 @@ MIN_CONFIDENCE = 12  # of 255: below it a depth is a guess
 class MatchPlan:
     """The disparities to search, common to all frames of a clip.
 
-    min_disparity_px <= d < max_disparity_px. Nothing outside depth_range_mm becomes depth.
+    min_disparity_px <= d < max_disparity_px. Depth outside depth_range_mm is dropped.
     """
 
     min_disparity_px: float
@@ -72,10 +72,10 @@ class MatchPlan:
 def match(
     left: Grey, right: Grey, plan: MatchPlan, tissue: NDArray[np.bool_] | None = None
 ) -> tuple[Image, NDArray[np.uint8]]:
-    """Disparity [H, W] float32 in px and confidence [H, W] uint8 of one pair on equal rows, in the left eye's pixels.
+    """Disparity [H, W] float32 in px and confidence [H, W] uint8 of one rectified pair, in the left eye's pixels.
 
-    Confidence falls with the error that is expected (ERROR_PX); 0: the picture is black or the match is a guess. What
-    cannot be matched, as it is flat, burnt out or seen by one eye alone, is filled from around at low confidence.
+    Confidence falls with the expected error (ERROR_PX); 0: the picture is black or the match is a guess. Pixels that
+    are flat, saturated or visible to one eye alone are filled from their surroundings at low confidence.
 
     tissue [H, W]: of the left eye; the rest is instruments. Neither is filled from the other. None: all is tissue.
     """
@@ -108,11 +108,11 @@ def match(
 
 
 def semi_global(left: Grey, right: Grey, low: int, count: int) -> tuple[Image, NDArray[np.bool_]]:
-    """Disparity [h, w], low <= d < low + count, and where both directions agree. count is a multiple of 16.
+    """Disparity [h, w], low <= d < low + count, and where both matching directions agree. count is a multiple of 16.
 
-    Disparities where they do not agree are below low.
+    Where they disagree, the disparity is below low.
     """
-    before, after = max(low + count, 0), max(-low, 0)  # so that the matcher keeps the margins
+    before, after = max(low + count, 0), max(-low, 0)  # padding, so that the matcher covers the image's margins
     wide = [
         cv2.copyMakeBorder(_even_contrast(image), 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)
     ]
@@ -132,7 +132,7 @@ def semi_global(left: Grey, right: Grey, low: int, count: int) -> tuple[Image, N
 
 
 def _even_contrast(image: Grey) -> Grey:
-    """Grey levels less their surroundings' mean, by their deviation: shows dark tissue, and no fall-off of light."""
+    """Contrast-normalised picture: shows dark tissue and removes the fall-off of illumination."""
     values = image.astype(np.float32)
     mean = _mean(values, CONTRAST_PX)
     deviation = cv2.sqrt(np.maximum(_mean(values * values, CONTRAST_PX) - mean * mean, 0))
@@ -141,7 +141,7 @@ def _even_contrast(image: Grey) -> Grey:
 
 
 def evidence(found: Image, agreed: NDArray[np.bool_], image: Grey) -> Image:
-    """[h, w] in [0, 1]: how much a match counts when others are filled from it."""
+    """Weight [h, w] in [0, 1] of each match when pixels are filled from it."""
     counted = agreed.astype(np.float32)
     number = np.maximum(_mean(counted, ROUGHNESS_PX), 1e-6)
     mean = _mean(found * counted, ROUGHNESS_PX) / number
@@ -152,14 +152,14 @@ def evidence(found: Image, agreed: NDArray[np.bool_], image: Grey) -> Image:
     trust: Image = counted * np.clip(1 - ROUGHNESS_PER_PX2 * variance, 0, 1) * (texture / (texture + EVIDENCE_TEXTURE))
     burnt_out = cv2.dilate((image >= SATURATED_LEVEL).astype(np.uint8), np.ones((3, 3), np.uint8))
     trust[burnt_out > 0] *= SATURATED_TRUST
-    trust[(image <= BLACK_LEVEL) | (found > np.arange(found.shape[1]))] = 0  # the right eye does not see the latter
+    trust[(image <= BLACK_LEVEL) | (found > np.arange(found.shape[1]))] = 0  # the latter lie outside the right picture
     return trust
 
 
 def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[h, w] pixels at which a match may be an instrument's: near one, or hidden by it from the right eye.
+    """Pixels [h, w] whose match may be an instrument's: near one, or occluded by one in the right eye.
 
-    An instrument of disparity D hides from the right eye a strip of D - d to its left, d being that of the tissue.
+    An instrument of disparity D occludes, for the right eye, a strip D - d wide to its left; d is the tissue's.
     """
     side = 2 * BESIDE_INSTRUMENTS_PX + 1
     beside = np.asarray(cv2.dilate(instrument.view(np.uint8), np.ones((side, side), np.uint8)), np.bool_)
@@ -176,22 +176,22 @@ def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]
 
 
 def _smoothed(found: Image, trust: Image, image: Grey) -> Image:
-    """The trusted disparities' mean along paths without edges of the image; it reaches every pixel."""
-    guide = np.rint(np.sqrt(255 * image.astype(np.float32))).astype(np.uint8)  # noise is as strong in dark and light
+    """Edge-aware weighted mean of the trusted disparities; it fills every pixel."""
+    guide = np.rint(np.sqrt(255 * image.astype(np.float32))).astype(np.uint8)  # the root makes shot noise even
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, SMOOTHNESS, COLOUR_SIGMA)
     weighted, weight = smoother.filter(found * trust), smoother.filter(trust)
     return np.where(weight > MIN_WEIGHT, weighted / np.maximum(weight, MIN_WEIGHT), found)
 
 
 def doubt_of(deviation: Image, evidence: Image) -> Image:
-    """The part of the expected error that the reduced images tell: how far matches lie from the smooth surface."""
+    """The expected error's part from the reduced images: deviation from the smooth surface, over evidence."""
     by_deviation = cv2.pow(deviation + np.float32(DOUBT_AT_LEAST_PX), DOUBT_BY_DEVIATION)
     doubt: Image = by_deviation / cv2.pow(evidence + np.float32(EVIDENCE_AT_LEAST), DOUBT_BY_EVIDENCE)
     return doubt
 
 
 def confidence_of(doubt: Image, texture: Image, residual: Image) -> Image:
-    """[H, W] in [0, 255] of the expected error in px: doubt times a Lucas-Kanade step's, by its window's noise."""
+    """Confidence [H, W] in [0, 255] for the expected error in px: doubt times the root of the window's noise."""
     noise = residual / cv2.sqrt(texture + 1) + np.float32(NOISE_AT_LEAST)
     expected_px: Image = np.float32(ERROR) * doubt * cv2.sqrt(noise)
     confidence = 255 / (1 + (expected_px / np.float32(ERROR_PX)) ** 2)
@@ -219,8 +219,8 @@ def _resized(image: Grey, size: tuple[int, int]) -> Grey:
 def _refine(disparity: Image, left: Grey, right: Grey) -> tuple[Image, Image, Image]:
     """One Lucas-Kanade step in x: d, texture (mean squared gradient) and residual (mean |difference|), all [H, W].
 
-    With R(x - d) the right image warped onto the left one L, minimise sum over the window of (R(x - d) - dd R' - L)^2:
-    dd = sum(R' (R - L)) / sum(R'^2). Both images lose their local mean first, as the eyes differ in exposure.
+    R(x - d) is the right image warped onto the left image L. Minimise the window's sum of (R(x - d) - dd R' - L)^2:
+    dd = sum(R' (R - L)) / sum(R'^2). The local means are subtracted first, because the eyes differ in exposure.
     """
     height, width = left.shape
     x = np.arange(width, dtype=np.float32) - disparity

@@ -1,4 +1,4 @@
-"""How near everything in a frame is, in a small picture: enough to tell instruments from the tissue behind them.
+"""Nearness of a frame at low resolution: enough to separate instruments from the tissue behind them.
 
 Symbols: h w pixels of the small picture; nearness: disparity beyond infinity in its pixels.
 """
@@ -16,7 +16,7 @@ from intrasplat.stereo.matching import Grey, Image, MatchPlan, evidence, semi_gl
 
 
 def nearness(coarse: NDArray[np.uint8], right: Grey, plan: MatchPlan, offset_px: float) -> Image:
-    """Nearness [h, w] of a small left picture [h, w, 3], with the right one's full picture [H, W] on equal rows.
+    """Nearness [h, w] for a small left picture [h, w, 3] and the rectified right picture [H, W] at full size.
 
     offset_px: the disparity at infinity, in pixels of the full picture.
     """

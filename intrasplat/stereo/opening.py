@@ -24,14 +24,14 @@ from intrasplat.report import Masks
 from intrasplat.stereo.depth import estimate_depth
 
 TRIES = 3
-"""Of a clip whose decoding process is killed from outside."""
+"""How often a clip is tried whose decoding process is killed from outside."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ClipPaths:
-    """The files of one clip (intrasplat/clip/opening.py); clip may be of both eyes."""
+    """The files of one clip (intrasplat/clip/opening.py); `clip` may contain both eyes."""
 
     clip: Path
     right: Path | None = None
@@ -50,19 +50,19 @@ def open_with_depth(
     before_matching: Callable[[], None] = ignore,
     segmenter: Path | None = None,
 ) -> DepthClip:
-    """Decode, and for stereo input rectify and match: the left frames with depth, and the right ones.
+    """The decoded clip with depth; stereo input is rectified and matched, and keeps its right eye.
 
     timings get decode_s, until the size of a stereo clip is known, and stereo_s, which includes decoding its frames.
 
-    Without masks instruments are found (intrasplat/instruments) by the segmenter, an ONNX file, if there is one, else
-    if options.mask_source is auto.
+    Without masks, instruments are found (intrasplat/instruments) if there is a segmenter, an ONNX file, or if
+    options.mask_source is auto.
 
-    When something outside kills the decoding process, it is tried again, TRIES times in all.
+    If something outside kills the decoding process, it is restarted, TRIES attempts in all.
 
     Raises:
         InputError: the clip, its calibration, its masks or the holdout cannot be used.
-        UnavailableError: the disk is full; or before_matching raised it; or the segmenter cannot be used; or the
-            decoding process was killed every time.
+        UnavailableError: the disk is full, before_matching raised it, the segmenter cannot be used, or the decoding
+            process was killed every time.
         Cancelled: hooks.should_stop said so.
     """
 
@@ -127,7 +127,7 @@ def match_eyes(
     mask_source: MaskSource = "given",
     segmenter: Path | None = None,
 ) -> DepthClip:
-    """Rectify a stereo clip and match its eyes, as open_with_depth does."""
+    """The clip with depth from a decoded stereo clip: rectified and matched as by open_with_depth."""
     finds = clip.tissue is None and _finds(mask_source, segmenter)
     network = load_segmenter(segmenter) if finds and segmenter is not None else None
     rectified = rectify(clip, calibration)
@@ -148,5 +148,5 @@ def match_eyes(
 
 
 def _finds(mask_source: MaskSource, segmenter: Path | None) -> bool:
-    """Whether instruments of a clip without masks are to be found."""
+    """Whether to find instruments in a clip without masks."""
     return mask_source == "auto" or (mask_source == "given" and segmenter is not None)

@@ -1,8 +1,8 @@
-"""How the right eye really stands and what colours it gives, measured against the left one.
+"""Rotation, zoom and colours of the right eye relative to its calibration, measured against the left eye.
 
-A calibration is never exact. A right eye that is turned or enlarged a little shows points on other rows than the left
-one; across the rows such an error looks like depth, and stays there. What the eyes' colours differ by is a gain and an
-offset by channel.
+A calibration is never exact. A small rotation or zoom of the right eye shifts points to other rows, which is measured
+and corrected. Its effect along the rows looks like depth and cannot be corrected. The colours of the eyes differ by a
+gain and an offset per channel.
 
 Symbols: H W pixels of one eye; M matches; x y = normalised coordinates in the right eye; dy = rows by which a point
 lies lower in the recorded right picture than in the rectified one, px.
@@ -27,33 +27,33 @@ from intrasplat.stereo.matching import SATURATED_LEVEL, Image, MatchPlan, match
 from intrasplat.stereo.turn import AnyImage, EyeRotation, Rgb
 
 USUAL_TURN_RAD = 0.01
-"""Deviation of a turn or zoom that is expected before anything is measured: holds back what matches hardly tell."""
+"""Prior standard deviation of a rotation or zoom: limits parameters that the matches hardly determine."""
 COARSE_WITHIN_PX = (6.0, 6.0, 6.0, 3.0, 3.0, 3.0, 3.0)
-"""Step by step, matches off the row by more are wrong."""
+"""For each step, the row error beyond which a match counts as wrong."""
 MIN_TURN_MATCHES = 150
-"""Fewer, such as flat tissue has, tell no more than the rows' shift: many of them are wrong alike."""
+"""With fewer matches, as on flat tissue, only the row shift is estimated: many of them share the same error."""
 FINE_STEPS, COLOUR_STEPS = 3, 6
 MAX_FINE_PX = 1.0
-"""Of pictures as wide as features are searched in. The fine measurement linearises pictures: where it differs from the
-coarse one by more, it is not to be trusted."""
-SURE = 128  # of 255: the least confidence of a match that counts
+"""At FEATURE_WIDTH. The fine measurement, which linearises pictures, is rejected if it differs by more from the coarse
+one."""
+SURE = 128  # of 255: minimum confidence of a match that counts
 BORDER_PX, HIGH_PASS_PX, COLOUR_PX, HIGHLIGHT_PX = 8, 15, 5, 9
-MIN_SAMPLE = 500  # pixels that tell something
+MIN_SAMPLE = 500  # minimum number of usable pixels
 CENTRAL_SHARE = 0.7  # of the picture's half width and height
-BRIGHTEST = 240  # levels; beyond them colours are cut off
-MIN_GAIN = 0.5  # of a channel, or one over it: less is no camera's setting
-MIN_COLOUR_LEVELS = 5.0  # of 255: eyes that differ by less keep their colours; highlights feign as much
+BRIGHTEST = 240  # levels; above, colours may be clipped
+MIN_GAIN = 0.5  # of a channel; at most 1 / MIN_GAIN: no camera setting is beyond
+MIN_COLOUR_LEVELS = 5.0  # of 255: smaller differences are not corrected; highlights alone can cause as much
 WARN_MOVED_PX, WARN_COLOUR_LEVELS = 0.5, 8.0
 MAX_RESIDUAL_PX, MIN_CORRELATION = 0.25, 0.965
-"""Of pictures as wide as features are searched in; sound recordings have 0.06 to 0.20 px, and 0.98 or more."""
+"""The first at FEATURE_WIDTH. Sound recordings have 0.06 to 0.20 px, and 0.98 or more."""
 
 
 @dataclass(frozen=True)
 class Colours:
-    """The right eye's colour = gain * the left eye's + offset, by channel R, G, B; offset in levels of 255.
+    """The right eye's colour = gain * the left eye's + offset, per channel R, G, B; offset in levels of 255.
 
-    correlation is that of the eyes' colours where they match, the least of three channels; None: too little matches;
-    0 where what matches is burnt out.
+    correlation is the lowest of three channels, over matching pixels. None: too few match; 0: the matching pixels are
+    saturated.
     """
 
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -69,19 +69,19 @@ class Colours:
 
     @property
     def largest_levels(self) -> float:
-        """The largest difference that a colour between a quarter and three quarters of white has."""
+        """The largest colour difference, in levels, for colours between a quarter and three quarters of white."""
         levels = np.array([[64.0], [192.0]])
         return float(np.abs((np.array(self.gain) - 1) * levels + np.array(self.offset)).max())
 
 
 @dataclass(frozen=True)
 class Registration:
-    """What the right eye differs by.
+    """How the right eye differs from its calibration.
 
-    calibrated   its camera as calibrated, to which `turn` comes
-    baseline_mm  how far it lies to the right of the left eye
-    matches      features that the eyes' rows were measured by
-    residual_px  median |dy| of matching features that is left
+    calibrated   its camera as calibrated, without `turn`
+    baseline_mm  distance from the left eye
+    matches      number of feature matches in the measurement of rows
+    residual_px  median |dy| of matching features after the correction
     """
 
     calibrated: Intrinsics
@@ -95,7 +95,7 @@ class Registration:
     def of_matches(
         cls, matches: NDArray[np.float64], shift: RowShift, calibrated: Intrinsics, baseline_mm: float
     ) -> Registration:
-        """The coarse turn, from features [M, 4]; none where measure_row_shift found too few."""
+        """The coarse rotation, from feature matches [M, 4]; none where measure_row_shift found too few."""
         if shift.matches == 0:
             return cls(calibrated, baseline_mm)
         turn = EyeRotation(shift.shift_px)
@@ -104,9 +104,9 @@ class Registration:
         return cls(calibrated, baseline_mm, turn, Colours(), shift.matches, _residual_px(matches, turn, calibrated))
 
     def refined(self, pairs: Sequence[MatchedPair], matches: NDArray[np.float64], each: Map = map) -> Registration:
-        """The finer turn, and the colours, from pairs that were rectified by this one.
+        """The refined rotation, and the colours, from pairs that this registration rectified.
 
-        each: a pool's map does pairs side by side.
+        each: a thread pool's map processes pairs in parallel.
         """
         turn = self.turn
         if self.matches >= MIN_TURN_MATCHES:
@@ -121,39 +121,39 @@ class Registration:
 
     @property
     def left_from_right(self) -> NDArray[np.float64]:
-        """[4, 4] the right eye's pose in the left one's camera axes, mm."""
+        """The right eye's pose [4, 4] in the left eye's camera axes, mm."""
         pose = np.eye(4)
         pose[:3, :3], pose[0, 3] = self.turn.rotation, self.baseline_mm
         return pose
 
     def rectified(self, image: Rgb) -> Rgb:
-        """The recorded right picture as the calibrated eye would show it (Turn.rectified)."""
+        """The recorded right picture as the calibrated eye would show it (EyeRotation.rectified)."""
         return self.turn.rectified(image, self.calibrated)
 
     def recorded(self, image: AnyImage) -> AnyImage:
-        """What belongs to the calibrated eye's pixels, at the recorded picture's (Turn.recorded)."""
+        """An image in the calibrated eye's pixels, resampled to the recorded picture's (EyeRotation.recorded)."""
         return self.turn.recorded(image, self.calibrated)
 
     def recorded_depth(self, depth_mm: Image) -> Image:
-        """Depth [H, W] at the calibrated eye's pixels becomes the depth that the turned eye has, at its own pixels."""
+        """Depth [H, W] mm of the calibrated eye, converted to the rotated eye: its axes, its pixels."""
         factor = self.turn.depth_factor(self.calibrated)
         return self.recorded(depth_mm * factor)
 
     @property
     def recolours(self) -> bool:
-        """Whether the right eye's colours differ by enough to be corrected, and by no more than a camera's can."""
+        """Whether the colour difference is large enough to correct, and small enough to be a camera's setting."""
         colours = self.colours
         is_line = colours.correlation is not None and colours.correlation >= MIN_CORRELATION
         is_usual = all(MIN_GAIN <= gain <= 1 / MIN_GAIN for gain in colours.gain)
         return is_line and is_usual and colours.largest_levels >= MIN_COLOUR_LEVELS
 
     def recoloured(self, right: Rgb) -> Rgb:
-        """The right picture [H, W, 3] in the left eye's colours; as it is where they hardly differ."""
+        """The right picture [H, W, 3] in the left eye's colours; unchanged if they hardly differ."""
         return self.colours.corrected(right) if self.recolours else right
 
     @property
     def told(self) -> RightEye:
-        """The same, for the report."""
+        """The report's entry on the right eye."""
         turn, camera, colours = self.turn, self.camera, self.colours if self.recolours else Colours()
         return RightEye(
             moved_px=turn.moved_px(self.calibrated),
@@ -176,7 +176,7 @@ class Registration:
 
     @property
     def notices(self) -> tuple[Notice, ...]:
-        """What to distrust."""
+        """Warnings about calibration and colours."""
         found, moved_px = [], self.turn.moved_px(self.calibrated)
         if self.matches == 0:
             text = (
@@ -206,7 +206,7 @@ class Registration:
         return (*found, *self._disagreement())
 
     def _disagreement(self) -> tuple[Notice, ...]:
-        """What no turn and no colours correct."""
+        """Warnings about differences that neither rotation nor colours correct."""
         found, correlation = [], self.colours.correlation
         if self.residual_px > MAX_RESIDUAL_PX * max(self.calibrated.width / FEATURE_WIDTH, 1.0):
             found.append(
@@ -223,7 +223,7 @@ class Registration:
 
 
 def turn_of_matches(matches: NDArray[np.float64], lower_px: float, camera: Intrinsics) -> EyeRotation:
-    """The turn that puts matches [M, 4] (x_left, y_left, x_right, y_right) on equal rows, from a start for lower_px."""
+    """The rotation that puts matches [M, 4] on equal rows (as of match_features); lower_px: the initial row shift."""
     numbers = np.array([lower_px, 0.0, 0.0, 0.0, 0.0])
     for within_px in COARSE_WITHIN_PX:
         x, y = _rectified_places(matches, EyeRotation(*numbers.tolist()), camera).T
@@ -236,8 +236,8 @@ def turn_of_matches(matches: NDArray[np.float64], lower_px: float, camera: Intri
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """A left picture and the rectified right one, both [H, W, 3]; x [H, W] is where the right eye sees the left one's
-    pixels. sure [H, W] says which of them count."""
+    """A left picture and the rectified right one, both [H, W, 3]; x [H, W] is the column of each left pixel in the
+    right picture; sure [H, W] marks the matches that count."""
 
     left: Rgb
     right: Rgb
@@ -246,7 +246,7 @@ class MatchedPair:
 
     @classmethod
     def of(cls, left: Rgb, right: Rgb, tissue: NDArray[np.bool_], plan: MatchPlan) -> MatchedPair:
-        """Match the pair; tissue [H, W] is the left eye's."""
+        """The pair with its matches; tissue [H, W] is the left eye's."""
         greys = [cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY) for eye in (left, right)]
         disparity, confidence = match(greys[0], greys[1], plan, tissue)
         height, width = disparity.shape
@@ -256,7 +256,7 @@ class MatchedPair:
         return cls(left, right, x, sure)
 
     def right_as_left(self, image: NDArray[np.float32], lower_px: Image | float = 0.0) -> NDArray[np.float32]:
-        """An image of the right eye, by the left eye's pixels, from rows that lie lower_px lower."""
+        """An image of the right eye warped to the left eye's pixels, read lower_px rows lower."""
         rows = np.arange(len(self.x), dtype=np.float32)[:, None] + np.zeros_like(self.x) + np.float32(lower_px)
         moved = cv2.remap(image, self.x, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.float32)
@@ -265,9 +265,9 @@ class MatchedPair:
 def turn_of_pictures(
     pairs: Sequence[MatchedPair], turn: EyeRotation, camera: Intrinsics, each: Map = map
 ) -> EyeRotation:
-    """A finer turn, from pairs that were rectified by `turn`: after matching along rows only rows are left to fit.
+    """A refined rotation, from pairs that `turn` rectified: they are matched along rows, so the row error remains.
 
-    One step of Gauss and Newton is repeated FINE_STEPS times on pictures without their coarse brightness.
+    FINE_STEPS Gauss-Newton steps on high-pass filtered pictures.
     """
     numbers = np.zeros(len(astuple(turn)))
     details = list(each(partial(_RowDetail.of, camera=camera), pairs))
@@ -283,7 +283,7 @@ def turn_of_pictures(
 
 
 def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
-    """The eyes' gain and offset where they match, without highlights; none where too little matches."""
+    """Gain and offset between the eyes over matching pixels, without highlights; identity if too few match."""
     found = each(_colour_samples, pairs)
     left, right = (np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True))
     if len(left) < MIN_SAMPLE:
@@ -295,20 +295,20 @@ def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
 
 
 def _rectified_places(matches: NDArray[np.float64], turn: EyeRotation, camera: Intrinsics) -> NDArray[np.float64]:
-    """[M, 2] x, y of the right eye's features in the rectified picture."""
+    """Positions [M, 2] (x, y) of the right eye's features in the rectified picture."""
     places = cv2.perspectiveTransform(matches[:, None, 2:] - 0.5, np.linalg.inv(turn.from_rectified(camera)))
     return np.asarray(places[:, 0] + 0.5, np.float64)
 
 
 def _residual_px(matches: NDArray[np.float64], turn: EyeRotation, camera: Intrinsics) -> float:
-    """Median |dy| of the matches [M, 4] near their rows."""
+    """Median |dy| of the matches [M, 4], without outliers."""
     off_px = np.abs(_rectified_places(matches, turn, camera)[:, 1] - matches[:, 1])
     near = off_px[off_px < COARSE_WITHIN_PX[-1]]
     return float(np.median(near)) if near.size else 0.0
 
 
 def _slopes(x: NDArray[np.floating], y: NDArray[np.floating], camera: Intrinsics) -> NDArray[np.floating]:
-    """[5, M] of dy by a Turn's numbers, where they are small; x, y [M] in the picture."""
+    """Derivatives [5, M] of dy by an EyeRotation's numbers near 0; x, y [M] in the picture."""
     across, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
     turns = np.stack([down * down, -across * down, -across, down])
     return np.concatenate([np.ones_like(turns[:1]), camera.fy * turns])
@@ -317,7 +317,7 @@ def _slopes(x: NDArray[np.floating], y: NDArray[np.floating], camera: Intrinsics
 def _step(
     slopes: NDArray[np.floating], missing: NDArray[np.floating], numbers: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What to add to the numbers so that slopes [5, M] explain `missing` [M]; outliers count little."""
+    """Robust Gauss-Newton step of the numbers for derivatives `slopes` [5, M] and residuals `missing` [M]."""
     scale = 1.48 * float(np.median(np.abs(missing))) + 1e-6
     weighted = slopes * (1 / (scale**2 + missing**2))
     prior = np.array([0.0, *[USUAL_TURN_RAD**-2] * 4])
@@ -327,8 +327,8 @@ def _step(
 
 @dataclass(frozen=True, eq=False)
 class _RowDetail:
-    """A matched pair as its rows are compared: grey levels [H, W] of the left eye and of the recorded right one, and
-    slopes [5, H, W] of the right picture's rows by a Turn's numbers."""
+    """A matched pair for comparing rows: grey levels [H, W] of the left picture and of the right one, and derivatives
+    [5, H, W] of the right picture's rows by an EyeRotation's numbers."""
 
     pair: MatchedPair
     left: Image
@@ -343,7 +343,7 @@ class _RowDetail:
         return cls(pair, left, _detail(left), right, _slopes(pair.x + 0.5, y + 0.5, camera).astype(np.float32))
 
     def errors(self, numbers: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Slopes [5, M] of the right picture's levels by the numbers, and what the levels lack [M], where sure."""
+        """Derivatives [5, M] of the right picture's levels by the numbers, and residuals [M], at sure pixels."""
         lower_px = np.tensordot(numbers.astype(np.float32), self.slopes, 1)
         seen = self.pair.right_as_left(self.right, lower_px)
         brightest = cv2.dilate(np.maximum(self.left, seen), np.ones((3, 3), np.uint8))
@@ -355,13 +355,13 @@ class _RowDetail:
 
 
 def _detail(levels: Image) -> Image:
-    """A picture [H, W] without its coarse brightness."""
+    """A high-pass filtered picture [H, W]."""
     detail: Image = levels - cv2.blur(levels, (HIGH_PASS_PX,) * 2)
     return detail
 
 
 def _colour_samples(pair: MatchedPair) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colours [M, 3] of left and right where they match and neither is cut off, each the mean over a small window."""
+    """Colours [M, 3] of left and right at matching, unclipped pixels, each the mean over a small window."""
     left, right = pair.left.astype(np.float32), pair.right_as_left(pair.right.astype(np.float32))
     brightest = np.maximum(left, right).max(axis=2)
     lit = cv2.dilate((brightest > BRIGHTEST).astype(np.uint8), np.ones((HIGHLIGHT_PX, HIGHLIGHT_PX), np.uint8)) > 0
@@ -371,7 +371,7 @@ def _colour_samples(pair: MatchedPair) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def _central(x_right: Image) -> NDArray[np.bool_]:
-    """Pixels [H, W] that lie in the middle of both pictures: a lens darkens its border, which is elsewhere in each."""
+    """Pixels [H, W] in the middle of both pictures: vignetting affects different pixels of each eye."""
     height, width = x_right.shape
     down = (2 * np.arange(height)[:, None] / height - 1) ** 2
     return np.asarray(
@@ -380,7 +380,7 @@ def _central(x_right: Image) -> NDArray[np.bool_]:
 
 
 def _line(left: NDArray[np.float64], right: NDArray[np.float64]) -> tuple[float, float, float]:
-    """gain, offset and correlation of one channel [M]: the line whose errors are equal on both sides, robustly."""
+    """Gain, offset and correlation of one channel [M], by a robust line fit that treats both eyes alike."""
     weight, gain, offset = np.ones_like(left), 1.0, 0.0
     correlation = float(np.corrcoef(left, right)[0, 1]) if left.std() > 0 and right.std() > 0 else 0.0
     for _ in range(COLOUR_STEPS):

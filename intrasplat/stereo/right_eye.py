@@ -1,7 +1,7 @@
-"""The right eye of a matched clip: the left eye's depth and masks, moved to where the right eye sees them.
+"""Depth and masks of the right eye of a matched clip, warped from the left eye.
 
-Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. A rectified pair has one depth on both
-sides of a match, so the right eye needs no search of its own. What the left eye does not see has no depth here.
+Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. Both pixels of a rectified match have the
+same depth, so the right eye needs no search of its own. Surfaces that the left eye does not see get no depth.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ Mask = NDArray[np.bool_]
 Number = TypeVar("Number", bound=np.generic)
 
 SMOOTHED_PX = 3
-"""Side of the median that closes the cracks of a stretched surface and removes what shows through them."""
+"""Side of the median filter that closes cracks of a stretched surface and removes background visible through them."""
 MAX_STEP_PX = 1.0
-"""The left eye's disparities next to a match may differ by this much for their mean to be taken."""
+"""Disparities of neighbouring left pixels are averaged only if they differ by at most this."""
 CLOSED_SHARE, GROWN_SHARE = 0.03, 0.014
-"""Of the width: gaps of a moved instrument mask that are closed, and how far it grows. Matching blurs its outline."""
+"""Share of the width: gaps in a warped instrument mask that are closed; how far it grows: matching blurs outlines."""
 ROWS_AT_ONCE = 64
-"""Rows that are moved at once: few enough to stay in the processor's cache, which halves the time."""
+"""Rows that are warped at once: few enough to stay in the processor's cache, which halves the time."""
 DIRECTION_SHARE, MIN_DIRECTION_PX, MAX_SLOPE, BORDER_PX = 0.06, 6, 3.0, 8
-"""Of the width: how much of an instrument at the picture's border tells its direction, if it is so many px at least."""
+"""An instrument's direction at the border is measured over this share of the width, and at least this many px."""
 MAX_OVERLAY_LEVELS = 8.0
-"""Median difference of the eyes, of 255, at equal pixels of what is painted into both, such as a label."""
+"""Maximum median difference of the eyes, of 255, at equal pixels of an overlay such as a label."""
 
 
 def moved_depth(
@@ -36,7 +36,7 @@ def moved_depth(
 ) -> tuple[Image, NDArray[np.uint8]]:
     """Depth in mm and confidence [H, W] of the right eye, from those of the left; 0 where the left eye sees nothing.
 
-    The nearest surface wins: of left pixels that meet in one right pixel, the last in the row has the most disparity.
+    The nearest surface wins: of left pixels that map to one right pixel, the last in the row has the most disparity.
     """
     height, width = depth_mm.shape
     valid = depth_mm > 0
@@ -57,10 +57,10 @@ def moved_depth(
 
 
 def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px: float) -> Mask:
-    """Tissue [H, W] of the right eye: where the left eye's instruments are not.
+    """Tissue [H, W] of the right eye: all pixels without the left eye's instruments.
 
-    An instrument's pixels without depth take that of its nearest pixel with one. One that leaves the left picture on
-    the right goes on in its direction in the strip that only the right eye sees.
+    An instrument's pixels without depth get that of its nearest pixel with depth. An instrument that leaves the left
+    picture on the right is extended straight into the strip that only the right eye sees.
     """
     tool = ~tissue
     if not tool.any():
@@ -69,7 +69,7 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
     found = depth_mm > 0
     disparity = _ratio(focal_baseline, depth_mm, found, offset_px)
     left, top, across, down = cv2.boundingRect(tool.astype(np.uint8))
-    box = slice(top, top + down), slice(left, left + across)  # holds all that is asked for, and all that is known
+    box = slice(top, top + down), slice(left, left + across)  # contains all wanted and all known pixels
     disparity[box] = nearest_known(disparity[box], (found & tool)[box], (~found & tool)[box])
     moved = _moved(disparity, tool, tool.astype(np.uint8))
     for run in _runs(np.asarray(tool[:, -2:].any(axis=1))):
@@ -80,15 +80,15 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
 
 
 def _runs(chosen: Mask) -> list[slice]:
-    """The stretches of a column [H] that are chosen."""
+    """The runs of chosen pixels in a column [H]."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]))).tolist()
     return [slice(first, end) for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _go_on(moved: NDArray[np.uint8], tool: Mask, disparity: Image, run: slice) -> None:
-    """Draw into the right eye's instruments [H, W] how that in rows `run` of the left picture's right border goes on.
+    """Extend, in the right eye's mask [H, W], the instrument in rows `run` of the left picture's right border.
 
-    Its upper and lower edge go on as straight as they come; an edge at the picture's own stays there.
+    Its upper and lower edge are extended straight; an edge at the picture's own border stays there.
     """
     height, width = tool.shape
     edges, here = [(run.start, run.stop)], run
@@ -112,7 +112,7 @@ def _go_on(moved: NDArray[np.uint8], tool: Mask, disparity: Image, run: slice) -
 
 
 def painted_over(left: NDArray[np.uint8], right: NDArray[np.uint8], never_tissue: Mask) -> Mask:
-    """Which pixels [H, W] that are tissue in no frame show the same in both eyes [H, W, 3]: labels, not instruments."""
+    """Labels: the pixels [H, W] that are never tissue and look the same in both eyes [H, W, 3]."""
     count, part = cv2.connectedComponents(never_tissue.astype(np.uint8))
     difference = cv2.absdiff(left, right).mean(axis=2)
     found = np.zeros_like(never_tissue)
@@ -133,14 +133,14 @@ def _ratio(numerator: float, values: Image, chosen: Mask, offset: float = 0.0) -
 
 @lru_cache(1)
 def _row_numbers(height: int, width: int) -> Image:
-    """[H, W] the number of each pixel's row."""
+    """The row number [H, W] of each pixel."""
     rows = np.repeat(np.arange(height, dtype=np.float32), width).reshape(height, width)
     rows.flags.writeable = False
     return rows
 
 
 def _moved(disparity: Image, chosen: Mask, values: NDArray[Number]) -> NDArray[Number]:
-    """The chosen values [H, W] where the right eye sees them, 0 elsewhere; the last of a row wins."""
+    """The chosen values [H, W] warped to the right eye, 0 elsewhere; the last of a row wins."""
     height, width = disparity.shape
     columns = np.arange(width, dtype=np.float64)
     moved = np.zeros(height * width, values.dtype)
@@ -154,10 +154,10 @@ def _moved(disparity: Image, chosen: Mask, values: NDArray[Number]) -> NDArray[N
 
 
 def nearest_known(values: Image, known: Mask, wanted: Mask | None = None) -> Image:
-    """values [H, W], where wanted those of the nearest known pixel; as they are if none is known.
+    """values [H, W] with wanted pixels replaced by the nearest known pixel; unchanged if none is known.
 
     Args:
-        wanted: [H, W] all that is not known, if left out.
+        wanted: [H, W]; None: all unknown pixels.
     """
     wanted = ~known if wanted is None else wanted
     if not known.any() or not wanted.any():

@@ -1,6 +1,6 @@
-"""How the right eye's camera differs from the calibrated one, and what that does to its pictures.
+"""Rotation and zoom of the right eye's camera against its calibration, and the homographies that follow.
 
-Symbols: H W pixels of one eye. `calibrated` is the right eye's camera without a turn; its picture is the rectified one.
+Symbols: H W pixels of one eye. `calibrated`: the right eye's camera without rotation; its picture is the rectified one.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from intrasplat.camera import Intrinsics
 Rgb = NDArray[np.uint8]  # [H, W, 3] or grey [H, W]
 AnyImage = NDArray[Any]  # [H, W]
 
-MIN_CORRECTION_PX = 0.05  # less is within the error of measuring
-MIN_MOVED_PX = 0.5  # by less, no whole pixel moves
+MIN_CORRECTION_PX = 0.05  # less is within the measurement error
+MIN_MOVED_PX = 0.5  # below it no whole pixel moves
 
 
 @dataclass(frozen=True)
 class EyeRotation:
-    """The right eye's camera against the calibrated one. Its principal point keeps its column, which depth was made of.
+    """The right eye's camera relative to the calibrated one. The principal point's column, which depth uses, is fixed.
 
     lower_px     rows by which its picture lies lower than the left one's
     pitch_rad, yaw_rad, roll_rad  rotation about its own x, y, z axes
-    zoom         by which its focal length is longer, as a share
+    zoom         relative increase of its focal length
     """
 
     lower_px: float = 0.0
@@ -40,29 +40,29 @@ class EyeRotation:
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """[3, 3] left_from_right: the directions of the right eye's axes."""
+        """Rotation [3, 3] left_from_right: the directions of the right eye's axes."""
         rotation: NDArray[np.float64] = Rotation.from_rotvec([self.pitch_rad, self.yaw_rad, self.roll_rad]).as_matrix()
         return rotation
 
     def camera(self, calibrated: Intrinsics) -> Intrinsics:
-        """The right eye's camera; `calibrated` is what it would be without a turn."""
+        """The right eye's camera; `calibrated` is its camera without rotation."""
         k, (x, y, z) = calibrated, self.rotation.T @ (0.0, 0.0, 1.0)
         fx, fy = k.fx * (1 + self.zoom), k.fy * (1 + self.zoom)
         return replace(k, fx=fx, fy=fy, cx=k.cx - fx * float(x / z), cy=k.cy + self.lower_px - fy * float(y / z))
 
     def from_rectified(self, calibrated: Intrinsics) -> NDArray[np.float64]:
-        """[3, 3] homography from array places of the rectified right picture to those of the recorded one.
+        """Homography [3, 3] from array positions in the rectified right picture to those in the recorded one.
 
-        The third coordinate is a point's depth in the turned eye over that in the calibrated one.
+        The third coordinate is the ratio of a point's depth in the rotated eye to that in the calibrated one.
         """
         return _from_rectified(self, calibrated)
 
     def moved_px(self, calibrated: Intrinsics) -> float:
-        """How far the turn moves that point of the picture's border which it moves farthest."""
+        """The largest displacement, px, of a point of the picture's border by the rotation."""
         return _moved_px(self, calibrated)
 
     def rectified(self, image: Rgb, calibrated: Intrinsics) -> Rgb:
-        """The recorded right picture as the calibrated eye would show it; as it is where that is hardly another."""
+        """The recorded right picture as the calibrated eye would show it; unchanged if the correction is tiny."""
         if self.moved_px(calibrated) < MIN_CORRECTION_PX:
             return image
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
@@ -71,7 +71,7 @@ class EyeRotation:
         return redrawn
 
     def recorded(self, image: AnyImage, calibrated: Intrinsics) -> AnyImage:
-        """What belongs to the calibrated eye's pixels, at the recorded picture's; 0 beyond. Values are not mixed."""
+        """An image in the calibrated eye's pixels, resampled (nearest) to the recorded picture's; 0 outside."""
         if self.moved_px(calibrated) < MIN_MOVED_PX:
             return image
         matrix, size = self.from_rectified(calibrated), (calibrated.width, calibrated.height)
@@ -79,11 +79,11 @@ class EyeRotation:
         return moved
 
     def depth_factor(self, calibrated: Intrinsics) -> NDArray[np.float32]:
-        """[H, W] depth in the turned eye over depth in the calibrated one, by the calibrated eye's pixels."""
+        """Ratio [H, W] of depth in the rotated eye to depth in the calibrated one, in the calibrated eye's pixels."""
         return _depth_factor(self, calibrated)
 
 
-@lru_cache(16)  # the frames of a clip have one turn
+@lru_cache(16)  # all frames of a clip have the same rotation
 def _from_rectified(turn: EyeRotation, calibrated: Intrinsics) -> NDArray[np.float64]:
     matrix = _matrix(turn.camera(calibrated)) @ turn.rotation.T @ np.linalg.inv(_matrix(calibrated))
     matrix.flags.writeable = False
@@ -110,5 +110,5 @@ def _depth_factor(turn: EyeRotation, calibrated: Intrinsics) -> NDArray[np.float
 
 
 def _matrix(camera: Intrinsics) -> NDArray[np.float64]:
-    """[3, 3] of array places, whose pixel centres are at whole numbers."""
+    """Camera matrix [3, 3] for array positions, whose pixel centres are whole numbers."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1.0]])

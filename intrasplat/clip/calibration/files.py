@@ -1,6 +1,6 @@
 """Calibration files: our JSON, OpenCV's FileStorage (YAML, XML, JSON), the ini of StereoMIS and SCARED.
 
-The format is told by the content, not by the file's name: a service stores uploads under names of its own.
+The content determines the format, not the file's name, because a service stores uploads under names of its own.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from intrasplat.intake.sniff import check_calibration_text
 
 
 def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> StereoCalibration:
-    """Read a calibration file and fit it to eyes of eye_width x eye_height pixels.
+    """The calibration in a file, for eyes of eye_width x eye_height pixels.
 
-    A file made for another size of the same view is scaled, and `scaled_from` says so. A file without size is taken as
-    it is, and its `assumptions` say so.
+    A file for another size of the same view is scaled, which `scaled_from` records. A file without size is used
+    unchanged, which `assumptions` record.
 
     Raises:
         InputError: unreadable, of no known format, not finite, not rigid, of another aspect, of a size far from
@@ -85,7 +85,7 @@ def _parse_opencv(text: str, eye_width: int, eye_height: int) -> tuple[dict[str,
 
 
 def _opencv_values(text: str) -> dict[str, NDArray[np.float64]]:
-    """Every known key of a FileStorage text as an array of float64."""
+    """The known keys of a FileStorage text, each as an array of float64."""
     head = text.lstrip()[:6]
     if not head.startswith(("%YAML", "<?xml", "{")):
         text = "%YAML:1.0\n---\n" + text.removeprefix("---")
@@ -113,7 +113,7 @@ def _node_values(node: Any) -> NDArray[np.float64]:
 
 
 def _opencv_size(values: dict[str, NDArray[np.float64]]) -> tuple[int, int] | None:
-    """(width, height) if the file names them."""
+    """(width, height) if the file has them."""
     if "size" in values and values["size"].size == 2:
         pair: Sequence[float] = values["size"].ravel().tolist()
     elif "width" in values and "height" in values:

@@ -22,13 +22,13 @@ from intrasplat.intake.calibration.types import RawCalibration, RawEye, Rectifie
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.notices import Notice, NoticeCode
 
-OPENCV_PIXEL_CENTRE = 0.5  # OpenCV puts pixel centres at whole numbers, this project at +0.5 (docs/conventions.md)
+OPENCV_PIXEL_CENTRE = 0.5  # pixel centres are whole numbers in OpenCV, at +0.5 in this project (docs/conventions.md)
 WARN_ZOOM, MAX_ZOOM = 1.2, 2.0  # of the focal length; a sound endoscope calibration stays below 1.1
 
 USUAL_VIEW_DEG = 35.0, 95.0
-"""What an endoscope's picture shows from side to side. 59 is usual: twice or half the focal length lies outside."""
+"""Usual horizontal field of view of an endoscope. 59 is typical: twice or half its focal length lies outside."""
 
-GRID_POINTS = 17  # a side, on which it is asked how far rectification moves rows
+GRID_POINTS = 17  # per side of the grid on which the row shift by rectification is measured
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fixed-point maps: source pixel, index of its fraction
 
@@ -37,13 +37,13 @@ Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fixed-point maps
 class RectifiedClip:
     """A stereo clip whose rows match: disparity_px = fx * baseline_mm / depth_mm + disparity_offset_px.
 
-    pairs yields rectified (left, right) RGB uint8 frames, remapped as they are asked for. tissue is [T, H, W] bool in
-    the pixels of the rectified left eye (a read-only view when no masks were given), False where the rectified image
-    reaches beyond the recorded one. tissue_right is the same of the right eye, None if no masks show it. intrinsics are
-    the left eye's. rectification says how they were moved; None: they were not.
+    pairs yields rectified (left, right) RGB uint8 frames, remapped on demand. tissue is [T, H, W] bool in the pixels of
+    the rectified left eye (a read-only view if no masks were given), False where the rectified image extends beyond the
+    recorded one. tissue_right is the same for the right eye, None if no masks show it. intrinsics are the left eye's.
+    rectification has the left eye's mapping; None: the frames are unchanged.
 
-    equal_rows_px is y_right - y_left in these frames of points that lay on one row in the recorded ones: about what is
-    measured here when frames that had been rectified were rectified again.
+    equal_rows_px is y_right - y_left, in these frames, of points on equal rows of the recorded frames. If frames that
+    were rectified already are rectified again, about this row shift is measured.
     """
 
     frame_count: int
@@ -61,12 +61,12 @@ class RectifiedClip:
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
-    """Bring matching points of a clip's eyes onto the same rows, frame by frame as they are asked for.
+    """The clip with matching points of both eyes on the same rows, rectified frame by frame on demand.
 
     A "rectified" calibration passes the frames through. For "raw" ones the maps are computed once
     (cv2.stereoRectify with alpha 0: no pixel of the result lies outside the recording, as far as one zoom allows); the
-    eyes keep their own principal points, whose distance becomes disparity_offset_px. OpenCV's pixel centres are
-    turned into this project's by adding 0.5 to cx and cy.
+    eyes keep their own principal points, whose distance becomes disparity_offset_px. Adding 0.5 to cx and cy converts
+    OpenCV's pixel centres to this project's.
 
     Raises:
         InputError: the calibration is for another image size, or its eyes are not side by side.
@@ -183,7 +183,7 @@ def _rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
 
 
 def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
-    """Tissue in rectified pixels, nearest neighbour; beyond the recorded image there is none."""
+    """Tissue in rectified pixels, nearest neighbour; False beyond the recorded image."""
     warped = mapped_zeros(tissue.shape, np.bool_)
     for i, mask in enumerate(tissue):
         warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
@@ -193,7 +193,7 @@ def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
 
 
 def _all_tissue(clip: StereoClip) -> NDArray[np.bool_]:
-    """[T, H, W] True that takes no memory: alpha 0 leaves no pixel beyond the recording."""
+    """True [T, H, W], as a view without memory: alpha 0 leaves no pixel beyond the recording."""
     return np.broadcast_to(np.True_, (clip.frame_count, clip.height, clip.width))
 
 
@@ -203,7 +203,7 @@ def _assumptions(clip: StereoClip, calibration: StereoCalibration, done: str) ->
 
 
 def _scale_warning(calibration: StereoCalibration) -> tuple[Notice, ...]:
-    """What to say of a calibration that was read for frames of another size than it names."""
+    """The warning about a calibration for frames of another size."""
     if calibration.scaled_from is None:
         return ()
     width, height = calibration.scaled_from
@@ -216,7 +216,7 @@ def _scale_warning(calibration: StereoCalibration) -> tuple[Notice, ...]:
 
 
 def _view_warning(fx_px: float, width: int) -> tuple[Notice, ...]:
-    """What to say of a picture that shows less or more than endoscopes do."""
+    """The warning about an unusual field of view."""
     view_deg = math.degrees(2 * math.atan(width / (2 * fx_px)))
     low_deg, high_deg = USUAL_VIEW_DEG
     if low_deg <= view_deg <= high_deg:
@@ -229,10 +229,10 @@ def _view_warning(fx_px: float, width: int) -> tuple[Notice, ...]:
 
 
 def _zoom_warning(zoom: float) -> tuple[Notice, ...]:
-    """What to say of a rectification that magnifies, as it must cut away what only one eye recorded.
+    """The warning about a rectification that magnifies, because it must crop what only one eye recorded.
 
     Raises:
-        InputError: so little is left that the calibration cannot be this recording's.
+        InputError: so little remains that the calibration cannot belong to this recording.
     """
     if zoom > MAX_ZOOM:
         raise InputError(

@@ -1,6 +1,6 @@
-"""The registry of input layouts: a new one is a module here and a line in LAYOUTS.
+"""The registry of input layouts: a new layout is a module here and an entry in LAYOUTS.
 
-`auto` takes the first layout that recognises the files; layouts from outside are asked before ours.
+`auto` uses the first layout that recognises the files; registered layouts of users come before ours.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = [
 ]
 
 LAYOUTS = (ENDONERF, STEREOMIS, SBS, TB, FRAMES)
-"""In the order in which they are asked. intrasplat/names.py lists their names for those who cannot import this."""
+"""In order of detection. intrasplat/names.py lists the names for modules that cannot import this one."""
 
 _outside: dict[Path, InputLayout] = {}
-"""Layouts from outside, by the file that defines each."""
+"""Registered layouts of users, by the file that defines each."""
 
 
 def register_layout(file: Path) -> InputLayout:
-    """Add the layout that a Python file defines as LAYOUT, for this process and for those that decode clips for it.
+    """Add the layout that a Python file defines as LAYOUT, for this process and its decoding processes.
 
     The decoding process may read this file and installed packages; the file can import nothing else.
 
@@ -56,17 +56,17 @@ def register_layout(file: Path) -> InputLayout:
 
 
 def registered_files() -> list[Path]:
-    """The files of the layouts from outside."""
+    """The files of the registered layouts of users."""
     return list(_outside)
 
 
 def detect_layout(files: ClipFiles) -> InputLayout:
-    """The first layout that recognises the files. InputError where one cannot tell."""
-    return next(each for each in _all() if each.recognises(files))  # SBS, TB and FRAMES share what the others leave
+    """The first layout that recognises the files. InputError if a layout finds them ambiguous."""
+    return next(each for each in _all() if each.recognises(files))  # SBS, TB and FRAMES cover all remaining files
 
 
 def layout_named(name: str) -> InputLayout:
-    """The layout of that name. InputError where there is none."""
+    """The layout of that name. InputError if there is none."""
     found = next((each for each in _all() if each.name == name), None)
     if found is None:
         known = ", ".join(["auto", *(each.name for each in _all())])

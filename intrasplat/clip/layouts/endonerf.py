@@ -29,14 +29,14 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import Masks
 
 TITLE = "EndoNeRF"
-CONFIDENT = 255  # depth_confidence of every valid depth: the layout carries none of its own
-_USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with ample room; other units fall outside
-_MIN_DEPTH_SHARE = 0.5  # of tissue pixels with depth, below which the user should know
+CONFIDENT = 255  # depth_confidence of every valid depth: the layout has no confidence
+_USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with an ample margin; other units fall outside
+_MIN_DEPTH_SHARE = 0.5  # a smaller share of tissue pixels with depth causes a warning
 _MAX_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
 
 
 def _recognises(files: ClipFiles) -> bool:
-    """Whether files mean to be in this layout; what is missing is then an error."""
+    """Whether files are meant to be in this layout; missing files are then an error."""
     tree = files.tree
     if tree is None:
         return False
@@ -44,11 +44,10 @@ def _recognises(files: ClipFiles) -> bool:
 
 
 def _open(files: ClipFiles) -> DepthClip:
-    """Decodes the whole clip. The masks given, if any, replace the folder's own.
+    """The clip, decoded as a whole. Masks that the caller gives replace the folder's own.
 
-    Depth images hold millimetres in 8 or 16 bit, 0 = invalid. Intrinsics are f, cx = W / 2, cy = H / 2:
-    all the layout knows.
-    Raises InputError for everything that does not fit together and LimitError when it is too large.
+    Depth images contain millimetres in 8 or 16 bit, 0 = invalid. The layout stores f alone: cx = W / 2, cy = H / 2.
+    Raises InputError for inconsistent files and LimitError for a clip that is too large.
     """
     tree, convention = files.tree_for("endonerf"), files.pose_convention
     _check_files(tree)
@@ -162,7 +161,7 @@ def _decode_all(
 
 
 def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[Notice, ...]:
-    """What looks odd about depth that has some valid pixel on tissue; judged on every 4th row and column."""
+    """Warnings about depth that has some valid pixel on tissue; it is checked on every 4th row and column."""
     depth_mm, tissue = depth_mm[:, ::4, ::4], tissue[:, ::4, ::4]
     valid = (depth_mm > 0) & tissue
     warnings = []

@@ -1,4 +1,4 @@
-"""Layout "frames": left and right images, told by their names; or two videos, if nobody named the layout."""
+"""Layout "frames": left and right images, distinguished by name; or two videos, if the layout is detected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an input layout is, and what it gets to open."""
+"""The interface of an input layout, and the files that it opens."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from intrasplat.names import MaskPolarity, PoseConvention
 
 @dataclass(frozen=True)
 class ClipFiles:
-    """The files of a clip and what the caller said of them; nothing is decoded yet.
+    """The files of a clip and the caller's options for them; nothing is decoded yet.
 
-    tree             files of a folder or zip, or one image; None where path is a single other file, such as a video
-    detected         the caller left the layout open
-    masks            those that the caller gave in addition to the clip
+    tree             files of a folder or zip, or one image; None if path is a single other file, such as a video
+    detected         the layout is to be detected
+    masks            masks that the caller gave in addition to the clip
     ignores_masks    the caller wants no masks, not even those in the tree
-    mask_polarity    what white means in masks, as the caller said
-    pose_convention  axes of poses_bounds.npy, as the caller said
+    mask_polarity    the caller's meaning of white in masks
+    pose_convention  the caller's axes of poses_bounds.npy
     """
 
     path: Path
@@ -41,7 +41,7 @@ class ClipFiles:
     pose_convention: PoseConvention = "opengl"
 
     def tree_for(self, layout: str) -> FileTree:
-        """The files of a layout that needs several. InputError where a single file was given."""
+        """The files of a layout that needs several. InputError if a single file was given."""
         if self.tree is None:
             problem = f'layout "{layout}" needs a folder or zip, {self.path.name} is neither.'
             raise InputError("options.layout", problem, "Leave it out.")
@@ -59,7 +59,7 @@ class ClipFiles:
 
     @cached_property
     def sequence(self) -> FrameSequence | None:
-        """The pictures, where there is one sequence of them: one video, or images whose names name no eye."""
+        """The single sequence of pictures: one video, or images whose names give no eye; else None."""
         if self.tree is None:
             return open_video(self.path, "clip", self.limits)
         if len(self.videos) == 1:
@@ -71,14 +71,14 @@ class ClipFiles:
 
 @dataclass(frozen=True)
 class InputLayout:
-    """How files make a clip.
+    """A layout of input files.
 
-    name        what callers choose
-    recognises  whether files that nobody named a layout for are in this one; it may raise InputError
-    open        the clip, or InputError or LimitError. A DepthClip comes with its masks applied; the masks of a
-                StereoClip are applied by open_clip
-    white       what white means in the masks of a StereoClip, unless the caller says; None: their look decides
-    title       the name as its makers write it, for messages
+    name        its name in options
+    recognises  whether files are in this layout, for detection; it may raise InputError
+    open        returns the clip; raises InputError, LimitError. A DepthClip comes with its masks applied; open_clip
+                applies the masks of a StereoClip
+    white       default meaning of white in the masks of a StereoClip; None: decided by their look
+    title       the name as its authors write it, for messages
     """
 
     name: str
@@ -89,6 +89,6 @@ class InputLayout:
 
 
 def outside_masks(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names that lie in no folder called masks or mask."""
+    """The names outside folders called masks or mask."""
     masks = {"masks", "mask"}
     return tuple(name for name in names if not masks & {part.lower() for part in PurePosixPath(name).parts[:-1]})

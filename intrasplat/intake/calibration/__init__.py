@@ -1,4 +1,4 @@
-"""What a stereo calibration is, which ones no endoscope has, whether one goes with a clip: text in, calibration out.
+"""Text in; a stereo calibration out, checked for plausibility and for its fit to a clip.
 
-OpenCV's files need a parser in C++, which runs where clips are decoded (intrasplat/clip/calibration/files.py).
+OpenCV's files need a C++ parser, which runs in the decoding process (intrasplat/clip/calibration/files.py).
 """

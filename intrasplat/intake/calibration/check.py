@@ -1,4 +1,4 @@
-"""What no stereo endoscope has: checks of a calibration that any reader, or none, may have made.
+"""Plausibility checks of a calibration from any source: is it one of a stereo endoscope?
 
 Symbols: R rotation and T translation (mm) from the left to the right eye, x_right = R x_left + T.
 """
@@ -12,11 +12,11 @@ from intrasplat.intake.calibration.types import RectifiedCalibration, Row, Stere
 
 FIELD = "calibration"
 MIN_BASELINE_MM, MAX_BASELINE_MM = 0.5, 50.0  # da Vinci 4 to 5 mm, rigid 3D laparoscopes up to about 15 mm
-RIGID_TOLERANCE = 1e-3  # largest entry of |R R^T - 1|: files carry rotations with four digits
+RIGID_TOLERANCE = 1e-3  # largest entry of |R R^T - 1|: files store rotations with four digits
 
 
 def check_calibration(calibration: StereoCalibration) -> None:
-    """Refuse what no stereo endoscope has: a non-rigid rotation, a vertical or reversed pair, an implausible baseline.
+    """Refuse a calibration with a non-rigid rotation, a vertical or reversed pair, or an implausible baseline.
 
     Raises:
         InputError: with field "calibration".

@@ -1,4 +1,4 @@
-"""Whether a calibration goes with a clip: scaled to the size of its eyes, or refused."""
+"""Fits a calibration to a clip: scales it to the size of the eyes, or refuses it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from intrasplat.intake.calibration.types import RectifiedCalibration, StereoCali
 
 MAX_ASPECT_CHANGE = 0.005  # 1348x1080 read as 640x512 is still one scale; a cropped image is not
 MAX_SCALE = 8.0
-"""4K reduced to 480 columns; what is scaled by more, either way, is not this recording's."""
+"""4K reduced to 480 columns; a calibration that needs a larger scale, either way, belongs to another recording."""
 
 
 def fitted(calibration: StereoCalibration, eye_width: int, eye_height: int) -> StereoCalibration:
-    """The calibration at the size of the clip's eyes; `scaled_from` tells if it named another.
+    """The calibration at the size of the clip's eyes; `scaled_from` has its own size if that differs.
 
     Raises:
-        InputError: it is of another aspect, which would mean a crop nobody described, or of a size far from the clip's.
+        InputError: its aspect differs, which would mean an unknown crop, or its size is far from the clip's.
     """
     if (calibration.width, calibration.height) == (eye_width, eye_height):
         return calibration
@@ -39,7 +39,7 @@ def fitted(calibration: StereoCalibration, eye_width: int, eye_height: int) -> S
 
 
 def check_centred(calibration: StereoCalibration) -> None:
-    """Return if a calibration whose file names no size may be of these eyes: both principal points lie in the middle.
+    """Check a calibration whose file gives no size: both principal points must lie near the middle of these eyes.
 
     Raises:
         InputError: one does not.

@@ -1,6 +1,6 @@
-"""What OpenCV's calibration files must hold, told from their text: the parser runs where clips are decoded.
+"""Checks the text of OpenCV's calibration files; the parser itself runs in the decoding process.
 
-Only what the parser is sure to refuse is refused here: a name that stands nowhere, a text that was cut short.
+Only files that the parser would certainly refuse are refused here: a missing name, a text that was cut short.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ OPENCV_KEYS = {
     "width": "imagewidth width camerawidth",
     "height": "imageheight height cameraheight",
 }
-"""Spellings met in files; compared without case, underscores, dots and dashes."""
+"""Spellings found in files; compared without case, underscores, dots and dashes."""
 
 _REQUIRED = ("left_k", "right_k", "rotation", "translation")
 _NAMES = {spelling: name for name, spellings in OPENCV_KEYS.items() for spelling in spellings.split()}
 _WORD = re.compile(r"[\w.-]+")
 _QUOTED_OR_COMMENT = re.compile(r'"[^"\n]*"|#.*')
 _OPENED = {end: re.compile(r":\s*(?:!!?[\w-]{1,40}\s*)?" + re.escape(begin)) for begin, end in ("[]", "{}")}
-"""A list or a map that is a value, by what closes it. No pattern here takes longer than the text is long."""
+"""Patterns of the start of a list or map value, by its closing bracket. All patterns here run in linear time."""
 
 
 def name_of(key: str) -> str | None:
-    """The name in OPENCV_KEYS that a file's key is a spelling of."""
+    """The name in OPENCV_KEYS for a file's spelling of a key; None if it is unknown."""
     return _NAMES.get(key.lower().translate(str.maketrans("", "", "_.-")))
 
 
@@ -50,10 +50,10 @@ def check_opencv_names(names: Collection[str | None]) -> None:
 
 
 def look_at_calibration(text: str) -> StereoCalibration | None:
-    """The calibration that a text of any format means; None if it is OpenCV's, and may be read where clips are decoded.
+    """The calibration in a text of any format; None for OpenCV's formats, which the decoding process reads.
 
     Raises:
-        InputError: no camera can be read from it, or they are what no stereo endoscope has.
+        InputError: no camera can be read from it, or it is implausible for a stereo endoscope.
     """
     calibration = read_calibration(text)
     if calibration is None:
@@ -69,5 +69,5 @@ def _check_opencv_text(text: str) -> None:
 
 
 def _is_unclosed(text: str) -> bool:
-    """Whether a list or a map is opened after the last one that is closed."""
+    """Whether a list or map starts after the last one that ends."""
     return any(opened.search(text, text.rfind(end) + 1) for end, opened in _OPENED.items())

@@ -1,4 +1,4 @@
-"""Calibrations as text: our JSON, and the ini of StereoMIS and SCARED. The format is told by the content."""
+"""Parses calibrations: our JSON, and the ini of StereoMIS and SCARED. The content determines the format."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _BLANKS = re.compile(r"[^\S\n]+")
 
 
 def read_calibration(text: str) -> StereoCalibration | None:
-    """The calibration that a text means; None if its format is not one of these.
+    """The calibration in a text; None if its format is not one of these.
 
     Raises:
-        InputError: it lacks a number, or is what no stereo endoscope has.
+        InputError: it lacks a number, or is implausible for a stereo endoscope.
     """
     value = parse_text(text)
     return None if value is None else checked_calibration(value)
 
 
 def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
-    """The calibration that a JSON-like value means; raises as read_calibration()."""
+    """The calibration in a JSON-like value; raises as read_calibration()."""
     try:
         calibration = parse_calibration(value)
     except ValidationError as error:
@@ -71,7 +71,7 @@ def _parse_ini(text: str) -> dict[str, Any]:
     """StereoMIS and SCARED: [StereoLeft], [StereoRight] with res, fc, cc, kc; the right one's R and T (mm) count."""
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(_BLANKS.sub(" ", text))  # its patterns are slow on many blanks
+        parser.read_string(_BLANKS.sub(" ", text))  # the parser's patterns are slow on long runs of blanks
         left, right = parser["StereoLeft"], parser["StereoRight"]
         value = {
             "model": "raw",

@@ -1,4 +1,4 @@
-"""What a stereo calibration is: the project's JSON, and what every other file format is turned into.
+"""Types of a stereo calibration: the project's JSON, to which every other file format is converted.
 
 Two kinds share the key `model`: "rectified" (rows already match; one focal length, one baseline) and "raw" (both eyes
 with their distortion and the rigid transform between them). Lengths are mm, image lengths are pixels of one eye.
@@ -14,13 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
-"""The numbers of coefficients OpenCV's distortion model comes in."""
+"""Valid numbers of coefficients in OpenCV's distortion model."""
 
 Row = tuple[float, float, float]
 
 
 class _Calibration(BaseModel):
-    """What both kinds carry: the pixel grid of one eye, and what a reader had to assume to fill the model."""
+    """Fields of both kinds: the pixel grid of one eye, and the assumptions of the reader."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -28,7 +28,7 @@ class _Calibration(BaseModel):
     height: int = Field(gt=0, description="pixels of one eye")
     assumptions: tuple[str, ...] = Field(default=(), description="what the reader assumed, for the report")
     scaled_from: SkipJsonSchema[tuple[int, int] | None] = None
-    """Width and height that the file names, where a reader has scaled it to another clip."""
+    """Width and height in the file, if a reader has scaled the calibration to another size."""
 
 
 class RectifiedCalibration(_Calibration):
@@ -63,9 +63,9 @@ class RectifiedCalibration(_Calibration):
 
 
 class RawEye(BaseModel):
-    """One unrectified eye as OpenCV's calibration writes it: pixel centres lie at whole numbers (not at +0.5).
+    """One unrectified eye in OpenCV's convention: pixel centres are whole numbers (not at +0.5).
 
-    distortion holds OpenCV's coefficients in OpenCV's order, k1 k2 p1 p2 k3 and on: 0, 4, 5, 8, 12 or 14 of them.
+    distortion has OpenCV's coefficients in OpenCV's order, k1 k2 p1 p2 k3 and on: 0, 4, 5, 8, 12 or 14 of them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -84,7 +84,7 @@ class RawEye(BaseModel):
         return value
 
     def resized(self, sx: float, sy: float) -> RawEye:
-        """The same eye on a grid sx, sy times as fine; the half pixels move between the two conventions."""
+        """The same eye on a grid sx, sy times as fine; half a pixel converts between the two conventions."""
         return self.model_copy(
             update={
                 "fx_px": self.fx_px * sx,
@@ -118,7 +118,7 @@ StereoCalibration = Annotated[RectifiedCalibration | RawCalibration, Field(discr
 
 
 def parse_calibration(value: Any) -> RectifiedCalibration | RawCalibration:
-    """The calibration a decoded JSON value means.
+    """The calibration in a decoded JSON value.
 
     Raises:
         pydantic.ValidationError: it is of neither kind, or a number is missing, not finite or out of range.
