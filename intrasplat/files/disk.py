@@ -1,4 +1,4 @@
-"""The disk of a data directory: how much room it has, and the error that names it when it has none."""
+"""The disk of a data directory: its free space, and the error that names it when it is full."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path
 from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
 
 PROBE_BYTES = 64 * 2**10
-"""A disk that cannot give this much is full, whatever it says of its free bytes: a quota may be used up."""
+"""A disk on which this much cannot be written is full, whatever its free bytes: a quota may be used up."""
 
 FULL_REMEDY = "Free space, or delete scenes: DELETE /scenes/ID."
 
 
 class Disk:
-    """The disk that holds a folder, or that would hold it if it were made."""
+    """The disk of a folder, which need not exist yet."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.expanduser().resolve()
@@ -26,12 +26,12 @@ class Disk:
 
     @property
     def name(self) -> str:
-        """The folder and where its disk is mounted, for people."""
+        """The folder and the mount point of its disk, for messages."""
         mount = next(path for path in (self._folder, *self._folder.parents) if os.path.ismount(path))
         return f"the disk of {self._folder}" + ("" if mount == self._folder else f" (mounted at {mount})")
 
     def free_bytes(self) -> int:
-        """What this user may still write, without regard to quotas. Raises OSError if the disk is gone."""
+        """Bytes that this user can still write, ignoring quotas. Raises OSError if the disk is gone."""
         status = os.statvfs(self._there)
         return status.f_bavail * status.f_frsize
 
@@ -48,6 +48,6 @@ class Disk:
         return False
 
     def full_error(self) -> StoreFullError:
-        """The error that names this disk; for whoever runs the service, not for its callers."""
+        """The error that names this disk, for operators of the service, not for its clients."""
         problem = f"There is no room left on {self.name}: {self.free_bytes() >> 20} MiB are free."
         return StoreFullError(problem, FULL_REMEDY)

@@ -1,4 +1,4 @@
-"""What the operating system refuses, as errors that say what to do."""
+"""Converts errors of the operating system to errors that name a remedy."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ NOT_THERE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ESTALE})
 
 
 class StoreFullError(UnavailableError):
-    """The data directory's disk, quota or file size limit is used up. What was stored before is not harmed.
+    """The data directory's disk, quota or file size limit is used up. Earlier files are intact.
 
-    Room may return at any time (may_return), so processes wait for it.
+    Space may become free at any time (may_return), so processes wait for it.
     """
 
     code = ErrorCode.STORE_FULL
@@ -28,7 +28,7 @@ class StoreFullError(UnavailableError):
 
 @contextlib.contextmanager
 def disk_errors() -> Iterator[None]:
-    """Raise an OSError of the body as an UnavailableError that names the remedy and no file."""
+    """Context manager that converts an OSError to an UnavailableError with a remedy and without file names."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,6 @@
-"""The only place that puts a file or a folder on disk whole: after a crash or a loss of power it is the old or the new.
+"""Atomic, durable writes of files and folders: after a crash or power loss there is the old or the new one, complete.
 
-Everything is written aside, flushed, renamed into place, and the folder that holds the name is flushed.
+The content is written to a temporary name, flushed and renamed; then the parent folder is flushed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 
 OWNER_ONLY = 0o600
 FOR_ALL = 0o666
-"""Less what the user's umask takes away."""
+"""File mode before the user's umask."""
 
 
 def flush(path: Path) -> None:
@@ -23,12 +23,12 @@ def flush(path: Path) -> None:
 
 
 def aside_of(path: Path) -> Path:
-    """Where a file is written before it takes its place; a crash may leave it there."""
+    """The temporary path at which a file is written before the rename; a crash may leave a file there."""
     return path.with_name(f".{path.name}.new")
 
 
 def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
-    """Write a file whole, in place of any that is there. It is on disk when this returns.
+    """Write a file atomically, replacing any old one. It is on disk when this returns.
 
     Only one process at a time may write the same file.
 
@@ -36,7 +36,7 @@ def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
         mode: the file's permissions before the umask.
 
     Raises:
-        OSError: the disk is full or refuses; the old file is as it was.
+        OSError: the disk is full or refuses; the old file is unchanged.
     """
     aside = aside_of(path)
     aside.unlink(missing_ok=True)  # left by a crash
@@ -53,10 +53,10 @@ def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
 
 
 def move_folder(source: Path, target: Path) -> None:
-    """Rename a folder after every byte of it is on disk. The new name is on disk when this returns.
+    """Rename a folder after all its content is on disk. The new name is on disk when this returns.
 
     Raises:
-        OSError: the disk refuses; the folder is where it was.
+        OSError: the disk refuses; the folder keeps its old name.
     """
     for path in source.rglob("*"):
         flush(path)
@@ -65,5 +65,5 @@ def move_folder(source: Path, target: Path) -> None:
     try:
         flush(target.parent)
     except OSError:
-        target.rename(source)  # who hears that it failed must not find it done
+        target.rename(source)  # undo: after an error the new name must not exist
         raise

@@ -1,4 +1,4 @@
-"""A zip written part by part, without a file: each part can be sent before the next is made."""
+"""Streams a zip without a file: each part can be sent before the next is computed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 
 class _Sink(io.RawIOBase):
-    """Takes what a zip writes until it is taken away. It cannot seek, and ZipFile then needs not to."""
+    """Buffers what a zip writes until take(). It cannot seek, so ZipFile writes a zip that needs no seeking."""
 
     def __init__(self) -> None:
         self._written = bytearray()
@@ -22,14 +22,14 @@ class _Sink(io.RawIOBase):
         return len(content)
 
     def take(self) -> bytes:
-        """What was written since this was called last."""
+        """The bytes written since the last call."""
         taken = bytes(self._written)
         self._written.clear()
         return taken
 
 
 def zip_parts(members: Iterator[tuple[str, Iterator[bytes]]]) -> Iterator[bytes]:
-    """The bytes of a zip of these members, each a name and its content in pieces, stored as they are."""
+    """The bytes of a zip of these members, each a name and its content in chunks, stored uncompressed."""
     sink = _Sink()
     with zipfile.ZipFile(sink, "w") as archive:
         for name, pieces in members:

@@ -1,9 +1,9 @@
-"""The decorator of every Numba kernel, and the folder where compiled kernels are kept between runs.
+"""The decorator of every Numba kernel, and the folder where compiled kernels are stored between runs.
 
-Numba keys a kernel's cache by its own source file and does not see a change in a module it was compiled from (a
-constant, an inlined helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels
-therefore live in a folder named after a hash of the rasteriser's source files and of the numbers compiled into
-them, the only files that build on each other: any change there starts afresh.
+Numba keys a kernel's cache by its own source file and ignores changes in imported modules (a constant, an inlined
+helper, the vector type), so a stale kernel could run with a new layout of its arrays. All kernels are therefore stored
+in a folder named after a hash of the rasteriser's source files, the only files that build on each other, and of the
+numbers compiled into them. After any change there, kernels are compiled anew.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from numba.core.caching import FunctionCache
 
 
 def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never", error_model: str = "python") -> Any:
-    """Declare a function as a kernel: compiled by Numba at its first call, kept on disk, and run without the GIL.
+    """Declare a function as a kernel: compiled by Numba at its first call, cached on disk, and run without the GIL.
 
-    Declaring one touches no file. Numba's own `cache=True` would choose the folder while a module is imported.
+    The declaration touches no file. Numba's own `cache=True` would choose the folder during import.
 
     Args:
         inline: "always" copies the kernel into those that call it.
-        error_model: "numpy" lets a division by zero give inf or NaN instead of an exception.
+        error_model: "numpy": a division by zero gives inf or NaN instead of an exception.
     """
     if function is None:
         return lambda declared: kernel(declared, inline=inline, error_model=error_model)
@@ -58,7 +58,7 @@ def kernel_cache_directory() -> Path:
     """The folder of compiled kernels: $INTRASPLAT_CACHE, else $XDG_CACHE_HOME/intrasplat, else ~/.cache/intrasplat.
 
     Raises:
-        RuntimeError: none of them is set and this user has no home.
+        RuntimeError: none of them is set and this user has no home directory.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     splat = Path(__file__).resolve().parents[1] / "splat"
@@ -72,9 +72,9 @@ def kernel_cache_directory() -> Path:
 
 @cache
 def use_kernel_cache() -> None:
-    """Point Numba at that folder, once a process.
+    """Set Numba's cache to that folder, once per process.
 
-    Where nothing can be written there, a temporary folder takes its place until the process ends, with a warning.
+    If the folder is not writable, a temporary one replaces it until the process ends, with a warning.
     """
     try:
         folder = kernel_cache_directory()

@@ -1,6 +1,6 @@
-"""How long a reconstruction still takes: what its stages usually take, corrected by what they have taken so far.
+"""Remaining time of a reconstruction: the usual time of its stages, scaled by the pace so far.
 
-Seconds are those of two cores of the machine that lab/rows/post.csv names, and of both eyes.
+Usual seconds are for both eyes, on two cores of the machine in lab/rows/post.csv.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ USUAL_S = {
     "finish": (1.5, 0.02),
     "publish": (0.7, 0.0),
 }
-"""In their order: seconds of a stage, and seconds for each megapixel of all frames of one eye."""
+"""Stages in order: fixed seconds, and seconds per megapixel of all frames of one eye."""
 COMPILATION = "compile"
-"""May come after any stage; kernels that are compiled already take no time."""
+"""A stage that may follow any other; kernels that are compiled already take no time."""
 IN_BUDGET = ("motion", "fusion", "start", "calibrate")
-"""Stages whose time a budget includes, besides training."""
+"""Stages whose time counts in a budget, besides training."""
 USUAL_MEGAPIXELS = 30.0
-"""Until the clip's size is known."""
+"""Assumed size of a clip until it is known."""
 STEP_S = 0.12
-"""Of a step on both eyes, for each megapixel of a frame; until steps have been made."""
+"""Assumed seconds of a step on both eyes, per megapixel of a frame, until training reports its own."""
 LEAST_PACE, MOST_PACE = 0.5, 5.0
 TRUSTED_S = 1.5
-"""Of work at the usual pace that is believed in before any has been done: little work says little of the pace."""
+"""Prior of the pace, as seconds of work at the usual pace: little work says little about the pace."""
 
 
 class TimeEstimate:
     """Adds seconds_left to each report of progress.
 
     Args:
-        iterations, budget_s: how long training is; one of the two is None.
-        most_frames: to train on; None: all.
-        clock: monotonic seconds.
+        iterations, budget_s: length of training; one of the two is None.
+        most_frames: maximum number of training frames; None: all.
+        clock: returns monotonic seconds.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class TimeEstimate:
         self._megapixels = USUAL_MEGAPIXELS
 
     def completed(self, progress: Progress) -> Progress:
-        """The report with the seconds that are left until the scene is finished."""
+        """The report with the estimated seconds until the scene is finished."""
         if progress.stage not in (*USUAL_S, COMPILATION):
             return progress
         if progress.frames:
@@ -80,13 +80,13 @@ class TimeEstimate:
         own_s = (1 - fraction) * usual[reached]
         if progress.stage == "train" and progress.seconds_left is not None:
             return replace(progress, seconds_left=progress.seconds_left + pace * rest_s)
-        # The seconds of a budget are no work: they pass at the same pace everywhere.
+        # A budget lasts the same time on any machine, so the pace does not scale it.
         in_budget = self._budget_s is not None and place <= stages.index("train")
         fixed_s = usual["train"] if in_budget else 0.0
         return replace(progress, seconds_left=pace * (own_s + rest_s - fixed_s) + fixed_s)
 
     def learn(self, frames: int, megapixels: float) -> None:
-        """The clip's frames, and the megapixels of all of them, of one eye."""
+        """Set the clip's number of frames, and the megapixels of all frames of one eye."""
         used = frames if self._most_frames is None else min(frames, self._most_frames)
         self._frames, self._megapixels = used, megapixels * used / frames
 
@@ -100,6 +100,6 @@ class TimeEstimate:
         return usual
 
     def _pace(self, done_s: float) -> float:
-        """How much longer than usual the work takes here and now; done_s: what the work so far usually takes."""
+        """Actual over usual time of the work so far, limited. done_s: its usual time."""
         pace = (self._clock() - self._started_s + TRUSTED_S) / (done_s + TRUSTED_S)
         return min(max(pace, LEAST_PACE), MOST_PACE)

@@ -1,4 +1,4 @@
-"""How a stage of a reconstruction reports its progress to its caller, and learns that it must stop."""
+"""Callbacks by which a stage of a reconstruction reports progress and learns that it must stop."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from intrasplat.errors import Cancelled
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of progress. fraction is of the stage, in [0, 1].
+    """One report of progress. fraction is the finished part of the stage, in [0, 1].
 
-    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and of the right eye, if any. Some
-    reports tell the clip's frames, and the megapixels of all of them of one eye; else both are 0.
+    psnr_db and psnr_right_db are the last held-out psnr_tissue of the left and the right eye, if any. Some reports have
+    the clip's number of frames, and the megapixels of all frames of one eye; else both are 0.
     """
 
     stage: str
@@ -28,7 +28,7 @@ class Progress:
     megapixels: float = 0.0
 
     def __str__(self) -> str:
-        """One line for people, such as `train 25 %, 31.2 dB, 42 s left`."""
+        """One readable line, such as `train 25 %, 31.2 dB, 42 s left`."""
         parts = [f"{self.stage} {self.fraction:.0%}"]
         if self.psnr_db is not None:
             parts.append(f"{self.psnr_db:.1f} dB")
@@ -43,17 +43,16 @@ def ignore(*arguments: object) -> None:
 
 
 def never() -> bool:
-    """A question that is always answered with no."""
+    """A should_stop that is always False."""
     return False
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """The caller's callbacks: both are called between two steps of the work (worker/hang.py
-    has the longest).
+    """The caller's callbacks. The first two are called between steps of the work (worker/hang.py has the longest step).
 
-    on_first_moment gets a DepthClip of one frame (intrasplat/clip/types.py), as soon as a training frame has depth:
-    long before the others have. It is called at most once, by the thread that calls the stage.
+    on_first_moment gets a DepthClip of one frame (intrasplat/clip/types.py) as soon as the first training frame has
+    depth. It is called at most once, by the thread that calls the stage.
     """
 
     on_progress: Callable[[Progress], None] = ignore
@@ -61,7 +60,7 @@ class Hooks:
     on_first_moment: Callable[[Any], None] = ignore
 
     def report_stage(self, stage: str, fraction: float) -> None:
-        """Report how far a stage has come.
+        """Report the finished fraction of a stage.
 
         Raises:
             Cancelled: the caller wants to stop.

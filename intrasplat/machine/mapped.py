@@ -1,7 +1,7 @@
-"""Large arrays in files without a name, mapped: the system keeps as much of them in memory as it has room for.
+"""Large arrays mapped from unnamed files: the system caches as much of them as fits into memory.
 
-A process's resident memory counts the pages of such an array that it has touched, until it lets go of them. They stay
-in the system's page cache, which gives way to whatever needs the memory.
+A process's resident memory includes the pages of such an array that it has touched, until let_go(). The pages then
+remain in the system's page cache, which shrinks when memory is needed.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import DTypeLike, NDArray
 from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
 
 AROUND_BYTES = 1 << 16
-"""Linux maps so much around what is asked for: what lies beside an array is let go with it."""
+"""Linux maps this much around an accessed page, so pages beside an array are released with it."""
 
 
 def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Zeros in a file in tempfile.gettempdir(), which is gone with the last array that views it.
+    """An array of zeros in a file in tempfile.gettempdir(), which is deleted with the last view of the array.
 
     Raises:
         StoreFullError: the disk is full.
@@ -29,7 +29,7 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     needed_bytes = max(int(np.prod(shape)) * np.dtype(dtype).itemsize, 1)
     with tempfile.TemporaryFile(prefix="intrasplat-") as file:
         try:
-            if hasattr(os, "posix_fallocate"):  # else a full disk would end the process when it writes
+            if hasattr(os, "posix_fallocate"):  # reserve: else a full disk would kill the process (SIGBUS) on writing
                 os.posix_fallocate(file.fileno(), 0, needed_bytes)
             else:
                 file.truncate(needed_bytes)
@@ -42,7 +42,7 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def let_go(array: NDArray[Any]) -> None:
-    """Take what a contiguous array views of a file out of this process's memory. It comes back when it is asked for.
+    """Release the pages of a contiguous mapped array from this process's memory. Access reads them back.
 
     Does nothing to an array that is not mapped for writing, as those of mapped_zeros are.
     """

@@ -1,4 +1,4 @@
-"""Memory that has been freed goes back to the system, as far as the C library is glibc."""
+"""Returns freed memory to the system, if the C library is glibc."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import ctypes
 from functools import cache
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Of glibc's mallopt."""
+"""Parameters of glibc's mallopt."""
 USUAL_BYTES, LITTLE_BYTES = 64 << 20, 16 << 20
-"""The first is as much as glibc comes to keep by itself. Keeping little slows what allocates much, as stereo does."""
+"""The first is what glibc finally keeps by itself. A small value slows code that allocates much, such as stereo."""
 
 
 def keep_free_memory(most_bytes: int) -> None:
-    """Return free memory to the system; from here on glibc keeps at most so much for later at the end of each heap.
+    """Return free memory to the system; from now on glibc keeps at most most_bytes at the end of each heap.
 
-    Each thread that has allocated has a heap. An array of half as much lies in none, and is returned when it is freed.
+    Each thread that has allocated has a heap. An array of half that size lies outside heaps and is returned when freed.
     """
     libc = _glibc()
     if libc is not None:

@@ -1,4 +1,4 @@
-"""How much memory this process may use: the machine's, or less where a container or a service unit is limited."""
+"""The memory that this process may use: the machine's, or less in a container or a service unit with a limit."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path, PurePosixPath
 CONTROL_GROUPS = Path("/sys/fs/cgroup")
 OWN_GROUPS = Path("/proc/self/cgroup")
 LIMIT_FILES = {"": "memory.max", "memory": "memory.limit_in_bytes"}
-"""By the controllers of a line of OWN_GROUPS: version 2 names none there."""
+"""Limit files by the controller in a line of OWN_GROUPS; the empty name is that of cgroup version 2."""
 
 
 def memory_bytes(groups: Path = CONTROL_GROUPS, own: Path = OWN_GROUPS) -> int | None:
-    """The least of the machine's memory and the limits of this process's control groups; None: nothing tells.
+    """The minimum, in bytes, of the machine's memory and the limits of this process's control groups; None: unknown.
 
     Args:
-        groups: where the control groups are mounted.
-        own: the file that names this process's.
+        groups: mount point of the control groups.
+        own: the file that names this process's groups.
     """
     return min((*_of_machine(), *_limits(groups, own)), default=None)
 
@@ -25,15 +25,15 @@ def memory_bytes(groups: Path = CONTROL_GROUPS, own: Path = OWN_GROUPS) -> int |
 def _of_machine() -> Iterator[int]:
     try:
         found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # not every system tells
+    except (AttributeError, OSError, ValueError):  # not available on every system
         return
     if found > 0:
         yield found
 
 
 def _limits(groups: Path, own: Path) -> Iterator[int]:
-    """Of the groups and of all above them. In a container the path may be the host's, which is not there: the
-    container's own group is mounted where the host's topmost would be."""
+    """Limits of the groups and of all their parents. In a container the path may be the host's, which does not exist
+    there: the container's own group is mounted in place of the host's root group."""
     try:
         lines = own.read_text().splitlines()
     except OSError:
@@ -46,5 +46,5 @@ def _limits(groups: Path, own: Path) -> Iterator[int]:
         for folder in (below, *below.parents):
             try:
                 yield int((groups / controllers / folder / LIMIT_FILES[controllers]).read_text())
-            except (OSError, ValueError):  # not there, or "max"
+            except (OSError, ValueError):  # no such file, or "max"
                 continue

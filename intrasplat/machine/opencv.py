@@ -1,4 +1,4 @@
-"""OpenCV on one thread of its own, while this program's threads call it side by side; and without its remarks."""
+"""Limits OpenCV to one thread, while this program's threads call it in parallel; and silences its messages."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from contextlib import contextmanager
 import cv2
 
 STDERR = 2
-"""Its file descriptor, to which libraries write."""
+"""File descriptor of stderr, to which libraries write."""
 
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """Within it OpenCV does not split its loops; the former setting, which is the whole process's, comes back after.
+    """Context manager in which OpenCV does not split its loops; afterwards the process-wide setting is restored.
 
-    How OpenCV splits a loop depends on which of its threads are free. With callers side by side that is a matter of
-    chance, and now and then a few pixels of depth came out otherwise: a stopped run did not find its input again.
+    OpenCV splits a loop by its number of free threads, which is random with parallel callers. A few pixels of depth
+    then differed at times, and a stopped run did not find its input again.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -30,8 +30,8 @@ def one_opencv_thread() -> Iterator[None]:
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Within it the process has no stderr: OpenCV remarks on every WebM it writes that VP9 has no tag there, and that
-    cannot be turned off otherwise. For commands with one thread, around calls whose failure is told by other means.
+    """Context manager without stderr: nothing else silences OpenCV's message, on every WebM it writes, that VP9 has no
+    tag there. For commands with one thread, around calls whose failure is detected by other means.
     """
     sys.stderr.flush()
     kept = os.dup(STDERR)

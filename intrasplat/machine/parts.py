@@ -1,4 +1,4 @@
-"""Work that is done in parts, so that whoever does it may do something else between two of them, or stop."""
+"""Work in parts, so that its caller can do something else between two parts, or stop."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TypeAlias, TypeVar
 T = TypeVar("T")
 
 Parts: TypeAlias = Generator[None, None, T]
-"""A generator that yields after each part of the work but the last, and returns the result. close() abandons the work.
+"""A generator that yields after each part of the work except the last, and returns the result. close() cancels it.
 
 Several may be advanced in turn, each by one thread at a time."""
 
 
 def whole(parts: Parts[T]) -> T:
-    """The result, with all parts done now. Raises whatever a part raises."""
+    """The result, after running all parts now. Raises as the parts do."""
     while True:
         try:
             next(parts)

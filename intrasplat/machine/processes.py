@@ -1,4 +1,4 @@
-"""How this process ends: by a signal, or together with its parent."""
+"""Ends this process on a signal, or together with its parent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def told_to_end() -> threading.Event:
-    """An event that is set at the first SIGINT or SIGTERM from now on; for the main thread."""
+    """An event that the next SIGINT or SIGTERM sets. Call it from the main thread."""
     end = threading.Event()
     signals: queue.SimpleQueue[None] = queue.SimpleQueue()
 
@@ -24,8 +24,8 @@ def told_to_end() -> threading.Event:
         signals.get()
         end.set()
 
-    # A handler interrupts the main thread anywhere, also while that holds the lock that end.set() needs, and would wait
-    # for itself. SimpleQueue.put() is safe there.
+    # A handler may interrupt the main thread while that thread has the lock that end.set() needs: a deadlock.
+    # SimpleQueue.put() is safe in a handler.
     threading.Thread(target=wait, name="signals", daemon=True).start()
     for number in _ENDING:
         signal.signal(number, lambda *_: signals.put(None))
@@ -34,7 +34,7 @@ def told_to_end() -> threading.Event:
 
 @contextmanager
 def heeding_signals() -> Iterator[threading.Event]:
-    """told_to_end() as long as the with statement lasts; afterwards signals do what they did before."""
+    """Context manager around told_to_end(); afterwards the previous signal handlers are restored."""
     before = {number: signal.getsignal(number) for number in _ENDING}
     try:
         yield told_to_end()
@@ -44,10 +44,10 @@ def heeding_signals() -> Iterator[threading.Event]:
 
 
 def die_with_parent() -> None:
-    """From now on this process is killed when the thread that started it ends, kill -9 included (Linux only)."""
+    """From now on the kernel kills this process when the thread that started it ends, however it ends (Linux only)."""
     if not sys.platform.startswith("linux"):
         return
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it died just before
+    if os.getppid() != parent:  # the parent ended before prctl
         os.kill(os.getpid(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Clocks of a run: seconds by stage, and seconds of training without what does not count as training."""
+"""Clocks of a run: seconds per stage, and seconds of training without pauses."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from contextlib import contextmanager
 
 
 class Timings:
-    """Seconds by stage."""
+    """Seconds per stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     def add(self, stage: str, seconds: float) -> None:
-        """Add to what the stage has taken so far."""
+        """Add seconds to the stage."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
     @contextmanager
@@ -32,7 +32,7 @@ class Stopwatch:
         self.restart(elapsed_s)
 
     def restart(self, elapsed_s: float = 0.0) -> None:
-        """Go on from elapsed_s."""
+        """Continue from elapsed_s."""
         self._start, self._paused = time.perf_counter() - elapsed_s, 0.0
 
     @property
@@ -41,7 +41,7 @@ class Stopwatch:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Do not count the duration of the block."""
+        """Exclude the duration of the block."""
         start = time.perf_counter()
         yield
         self._paused += time.perf_counter() - start

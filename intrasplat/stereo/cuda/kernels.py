@@ -1,4 +1,4 @@
-"""The parts of matching that are not plain tensor operations: census words, costs, paths, winners, the line solver.
+"""Triton kernels of matching: census words, costs, paths, winners, the line solver; the rest is tensor operations.
 
 Symbols: F frames of h w pixels; D disparities, low <= d < low + D, of which index i is low + i; a point at x in the
 left eye is at x - d in the right one. Volumes are [F, h, w, D], D fastest. LANES is the power of two from D up.
@@ -8,10 +8,10 @@ All volumes together have fewer than 2^31 entries (matching.VOLUME_BYTES), so pl
     L_r(p, i) = C(p, i) + min(L_r(p - r, i), L_r(p - r, i +- 1) + P1, min L_r(p - r) + P2) - min L_r(p - r)
     S(p, i)   = sum over the four directions r of L_r(p, i)          (Hirschmueller 2008, eq. 13, 14)
 
-Layout. A disparity is a lane, so that a step along a path is elementwise but for one minimum and the look at both
-neighbours, which are shuffles within a warp. A program is one warp and its steps wait for each other: what keeps the
-processor busy is the number of lines, some hundred per frame, so many frames are matched at once. The line solver has a
-line per lane. Images at the margin repeat their last pixel.
+Layout. A disparity is a lane, so a step along a path is elementwise, except one minimum and the access to both
+neighbours, which are shuffles within a warp. A program is one warp, whose steps are sequential. Many lines keep the GPU
+busy; a frame has some hundred, so many frames are matched at once. The line solver has a line per lane. Images are
+extended by their border pixels.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import triton.language as tl
 BLOCK_PX = 5
 """Side of the square over which a pixel's costs are summed."""
 BEYOND = 1 << 12
-"""Cost and sum of lanes beyond D: more than any true one, which is at most 4 (24 BLOCK_PX^2 + P2)."""
+"""Cost and sum of lanes beyond D: more than any real one, which is at most 4 (24 BLOCK_PX^2 + P2)."""
 PACKED = 512
-"""Sums and indices are compared together, as sum * PACKED + index: no range has more disparities."""
+"""Sums and indices are compared together, as sum * PACKED + index; it is the maximum number of disparities."""
 
 _kernel = triton.jit(
     do_not_specialize=[
@@ -32,7 +32,7 @@ _kernel = triton.jit(
         "line_stride", "step_stride", "frame_size", "small", "large",
     ]
 )  # fmt: skip
-"""A clip of another size is matched by the kernels that are compiled already."""
+"""Sizes are not specialised, so a clip of another size uses the kernels that are compiled already."""
 
 _RADIUS = tl.constexpr(BLOCK_PX // 2)
 _BEYOND = tl.constexpr(BEYOND)
@@ -41,7 +41,7 @@ _PACKED = tl.constexpr(PACKED)
 
 @triton.jit
 def _shifted(pixel, dy, dx, height, width):  # type: ignore[no-untyped-def]
-    """The pixel (of any frame) dy rows below and dx columns to the right, or the last one of the image on the way."""
+    """The pixel (of any frame) dy rows below and dx columns to the right, clamped to the image."""
     x, y = pixel % width, pixel // width % height
     to_y, to_x = tl.minimum(tl.maximum(y + dy, 0), height - 1), tl.minimum(tl.maximum(x + dx, 0), width - 1)
     return pixel + (to_y - y) * width + to_x - x
@@ -64,7 +64,7 @@ def census(image, words, pixels, height, width, PIXELS: tl.constexpr):  # type: 
 
 @triton.jit
 def _bits_by_byte(word):  # type: ignore[no-untyped-def]
-    """Bits that are set in each byte of a word of 24 bits: the first steps of counting them all."""
+    """The number of set bits in each byte of a 24-bit word: the first steps of a population count."""
     word = word - ((word >> 1) & 0x555555)
     word = (word & 0x333333) + ((word >> 2) & 0x333333)
     return (word + (word >> 4)) & 0x0F0F0F
@@ -108,9 +108,9 @@ def block_costs(  # type: ignore[no-untyped-def]
 def _follow(  # type: ignore[no-untyped-def]
     cost_at, sum_at, stride, length, there, lane, small, large, ADD: tl.constexpr, LANES: tl.constexpr
 ):  # fmt: skip
-    """L from the pixels at cost_at and sum_at on, written to the sums or added; returns where the last was.
+    """Compute L along a line from cost_at and sum_at, and write or add it to the sums; returns the last positions.
 
-    What the next step reads is loaded one step early: the steps wait for each other, and for nothing else.
+    Each step's input is loaded one step early, so that steps wait for each other alone, not for memory.
     """
     path = tl.zeros(there.shape, tl.int32)  # in front of the first pixel: there L is the cost
     to_nearer = tl.broadcast_to(tl.maximum(lane - 1, 0), there.shape)
@@ -126,7 +126,7 @@ def _follow(  # type: ignore[no-untyped-def]
         if ADD:
             next_before = tl.load(sum_at + stride, mask=more, other=0).to(tl.int32)
         least = tl.min(path, 1)[:, None]
-        # At either end the neighbour is the lane itself, which at the price of a step is never the least.
+        # At either end the neighbour is the lane itself, which at the cost of a step is never the minimum.
         neighbour = tl.minimum(tl.gather(path, to_nearer, 1), tl.gather(path, to_farther, 1))
         path = cost + tl.minimum(tl.minimum(path, neighbour + small) - least, large)
         tl.store(sum_at, (path + before).to(tl.int16), mask=there)
@@ -143,8 +143,8 @@ def add_paths(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Follow `lines` parallel lines of every frame there and back: sums int16 [F, h, w, D] gains both L.
 
-    Pixel k of line j of a frame is the frame's pixel j line_stride + k step_stride; small is P1, large P2. Without ADD
-    sums is new: what lies in it is not read.
+    Pixel k of line j of a frame is the frame's pixel j line_stride + k step_stride; small is P1, large P2. Without ADD,
+    sums is overwritten.
     """
     line = (tl.program_id(0) * LINES + tl.arange(0, LINES))[:, None]
     lane = tl.arange(0, LANES)[None, :]
@@ -158,7 +158,7 @@ def add_paths(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _winner(sums, at, there, lane):  # type: ignore[no-untyped-def]
-    """Index of the least sum of each row [PIXELS], the first where several are, and that sum."""
+    """The index of the minimum sum of each row [PIXELS], the first of equal ones, and that sum."""
     both = tl.load(sums + at, mask=there, other=_BEYOND).to(tl.int32) * _PACKED + lane
     least = tl.min(both, 1)
     return least % _PACKED, least // _PACKED
@@ -170,8 +170,8 @@ def winners(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Disparities float32 [F, h, w] of both eyes' pixels, the left ones' to fractions of a pixel.
 
-    The right eye's pixel x sees at disparity d what the left one sees at x + d. Costs grow about linearly away from
-    the best match, so its fraction is where two lines of equal and opposite slope through the neighbours meet.
+    The right eye's pixel x matches the left eye's x + d at disparity d. Costs grow about linearly away from the best
+    match, so its fraction is where two lines of equal and opposite slope through the neighbours intersect.
     """
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     lane = tl.arange(0, LANES)[None, :]
@@ -201,7 +201,7 @@ def smooth_lines(  # type: ignore[no-untyped-def]
     A is the Laplacian of a chain whose links weigh 2^(-steepness |difference of guide|). guide uint8, first, second and
     the scratch kept float32 [F, h, w]; lines as in add_paths. The system is tridiagonal (Thomas's algorithm): forward
     u_k = (v_k + a u_(k-1)) / (1 + a + c - a g_(k-1)), g_k = c / (the same), with links a before and c behind; then
-    backward u_k += g_k u_(k+1). All of it is a mean with positive weights, so nothing can blow up.
+    backward u_k += g_k u_(k+1). The result is a mean with positive weights, so it is stable.
     """
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     there = line < lines

@@ -2,9 +2,9 @@
 
 Symbols: F frames, H W pixels of one eye; h w pixels the matcher works on, D disparities; d disparity in px.
 
-Reduced images are matched by census costs along four directions (kernels.py). The right eye's disparities are read
-from the same sums; where both agree, an edge-aware least-squares filter (Min et al. 2014) starts, fills the rest, and
-one Lucas-Kanade step along the row at full resolution restores the sub-pixel part.
+Reduced images are matched by census costs along four directions (kernels.py). The right eye's disparities come from the
+same sums. An edge-aware least-squares filter (Min et al. 2014) smooths disparities on which both eyes agree and fills
+the rest. One Lucas-Kanade step along the row at full resolution restores the sub-pixel part.
 """
 
 from __future__ import annotations
@@ -64,21 +64,21 @@ Greys = NDArray[np.uint8]  # [F, H, W]
 SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 12, 100
 """P1 and P2 against costs of up to 24 bits per pixel of the block: a half and four bits per pixel."""
 FILTER_PASSES, FILTER_EASING = 3, 0.25
-"""The filter alternates rows and columns so often, each time with this share of the strength before."""
+"""Number of passes over rows and columns; each pass has this share of the previous strength."""
 AGREEMENT_PX = 1.5
-"""Of the reduced image: by more the disparities of both eyes contradict each other."""
+"""Largest difference, px of the reduced image, between consistent disparities of both eyes."""
 MIN_LANES = 32
 VOLUME_BYTES = 1 << 30
-"""Of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
+"""Size of the cost volumes at a time: some seventy frames, whose lines are enough for a large GPU."""
 PIXELS_AT_ONCE = 1 << 25
-"""Of full resolution, for the same reason: refining keeps about a dozen float32 of each."""
+"""Pixels of full resolution at a time; refinement needs about a dozen float32 for each."""
 BYTES_A_COST = 5
-"""int16 for the cost and the sum, and the uint8 of the sums over columns."""
+"""int16 for the cost and for the sum, and uint8 for column_costs."""
 
 
 @dataclass(frozen=True)
 class _Share:
-    """What one program of a kernel takes: pixels, pixels with their lanes, lines with their lanes, bare lines."""
+    """The work of one kernel program: pixels, pixels with lanes, lines with lanes, lines without lanes."""
 
     pixels: int
     costs: int
@@ -87,11 +87,11 @@ class _Share:
 
 
 ON_GPU = _Share(pixels=256, costs=16, paths=2, lines=32)
-INTERPRETED = _Share(pixels=4096, costs=4096, paths=512, lines=512)  # it takes time by program, hardly by number
+INTERPRETED = _Share(pixels=4096, costs=4096, paths=512, lines=512)  # its time grows with programs, hardly with size
 
 
 def frames_at_once(height: int, width: int, plan: MatchPlan) -> int:
-    """How many pairs of H x W pixels go through match_frames together."""
+    """The number of pairs of H x W pixels that match_frames processes together."""
     (h, w), _, count = _reduced(height, width, plan)
     return max(1, min(VOLUME_BYTES // (BYTES_A_COST * h * w * count), PIXELS_AT_ONCE // (height * width)))
 
@@ -99,7 +99,7 @@ def frames_at_once(height: int, width: int, plan: MatchPlan) -> int:
 def depth_of(
     left: Greys, right: Greys, tissue: NDArray[np.bool_], plan: MatchPlan, focal_baseline: float, offset_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth in mm, 0 where it is invalid, and its confidence, 0 at the same pixels, of pairs [F, H, W] on the host."""
+    """Depth in mm and confidence of pairs [F, H, W] in host memory; both are 0 at invalid pixels."""
     left_eye, right_eye, shown = (torch.from_numpy(each).to(_device()) for each in (left, right, tissue))
     disparity, confidence = match_frames(left_eye, right_eye, plan, shown)
     nearest_mm, farthest_mm = plan.depth_range_mm
@@ -111,7 +111,7 @@ def depth_of(
 
 
 def match_frames(left: Tensor, right: Tensor, plan: MatchPlan, tissue: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Disparity float32 in px and confidence uint8 of pairs uint8 [F, H, W], on their device; see matching.match.
+    """Disparity float32 in px and confidence uint8 of pairs uint8 [F, H, W], on their device; as stereo/matching.match.
 
     tissue: bool [F, H, W], of the left eye; None: all is tissue.
     """
@@ -144,7 +144,7 @@ def match_frames(left: Tensor, right: Tensor, plan: MatchPlan, tissue: Tensor | 
 
 
 def _evidence(found: Tensor, consistency: Tensor, image: Tensor) -> Tensor:
-    """As matching.evidence, from a consistency that knows the disparities' roughness."""
+    """As matching.evidence, from a consistency that includes the disparities' roughness."""
     values = image.float()
     values = functional.pad(values - _box(values, CONTRAST_PX), (1, 1), mode="reflect")
     texture = _box((0.5 * (values[:, :, 2:] - values[:, :, :-2])).square(), EVIDENCE_PX)
@@ -155,7 +155,7 @@ def _evidence(found: Tensor, consistency: Tensor, image: Tensor) -> Tensor:
 
 
 def _beside_instruments(found: Tensor, trust: Tensor, instrument: Tensor) -> Tensor:
-    """As matching.beside_instruments, of frames [F, h, w]."""
+    """As matching.beside_instruments, for frames [F, h, w]."""
     reach = BESIDE_INSTRUMENTS_PX
     beside = functional.max_pool2d(instrument.float(), 2 * reach + 1, 1, reach) > 0
     surface = ~beside & (trust >= SURE_TRUST)
@@ -202,7 +202,7 @@ def _device() -> str:
 
 
 def _reduced(height: int, width: int, plan: MatchPlan) -> tuple[tuple[int, int], int, int]:
-    """Size (h, w) of the reduced images, and their least disparity and number of disparities."""
+    """Size (h, w) of the reduced images, their minimum disparity and number of disparities."""
     factor = -(-width // MATCHING_WIDTH)
     size = (round(height / factor), round(width / factor))
     scale = size[1] / width
@@ -272,7 +272,7 @@ def _disagreement(disparity: Tensor, opposite: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _consistency(disparity: Tensor, opposite: Tensor) -> Tensor:
-    """[F, h, w] in [0, 1]: 0 where the eyes contradict each other, low where the disparity is rough in either."""
+    """Weight [F, h, w] in [0, 1]: 0 where the eyes disagree, low where the disparity is rough in either eye."""
     difference, match = _disagreement(disparity, opposite)
     smooth, opposite_smooth = _smoothness(disparity), _smoothness(opposite)
     return torch.where(difference < AGREEMENT_PX, torch.minimum(smooth, opposite_smooth.gather(2, match)), 0.0)
@@ -285,7 +285,7 @@ def _smoothness(disparity: Tensor) -> Tensor:
 
 
 def filled(disparity: Tensor, trust: Tensor, guide: Tensor) -> Tensor:
-    """The trusted disparities' mean along paths without edges of guide uint8 [F, h, w]; it reaches every pixel."""
+    """Edge-aware weighted mean of the trusted disparities, guided by guide uint8 [F, h, w]; it fills every pixel."""
     share = _share()
     frames, h, w = disparity.shape
     weighted, weight, kept = disparity * trust, trust.clone(), torch.empty_like(trust)
@@ -329,7 +329,7 @@ def _window(size_px: int, fineness: float) -> int:
 
 
 def _box(image: Tensor, size: int) -> Tensor:
-    """Means over squares of an odd number of pixels [F, H, W]; beyond the margin the image is mirrored."""
+    """Means over squares with an odd side [F, H, W]; the image is mirrored at its border."""
     radius = size // 2
     wide = functional.pad(image, (radius, radius, radius, radius), mode="reflect")
     return functional.avg_pool2d(functional.avg_pool2d(wide, (1, size), 1), (size, 1), 1)
