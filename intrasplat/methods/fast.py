@@ -111,7 +111,8 @@ DEPARTURES = (
     #
     # Rates rise again when the iterations have doubled, and the last models of each cycle are averaged
     # (intrasplat/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one
-    # number. Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
+    # number.
+    # Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
     Departure("warm restarts and averages", {"warm_restarts": True}, needs=("no densification",)),
     # A run with a budget ends if doubling its iterations gained less on validation frames (docs/decisions/training.md).
     # Gain: phantom-pull -0.15 dB, -19 s; d4d-a-320x256 -0.08 dB, +2 s.

@@ -1,6 +1,6 @@
 """Times rasterize() against its own reference and against gsplat's plain-torch path, on the same Gaussians.
 
-    python lab/benchmarks/bm_rasterize.py [--gsplat FOLDER] [--repeats 9] [--csv docs/results/rasterize.csv]
+    python -m lab.benchmarks.bm_rasterize [--gsplat FOLDER] [--repeats 9] [--csv lab/rows/rasterize.csv]
 
 All run on the processor, in float32, in turn within each round: forward, and forward with all gradients of a random
 projection of colour, depth and alpha. Figures are medians of the rounds in ms, with the least beside them.

@@ -150,7 +150,7 @@ def test_a_key_without_the_scope_sees_the_stream(tmp_path: Path, driver: webdriv
 
 @pytest.mark.parametrize("damage", ["bytes", "kind"])
 def test_what_cannot_be_drawn_here_is_drawn_by_the_service(site: Site, page: Drawn, damage: str) -> None:
-    scene = site.scene(model=random_scene("hexplane") if damage == "kind" else scattered(10, moves=False))
+    scene = site.scene(model=random_scene("fdm-gaussian") if damage == "kind" else scattered(10, moves=False))
     page.press(scene, "View")
     page.until_state("live")  # the worker has it in memory
     if damage == "bytes":

@@ -241,11 +241,3 @@ def test_a_folder_without_a_scene_is_a_bad_input(tmp_path: Path, capsys: pytest.
     for folder in (tmp_path, tmp_path / "nosuch"):
         assert main(["render", str(folder), "--t", "0", "--out", str(tmp_path / "a.png")]) == ExitCode.BAD_INPUT
         assert "reconstruct --out" in capsys.readouterr().err
-
-
-def test_consume_without_a_queue_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv("REDIS_URL", raising=False)
-    assert main(["consume"]) == ExitCode.UNAVAILABLE
-    assert "intrasplat up" in capsys.readouterr().err

@@ -127,7 +127,9 @@ def test_a_wrong_kernel_casts_doubt_on_what_follows_and_a_part_without_end_is_ki
         (tmp_path / f"{name}.py").write_text(f"import sys, time\n{text}\n")
     monkeypatch.setattr(check, "GRACE_S", 0.2)
     # a part gets what those before it left over; the last one has all but two seconds of that taken away
-    parts = [check.Part(name, seconds, tmp_path) for name, seconds in (("correct", 20), ("speed", 20), ("train", -38))]
+    parts = [
+        check.CheckPart(name, seconds, tmp_path) for name, seconds in (("correct", 20), ("speed", 20), ("train", -38))
+    ]
     begun = time.monotonic()
     options = ["--out", str(tmp_path), "--work", str(tmp_path), "--seed", "1"]
     failures = check.run_parts(parts, options, check.environment(tmp_path, interpret=True))

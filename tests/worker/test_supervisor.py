@@ -31,6 +31,7 @@ from intrasplat.train.request import ReconstructionRequest
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.contract.queues import RunningServer, valkey_binary
 from tests.worker.jobs import STANDIN, WAIT_S, Jobs, eventually
+from worker.__main__ import main
 from worker.supervisor import run_supervisor
 
 LEASE_S = 6.0
@@ -216,3 +217,11 @@ def test_the_supervisor_loads_nothing_that_could_hang_or_eat_memory() -> None:
     command = [sys.executable, "-c", program]
     result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.split() == []
+
+
+def test_consume_without_a_queue_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("REDIS_URL", raising=False)
+    assert main(["consume"]) == ExitCode.UNAVAILABLE
+    assert "intrasplat up" in capsys.readouterr().err

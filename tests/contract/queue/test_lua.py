@@ -26,5 +26,5 @@ def test_a_script_begins_with_its_flags_and_says_what_it_does(name: str) -> None
 
 
 def test_the_wheel_carries_the_scripts() -> None:
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    project = tomllib.loads((REPOSITORY / "service" / "pyproject.toml").read_text())
     assert "scripts/*.lua" in project["tool"]["setuptools"]["package-data"]["contract.queue"]

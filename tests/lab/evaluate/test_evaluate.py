@@ -136,8 +136,8 @@ def test_the_command_of_a_file_has_what_it_was_read_with(tmp_path: Path) -> None
     source = source_of(str(clip), {"layout": "sbs", "mask_polarity": "auto"})
     (cell,) = plan([source.name], ["fast"], ["every8"], [3], budgets_s=[6])
     asked = f"evaluate '{clip}' --layout sbs --mask-polarity auto --series fast --holdout every8 --seeds 3 --budget-s 6"
-    assert command_of(cell, source) == f"intrasplat {asked} --out DIR"
-    assert command_of(cell, source, "cuda") == f"intrasplat {asked} --out DIR --device cuda"
+    assert command_of(cell, source) == f"python -m lab {asked} --out DIR"
+    assert command_of(cell, source, "cuda") == f"python -m lab {asked} --out DIR --device cuda"
 
 
 def test_the_seconds_of_a_row_are_those_of_a_run_that_nobody_evaluates() -> None:

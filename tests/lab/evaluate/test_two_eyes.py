@@ -30,8 +30,8 @@ def test_a_benchmark_of_both_eyes_goes_on_where_it_was_stopped_and_the_page_has_
     assert main([*asked, "--eyes", "both", "--again"]) == 0
     assert [row["series"] for row in read_rows(tmp_path / TWO_EYES)] == ["fast:eyes=left", "fast"]
     page = "".join(two_eyes_sections(tmp_path))
-    assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations | 1 |" in page
-    assert "| clip | held out | series | limit | seeds | 10 degrees | bound |" in page
+    assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations |" in page
+    assert "| clip | held out | series | limit | left, dB | right, dB | warp, dB | 10 degrees |" in page
 
 
 def test_a_run_that_fails_is_said_and_has_no_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
