@@ -35,6 +35,16 @@ def pose_gradient(rows: Tensor, like: Tensor) -> Tensor:
     return pose
 
 
+def refuse_second_derivatives() -> None:
+    """To be called first in a backward of kernels: torch would take their gradients for constants.
+
+    Raises:
+        RuntimeError: this backward runs with create_graph=True.
+    """
+    if torch.is_grad_enabled():
+        raise RuntimeError("the kernels compute first derivatives only: differentiate twice with the reference")
+
+
 def stacked(v_rgb: Tensor, v_depth: Tensor, v_alpha: Tensor) -> Tensor:
     """Cotangents of rgb [H, W, 3], depth and alpha [H, W] as the kernels read them: [5, H, W] float32."""
     return torch.cat([v_rgb.permute(2, 0, 1), v_depth[None], v_alpha[None]]).float().contiguous()

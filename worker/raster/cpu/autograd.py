@@ -17,6 +17,7 @@ from worker.raster.autograd import (
     opacity_gradient,
     pose_gradient,
     rasterize_by,
+    refuse_second_derivatives,
     scale_gradient,
     stacked,
 )
@@ -48,6 +49,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_second_derivatives()
         scale, logit, camera_from_world = ctx.saved_tensors
         gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents).numpy())
         state = torch.from_numpy(gradients.state[:, : ctx.count].T.copy())

@@ -9,7 +9,15 @@ from torch import Tensor
 
 from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster import Camera, Rendered
-from worker.raster.autograd import logit_of, opacity_gradient, pose_gradient, rasterize_by, scale_gradient, stacked
+from worker.raster.autograd import (
+    logit_of,
+    opacity_gradient,
+    pose_gradient,
+    rasterize_by,
+    refuse_second_derivatives,
+    scale_gradient,
+    stacked,
+)
 from worker.raster.cuda.rasterizer import CudaRasterizer
 from worker.raster.step import camera_vector
 
@@ -41,6 +49,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_second_derivatives()
         scale, logit, camera_from_world = ctx.saved_tensors
         gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents)[None], pose=True)
         state = gradients.state[0].T.clone()
