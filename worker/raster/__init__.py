@@ -2,6 +2,8 @@
 
     rasterize(mean, quaternion, scale, opacity, colour, camera) -> Rendered
 
+rasterize.py joins the backends behind one public function of several cameras, in gsplat's names.
+
 Symbols: N Gaussians, H W pixels (rows i, columns j), T transmittance. Lengths in optimiser units. Names in capitals are
 the bounds of worker/model/constants.py.
 
