@@ -5,7 +5,7 @@
 All run on the processor, in float32, in turn within each round: forward, and forward with all gradients of a random
 projection of colour, depth and alpha. Figures are medians of the rounds in ms, with the least beside them.
 
-gsplat is not installed here. A folder for --gsplat is made by
+gsplat is no requirement of this project. To make a folder for --gsplat:
 
     pip install --target FOLDER rich && pip install --target FOLDER --no-deps gsplat==1.5.3
 
@@ -46,7 +46,7 @@ WIDE_PX = 0.9
 """Standard deviation of an average Gaussian as a share of the mean distance between Gaussians on the image."""
 TILE = 16
 MAX_SECONDS = 30.0
-"""Spent on one size; after three rounds no other is begun beyond it."""
+"""No further round of a size begins after this long, once there are three."""
 FIELDS = (
     "renderer", "gaussians", "width", "height", "forward_ms", "least_forward_ms", "stand_ins_ms", "both_ms",
     "least_both_ms", "clock", "threads", "load_1min", "machine", "commit",

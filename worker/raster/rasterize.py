@@ -132,7 +132,9 @@ def rasterize(
     cameras = _cameras(viewmats * _with_translation(units, viewmats), Ks, width, height)
     gaussians = (means * units, quats, scales * units, opacities)
     by_camera = colors if colors.ndim == 3 else colors.expand(len(cameras), *colors.shape)
-    views = [_draw_channels(draw, gaussians, own, camera) for own, camera in zip(by_camera, cameras, strict=True)]
+    # Triton launches on the current GPU; for tensors of the host this does nothing.
+    with torch.cuda.device_of(means):  # type: ignore[no-untyped-call]
+        views = [_draw_channels(draw, gaussians, own, camera) for own, camera in zip(by_camera, cameras, strict=True)]
     rgb, depth, alpha = (torch.stack(layer) for layer in zip(*views, strict=True))
     return Rasterized(rgb, depth / units, alpha)
 

@@ -141,7 +141,9 @@ def gradients(given: Inputs, cotangent: Rasterized, by: Callable[[Inputs], Raste
 
 
 def seen_by(backend: str, *, seed: int, cameras: int, channels: int | None = None) -> Inputs:
-    """Arguments that a backend can afford."""
+    """Arguments that a backend can afford; at most two cameras where kernels are interpreted."""
+    if backend == "cuda" and INTERPRETED:
+        cameras = min(cameras, 2)
     size = affordable(BACKENDS[backend], 300, width=45, height=38)
     return inputs(random_scene(**size, seed=seed), cameras, channels)
 
@@ -193,7 +195,7 @@ def test_the_gradient_of_the_pose_is_that_of_finite_differences() -> None:
 def test_one_camera_sees_what_it_sees_among_others(backend: str) -> None:
     given = seen_by(backend, seed=23, cameras=3)
     together = draw(given, backend)
-    for camera in range(3):
+    for camera in range(len(given["viewmats"])):
         one = slice(camera, camera + 1)
         alone = draw(given | {"viewmats": given["viewmats"][one], "Ks": given["Ks"][one]}, backend)
         for layer in LAYERS:
@@ -284,8 +286,9 @@ def test_memory_that_is_not_contiguous_is_read_as_it_stands(backend: str) -> Non
     given = seen_by(backend, seed=26, cameras=2)
     strided = given | {name: given[name].T.contiguous().T for name in ("means", "quats", "scales", "colors")}
     strided["viewmats"] = given["viewmats"].transpose(1, 2).contiguous().transpose(1, 2)
+    got, wanted = draw(strided, backend), draw(given, backend)
     for layer in LAYERS:
-        assert bool((getattr(draw(strided, backend), layer) == getattr(draw(given, backend), layer)).all())
+        assert bool((getattr(got, layer) == getattr(wanted, layer)).all()), layer
 
 
 def test_a_retained_graph_gives_the_same_gradients_again(backend: str) -> None:
