@@ -67,8 +67,8 @@ def rasterize(
     from it. The kernels compute first derivatives only: create_graph=True needs the reference.
 
     Lengths may have any unit, the same for means, scales, the translations of viewmats, near_plane and depth.
-    means, quats, scales, opacities and colors share one dtype and one device, which the result has, too. viewmats and
-    Ks may have another float dtype and lie on another device.
+    means, quats, scales, opacities and colors share one dtype and one device, which the result has, too: float32 or
+    float64. viewmats may have the other of the two. viewmats and Ks may lie on another device.
 
     Args:
         means: [N, 3] centres in the world.
@@ -202,8 +202,9 @@ def _check_shapes(
         raise InputError("colors", "has no channel.", "Pass one at least.")
     if len(viewmats) == 0:
         raise InputError("viewmats", "names no camera.", "Pass one at least, [1, 4, 4].")
-    if means.dtype not in (torch.float32, torch.float64):
-        raise InputError("means", f"has dtype {means.dtype}.", "Pass float32, or float64 for the reference.")
+    for name, given in (("means", means), ("viewmats", viewmats)):
+        if given.dtype not in (torch.float32, torch.float64):
+            raise InputError(name, f"has dtype {given.dtype}.", "Pass float32 or float64.")
     for name, given in gaussians.items():
         if (given.dtype, given.device) != (means.dtype, means.device):
             problem = f"is {given.dtype} on {given.device}, and means are {means.dtype} on {means.device}."

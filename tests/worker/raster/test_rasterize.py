@@ -342,6 +342,7 @@ WRONG: dict[str, tuple[str, dict[str, Any], str]] = {
     "two K": ("Ks", {"Ks": torch.eye(3).expand(2, 3, 3)}, r"not \[1, 3, 3\]"),
     "no camera": ("viewmats", {"viewmats": torch.ones(0, 4, 4), "Ks": torch.ones(0, 3, 3)}, "no camera"),
     "half precision": ("means", {"means": torch.ones(1, 3).half()}, "float16"),
+    "half a pose": ("viewmats", {"viewmats": torch.eye(4)[None].half()}, "float16"),
     "mixed precision": ("scales", {"scales": torch.ones(1, 3).double()}, "one dtype"),
     "NaN": ("means", {"means": torch.tensor([[0.0, NAN, 1.0]])}, r"nan at \[0, 1\] is not finite"),
     "infinite colour": ("colors", {"colors": torch.full((1, 3), math.inf)}, r"inf at \[0, 0\]"),
