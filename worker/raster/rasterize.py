@@ -65,7 +65,7 @@ def rasterize(
     and a Ks that requires one is refused. viewmats gets the gradient of its upper three rows, taken as twelve free
     numbers. A step along it leaves the rigid transforms, so optimise a parametrisation of the pose and build viewmats
     from it. The kernels compute first derivatives only: create_graph=True needs the reference. The first call on a
-    machine compiles the kernels, which takes about a minute; later processes load them.
+    machine compiles the kernels, about 10 s of CPU time; later processes load them.
 
     Lengths may have any unit, the same for means, scales, the translations of viewmats, near_plane and depth.
     means, quats, scales, opacities and colors share one dtype and one device, which the result has, too: float32 or
