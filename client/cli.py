@@ -2,8 +2,8 @@
 
 reconstruct, render, export, measure, phantom, evaluate, stability, doctor and worker run the worker's program on this
 machine (`python -m worker ...`), and nothing that they do not need is imported here. up starts a service, keys manages
-its API keys, audit verifies its audit, backup and restore keep it. submit, import, watch, fetch, jobs, cancel, retry,
-delete and slicer talk to a service (client/commands.py).
+its API keys, backup and restore copy it and bring it back. submit, import, watch, fetch, jobs, cancel, retry, delete
+and slicer talk to a service (client/commands.py).
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from client.audit import add_audit
 from client.backup import add_backup
 from client.keys import add_keys
 from client.remote import add_remote
@@ -63,7 +62,6 @@ def _parser() -> argparse.ArgumentParser:
     add_remote(commands)
     add_slicer(commands)
     add_keys(commands)
-    add_audit(commands)
     add_backup(commands)
     return parser
 

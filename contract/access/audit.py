@@ -2,35 +2,28 @@
 
 A line names keys, tenants and jobs by their ids, and never a file, a person or a picture. It is on disk before the act
 goes on, so an act that cannot be recorded does not happen. A reserve file of zeros shrinks piece by piece when the disk
-is full. Without it, nobody could then look at a scene or delete one. The lines are chained by hashes (chain.py).
+is full. Without it, nobody could then look at a scene or delete one.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
+import fcntl
 import os
-import re
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from contract.access.chain import HEAD_PATTERN, START, head_of
-from contract.runtime.locks import held
 from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.durable import flush
 
 AUDIT_FILE = "audit.jsonl"
 RESERVE_FILE = "audit.reserve"
-HEAD_FILE = "audit.head"
-"""The head of the chain, and the lock of whoever appends. It counts only where the audit was moved away. It is noted
-after the line, and flushed once a file: a kill in between leaves the head before that line, and a loss of power may
-leave an earlier one, which the next file then names if this one is moved away at once (chain.unnamed_lines)."""
 RESERVE_BYTES = 4 * 2**20
-"""About 12,000 lines."""
+"""About 18,000 lines."""
 RESERVE_PIECE_BYTES = 64 * 2**10
 
 
@@ -70,8 +63,6 @@ class AuditEntry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    chain: str | None = None
-    """Of chain.py, set by AuditLog.append; the first field, so that it is found in a line that was cut off."""
     time: str
     action: AuditAction
     outcome: str = "ok"
@@ -95,13 +86,11 @@ def utc_text(at_s: float) -> str:
 class AuditLog:
     """The audit log of one data directory. Any number of processes may append to it.
 
-    It is opened for each line, so it may be moved away at any time, as logrotate does; the next file goes on with its
-    chain.
+    It is opened for each line, so it may be moved away at any time, as logrotate does.
     """
 
     def __init__(self, data_dir: Path) -> None:
         self._path = data_dir.expanduser() / AUDIT_FILE
-        self._head = data_dir.expanduser() / HEAD_FILE
         self._reserve = data_dir.expanduser() / RESERVE_FILE
 
     def append(self, entry: AuditEntry) -> None:
@@ -111,10 +100,11 @@ class AuditLog:
             StoreFullError: the disk is full and the reserve is used up.
             UnavailableError: the file cannot be written for another reason.
         """
+        line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
         while True:
             try:
-                with disk_errors(), held(self._head, "the audit"):
-                    return self._write(entry)
+                with disk_errors():
+                    return self._write(line)
             except StoreFullError:
                 if not self._shrink_reserve():
                     raise
@@ -129,32 +119,22 @@ class AuditLog:
             finally:
                 os.close(descriptor)
 
-    def _write(self, entry: AuditEntry) -> None:
-        head = os.open(self._head, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        audit = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    def _write(self, line: bytes) -> None:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            size = os.fstat(audit).st_size
-            noted = os.pread(head, len(START), 0).decode("ascii", "replace")
-            if not re.fullmatch(HEAD_PATTERN, noted):
-                noted = START
-                _put(head, noted)  # from now on, writing over it needs no room
-            chained = entry.model_copy(update={"chain": head_of(audit) or noted})
-            line = chained.model_dump_json(exclude_none=True).encode()
-            is_cut_off = size > 0 and os.pread(audit, 1, size - 1) != b"\n"  # keep this one apart from it
-            text = b"\n" * is_cut_off + line + b"\n"
-            if os.write(audit, text) < len(text):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # else the truncation below could remove a line of another process
+            size = os.fstat(descriptor).st_size
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                line = b"\n" + line  # a crash cut off the last line; this one starts on its own line
+            if os.write(descriptor, line) < len(line):
                 with contextlib.suppress(OSError):
-                    os.ftruncate(audit, size)
+                    os.ftruncate(descriptor, size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            os.fsync(audit)
-            if size == 0:  # the name of the new file, and the head that it goes on from
-                os.fsync(head)
-                flush(self._path.parent)
-            with contextlib.suppress(OSError):
-                _put(head, hashlib.sha256(line).hexdigest())
+            os.fsync(descriptor)
+            if size == 0:
+                flush(self._path.parent)  # the name of the new file
         finally:
-            os.close(audit)
-            os.close(head)
+            os.close(descriptor)
 
     def _shrink_reserve(self) -> bool:
         """Return a piece of the reserve to the disk; False if nothing is left."""
@@ -164,8 +144,3 @@ class AuditLog:
         except OSError:
             return False
         return size > 0
-
-
-def _put(descriptor: int, head: str) -> None:
-    if os.pwrite(descriptor, head.encode(), 0) < len(head):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

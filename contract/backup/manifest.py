@@ -4,7 +4,7 @@
     ├── .lock                       held while a backup is written
     ├── .unfinished-<time>/         a backup that was cut off, or is being written; the next one removes it
     └── 2026-11-24T132055.120Z/
-        ├── spool/ scenes/ unscored/ purging/ keys.json keys.rotated.json audit.jsonl audit.head: as in a data directory
+        ├── spool/ scenes/ unscored/ purging/ keys.json keys.rotated.json audit.jsonl: as in a data directory
         ├── jobs.jsonl              a JobRecord a line: ended jobs, then live ones in the order in which they are to run
         └── backup.json             the manifest: size, SHA-256 and time of change of each other file
 
@@ -21,7 +21,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from contract.access.audit import AUDIT_FILE, HEAD_FILE
+from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KEYS_FILE, ROTATED_FILE
 from contract.store.shelf import Area
 from contract.store.store import PURGING, UNSCORED
@@ -34,7 +34,8 @@ UNFINISHED = ".unfinished-"
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d{6}\.\d{3}Z", re.ASCII)
 PIECE_BYTES = 1 << 20
 FOLDERS = frozenset({str(Area.SPOOL), str(Area.SCENES), UNSCORED, PURGING})
-FILES = frozenset({KEYS_FILE, ROTATED_FILE, AUDIT_FILE, HEAD_FILE, JOBS_FILE})
+FILES = frozenset({KEYS_FILE, ROTATED_FILE, AUDIT_FILE, "audit.head", JOBS_FILE})
+"""What a backup may hold beside the folders. Builds before 0.3.0 wrote audit.head, which nothing reads now."""
 FIELD = "SOURCE"
 ANOTHER = "Restore another backup; this one is not whole."
 

@@ -8,10 +8,12 @@ purged since, as the given audits tell, does not come back; nor do keys that wer
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import time
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -21,7 +23,6 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
-from contract.access.chain import audit_lines
 from contract.access.keys import KeyFile
 from contract.backup.copier import place_for, write_hashed
 from contract.backup.manifest import (
@@ -206,7 +207,7 @@ def _acts(audit: Path) -> Iterator[dict[str, str]]:
         InputError: it cannot be read, or has lines and none is of an audit.
     """
     line, acts = None, 0
-    for line in audit_lines(audit):
+    for line in _lines(audit):
         with suppress(ValueError):
             entry = json.loads(line)
             if isinstance(entry, dict) and "action" in entry:
@@ -214,6 +215,16 @@ def _acts(audit: Path) -> Iterator[dict[str, str]]:
                 yield entry
     if line is not None and not acts:
         raise InputError("--audit", f"{audit} holds no line of an audit.", "Name audit.jsonl, or one that was rotated.")
+
+
+def _lines(audit: Path) -> Iterator[bytes]:
+    """The lines of an audit, of a compressed one (.gz) too. Raises InputError if it cannot be read."""
+    try:
+        with gzip.open(audit) if audit.suffix == ".gz" else audit.open("rb") as file:
+            yield from file
+    except (OSError, EOFError, zlib.error) as error:
+        problem = f"{audit} cannot be read ({type(error).__name__})."
+        raise InputError("--audit", problem, "Name files of an audit, as the user that runs the service.") from error
 
 
 def _check_empty(data_dir: Path) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from contract.access.audit import AUDIT_FILE, HEAD_FILE, AuditAction, AuditEntry, AuditLog, utc_now
+from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.keys import KEYS_FILE, ROTATED_FILE
 from contract.backup.copier import Copier
 from contract.backup.manifest import (
@@ -155,7 +155,7 @@ def _copy_all(
                 copier.copy(f"{UNSCORED}/{worker.name}/{path.name}")
     for job_id in sorted(noted):
         copier.write(f"{PURGING}/{job_id}", b"")
-    for name in (KEYS_FILE, ROTATED_FILE, AUDIT_FILE, HEAD_FILE):
+    for name in (KEYS_FILE, ROTATED_FILE, AUDIT_FILE):
         copier.copy(name)
     left_out = [tuple(sorted(job_ids)) for job_ids in (purged, without_files, unreadable - purged)]
     return _in_order(queue, chosen), left_out[0], left_out[1], left_out[2]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import redis
 
-from contract.access.audit import AUDIT_FILE, HEAD_FILE, RESERVE_FILE, AuditAction, AuditLog
+from contract.access.audit import AUDIT_FILE, RESERVE_FILE, AuditAction, AuditLog
 from contract.queue.embedded import EmbeddedServer
 from contract.queue.interface import Claim
 from contract.queue.redis_queue import RedisQueue
@@ -33,7 +33,7 @@ from service.retention import HOUR_S, Retention, check_retention, kept_hours
 from tests.service.test_tus import uploaded
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
 
-KEPT_FILES = {AUDIT_FILE, HEAD_FILE, RESERVE_FILE}
+KEPT_FILES = {AUDIT_FILE, RESERVE_FILE}
 """What tells of a job after its purge: that it was purged."""
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,37 @@ def test_a_line_after_one_that_was_cut_off_stands_by_itself(tmp_path: Path) -> N
     log.append(entry("b" * 32))
     first, cut_off, last = (tmp_path / AUDIT_FILE).read_text().splitlines()
     assert (json.loads(first)["job_id"], cut_off, json.loads(last)["job_id"]) == ("a" * 32, '{"time": "20', "b" * 32)
+
+
+def test_an_audit_whose_lines_name_a_hash_is_read_and_appended_to(tmp_path: Path) -> None:
+    """Builds of 0.3 before its release wrote the field `chain` in front."""
+    chained = b'{"chain":"%s","time":"2026-05-04T09:12:31.204+00:00","action":"viewed","outcome":"ok"}\n' % (b"0" * 64)
+    (tmp_path / AUDIT_FILE).write_bytes(chained)
+    AuditLog(tmp_path).append(entry())
+    assert (tmp_path / AUDIT_FILE).read_bytes().startswith(chained)
+    assert [line["action"] for line in lines(tmp_path)] == ["viewed", "viewed"]
+
+
+def append_many(folder: Path) -> None:
+    def append() -> None:
+        for _ in range(20):
+            AuditLog(folder).append(entry())
+
+    threads = [threading.Thread(target=append) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def test_threads_and_processes_append_whole_lines(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=append_many, args=(tmp_path,)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [line["job_id"] for line in lines(tmp_path)] == ["a" * 32] * 120
 
 
 def test_a_file_that_was_moved_away_is_begun_anew(tmp_path: Path) -> None:

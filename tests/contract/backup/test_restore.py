@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import json
 import os
 import re
@@ -17,7 +18,7 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE, AuditAction, AuditEntry, AuditLog, utc_now
 from contract.access.keys import KeyFile
-from contract.backup.manifest import JOBS_FILE, MANIFEST_FILE
+from contract.backup.manifest import JOBS_FILE, MANIFEST_FILE, digest_of
 from contract.backup.restore import Restored, restore_backup
 from contract.backup.take import take_backup
 from contract.queue.interface import IDEMPOTENCY_S, Queue
@@ -159,6 +160,29 @@ def test_what_later_audits_tell_was_purged_or_revoked_does_not_come_back(site: S
     assert list(new.rglob(f"*{purged}*")) == []
     assert KeyFile(new).find(text) is None
     assert KeyFile(new).list() == (other,)
+
+
+def test_an_audit_that_cannot_be_read_is_named(site: Site, tmp_path: Path) -> None:
+    site.done()
+    backup = site.backup(tmp_path / "backups")
+    damaged = bytearray(gzip.compress(b"a line of an audit\n" * 100))
+    damaged[14] ^= 0xFF
+    (tmp_path / "damaged.gz").write_bytes(damaged)
+    (tmp_path / "audit.gz").write_bytes(b"no gzip")
+    for name in ("audit.gz", "damaged.gz", "absent", "."):
+        with pytest.raises(InputError, match="cannot be read"):
+            restored(tmp_path / "new", MemoryQueue(), backup, tmp_path / name)
+
+
+def test_a_backup_with_a_head_of_the_audit_is_restored(site: Site, tmp_path: Path) -> None:
+    """Builds of 0.3 before its release wrote the file."""
+    site.done()
+    backup = site.backup(tmp_path / "backups")
+    (backup / "audit.head").write_text("0" * 64)
+    document = json.loads((backup / MANIFEST_FILE).read_text())
+    document["files"]["audit.head"] = {"bytes": 64, "sha256": digest_of(backup / "audit.head"), "changed_ns": 0}
+    (backup / MANIFEST_FILE).write_text(json.dumps(document))
+    assert restored(tmp_path / "new", MemoryQueue(), backup).jobs == {JobState.DONE: 1}
 
 
 @pytest.mark.parametrize("text", ["audit\n", "12\n[]\n", '{"name": "a file of another kind"}\n'])
