@@ -1,7 +1,7 @@
 """The interface of the queue (`Queue`, a Protocol), and what every implementation guarantees.
 
-Two implementations pass the same tests: contract/queue/redis_queue.py, which deployments use, and
-contract/queue/memory.py, the plainest statement of the interface, which the tests use.
+contract/queue/redis_queue.py implements it. The tests have a second implementation, tests/memory_queue.py, which states
+the interface in plain Python. Both pass the same tests.
 
 A claim is a lease: it holds as long as its worker beats. After LEASE_S without a beat any worker may claim the job, as
 a new attempt. Every report carries the attempt's number and changes nothing if a later attempt has begun: the number

@@ -17,7 +17,6 @@ import numpy as np
 
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
@@ -38,6 +37,7 @@ from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
+from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.serve import Reply, RequestServer
 

@@ -26,7 +26,6 @@ from selenium.webdriver.support.ui import WebDriverWait
 from client.up import DASHBOARD
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
@@ -55,6 +54,7 @@ from service.renderer import ZmqRenderer
 from service.server import Server
 from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
+from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
 from worker.daemon.serve import Reply, RequestServer

@@ -13,10 +13,10 @@ import pytest
 import redis
 
 from contract.queue.interface import LEASE_S, Queue
-from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from tests.contract.queues import RunningServer, redis_binary, valkey_binary
 from tests.contract.stores import lead_to
+from tests.memory_queue import MemoryQueue
 
 MakeQueue = Callable[..., Queue]
 """A client of the one queue of the test, with a lease of so many seconds."""

@@ -14,7 +14,6 @@ from typing import Any
 
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
@@ -25,6 +24,7 @@ from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.memory_queue import MemoryQueue
 from worker.daemon.serve import Reply, RequestServer
 
 WORKER = "worker-1"

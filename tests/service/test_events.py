@@ -12,11 +12,11 @@ import httpx
 import pytest
 
 from contract.queue.interface import Event
-from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord
 from service.events import NOTHING_SEEN, Feeds
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import ServiceUnderTest, assert_problem
 
 PATIENCE_S = 20.0

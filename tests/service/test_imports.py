@@ -12,7 +12,6 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE, AuditLog
 from contract.access.keys import DEFAULT_SCOPES, KeyScope
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.archive import archive_parts
 from contract.store.store import Store
@@ -27,6 +26,7 @@ from service.questions import Questions
 from service.retention import Retention
 from service.sweep import Sweep
 from tests.archives import HOSTILE, ORIGIN, archived, files_of, small_scene, stored
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
 from worker.daemon.channel import Channel, Task
 from worker.daemon.device import obey

@@ -11,9 +11,9 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
-from contract.queue.memory import MemoryQueue
 from contract.wire.labels import Labels
 from contract.wire.names import LABELS
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
 LABEL, METADATA = "series Quokka 3", {"ris": "Wombat-17"}

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobFiles, JobRecord
@@ -15,6 +14,7 @@ from contract.wire.labels import Labels
 from contract.wire.options import JobOptions
 from service import listing
 from service.listing import NEXT_HEADER
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
 
 

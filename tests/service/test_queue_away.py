@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from contract.queue.interface import MAX_LISTED, Place
-from contract.queue.memory import MemoryQueue
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord
 from contract.wire.names import MANIFEST
 from contract.wire.rendering import WorkerAddress
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import assert_problem, bearer, running_service
 
 

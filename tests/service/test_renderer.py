@@ -16,11 +16,11 @@ import pytest
 import zmq
 
 from contract.queue.embedded import short_socket_path
-from contract.queue.memory import MemoryQueue
 from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.connection import Answer
 from service.renderer import ZmqRenderer
+from tests.memory_queue import MemoryQueue
 from worker.daemon.serve import Reply, RequestServer
 
 SCENES = [f"{number:032x}" for number in range(40)]

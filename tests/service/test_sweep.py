@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from contract.queue.interface import MAX_ATTEMPTS, Admission, Claim
-from contract.queue.memory import MemoryQueue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.names import MANIFEST, RESUME, SUBMISSION
 from service.sweep import Sweep
+from tests.memory_queue import MemoryQueue
 from tests.service.under_test import ServiceUnderTest, assert_problem, running_service
 
 PATIENCE_S = 10.0

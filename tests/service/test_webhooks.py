@@ -17,12 +17,12 @@ from client.cli import main as command_line
 from contract.access.keys import KeyScope
 from contract.access.webhook_secrets import tenant_secret
 from contract.queue.deliveries import Loan
-from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
 from contract.wire.errors import ErrorCode, UnavailableError
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from service import webhooks
 from service.webhooks import MAX_TRIES
+from tests.memory_queue import MemoryQueue
 from tests.receiver import Receiver, Webhook
 from tests.service.telling import LOG_WITHIN_S, PATIENT, SECRET, accepted, cancelled, failure_of, log_of, sent, telling
 from tests.service.under_test import ServiceUnderTest, another_clip, assert_problem, bearer, running_service

@@ -10,13 +10,13 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import KeyScope
-from contract.queue.memory import MemoryQueue
 from contract.store.shelf import new_job_id
 from contract.wire.errors import ErrorCode
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from contract.wire.webhooks import MAX_TRIES_BEFORE_AGAIN, DeliveryStatus
 from service import webhooks
 from service.webhooks import MAX_TRIES
+from tests.memory_queue import MemoryQueue
 from tests.receiver import Receiver
 from tests.service.telling import SECRET, accepted, cancelled, log_of, telling
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service

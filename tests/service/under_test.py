@@ -12,7 +12,6 @@ import httpx
 from contract.access.keys import DEFAULT_SCOPES, KeyFile, KeyScope
 from contract.queue.embedded import short_socket_path
 from contract.queue.interface import Claim, Queue
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest
@@ -35,6 +34,7 @@ from service.app import create_app
 from service.renderer import ZmqRenderer
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
+from tests.memory_queue import MemoryQueue
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
 from worker.daemon.serve import Reply, RequestServer

@@ -22,7 +22,6 @@ from contract.backup.manifest import JOBS_FILE, MANIFEST_FILE, digest_of
 from contract.backup.restore import Restored, restore_backup
 from contract.backup.take import take_backup
 from contract.queue.interface import IDEMPOTENCY_S, Queue
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.shelf import new_job_id
 from contract.store.store import RESTORING, Store, open_store
@@ -30,6 +29,7 @@ from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobFiles, JobRecord, JobState
 from tests.contract.queues import ERROR, claimed, job, known
 from tests.contract.stores import BUCKET_URL, SERVICE, files_no_larger_than, finished, given_to, published
+from tests.memory_queue import MemoryQueue
 
 
 class Site:

@@ -14,13 +14,13 @@ from contract.access.keys import KEYS_FILE, KeyFile
 from contract.backup.manifest import JOBS_FILE, MANIFEST_FILE, UNFINISHED, finished_backups, read_jobs, read_manifest
 from contract.backup.take import Taken, take_backup
 from contract.queue.interface import Queue
-from contract.queue.memory import MemoryQueue
 from contract.runtime.settings import Settings
 from contract.store.store import PURGING, UNSCORED, Store
 from contract.wire.errors import InputError, UnavailableError
 from contract.wire.job import JobRecord, JobState
 from contract.wire.labels import Labels
 from tests.contract.stores import accepted, files_no_larger_than, finished
+from tests.memory_queue import MemoryQueue
 
 
 class Site:

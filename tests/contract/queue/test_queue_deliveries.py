@@ -9,12 +9,13 @@ from itertools import count
 import pytest
 import redis
 
-from contract.queue import memory_deliveries, redis_deliveries
+from contract.queue import redis_deliveries
 from contract.queue.deliveries import Loan
 from contract.queue.interface import MAX_ATTEMPTS, Claim, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobRecord, JobState
 from contract.wire.webhooks import DeliveryStatus, DeliveryTry, TryFailure
+from tests import memory_deliveries
 from tests.contract.queues import ERROR, claimed, job, known
 
 CALLBACK = "https://his.example/done"

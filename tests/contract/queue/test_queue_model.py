@@ -18,7 +18,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from contract.queue.deliveries import Loan
 from contract.queue.interface import Admission, Claim, Event, QueueFullError, place_of
-from contract.queue.memory import MemoryQueue
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
 from contract.wire.labels import LabelChange
@@ -26,6 +25,7 @@ from contract.wire.options import Priority
 from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, TryFailure
 from tests.contract.conftest import emptied
 from tests.contract.queues import ERROR, TRAINING, job
+from tests.memory_queue import MemoryQueue
 
 OWNERS = st.sampled_from(["worker-1.a", "worker-1.b", "worker-2.a"])
 PICK = st.integers(min_value=0, max_value=5)

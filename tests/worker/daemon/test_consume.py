@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from contract.queue.interface import MAX_ATTEMPTS, Claim, Order
-from contract.queue.memory import MemoryQueue
 from contract.runtime import supervised
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobError, JobProgress, JobRecord, JobState
 from contract.wire.names import CURVE, MANIFEST, REPORT, RESUME
 from contract.wire.rendering import WorkerAddress
+from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker.daemon import consume, hang
 from worker.daemon.child import ChildKeeper

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from contract.queue.interface import Claim
-from contract.queue.memory import MemoryQueue
 from contract.store.store import Store
 from contract.wire.errors import UnavailableError
 from contract.wire.job import JobState
+from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import Jobs
 from worker.daemon.held import HeldClaim
 

@@ -11,11 +11,11 @@ from typing import cast
 import pytest
 
 from contract.queue.interface import Claim, QueueFigures
-from contract.queue.memory import MemoryQueue
 from contract.store.store import Store
 from contract.wire.names import CURVE, MANIFEST
 from contract.wire.names import REPORT as REPORT_FILE
 from contract.wire.report import Report
+from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import Jobs
 from tests.worker.standin import REPORT
 from worker.daemon import scores

@@ -1,4 +1,4 @@
-"""The queue inside one process: the plainest statement of contract/queue/interface.py, for tests."""
+"""A queue in the memory of one process, for tests: contract/queue/interface.py in plain Python."""
 # long: the whole interface is stated in one place
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from contract.queue.interface import (
     trainers,
     worker_died,
 )
-from contract.queue.memory_deliveries import MemoryDeliveries
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
 from contract.wire.webhooks import Delivery, DeliveryStatus
+from tests.memory_deliveries import MemoryDeliveries
 
 LEASE_CHECK_S = 0.05
 """How often a waiting claim looks for leases that have run out."""
