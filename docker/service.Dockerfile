@@ -8,7 +8,7 @@ COPY pyproject.toml constraints.txt README.md LICENSE ./
 # The project's own requirements are the worker's too (torch, OpenCV); the service needs these alone.
 RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt \
         fastapi starlette anyio uvicorn websockets h11 pydantic redis pyzmq python-multipart httpx prometheus-client fsspec s3fs \
-        opentelemetry-sdk opentelemetry-exporter-otlp-proto-http
+        opentelemetry-api opentelemetry-sdk opentelemetry-exporter-otlp-proto-http
 COPY contract contract
 COPY service service
 COPY client client

@@ -93,8 +93,7 @@ class Connection:
             WorkerGoneError: there will be none.
             UnavailableError: it is not one that this version can read.
         """
-        trace = traces.current().traceparent
-        document = WorkerRequest(request=request, trace=trace).model_dump_json().encode()
+        document = WorkerRequest(request=request, trace=traces.traceparent()).model_dump_json().encode()
         await self.reach(patiently=patiently)
         request_id = next(self._ids).to_bytes(8, "big")
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()

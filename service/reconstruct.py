@@ -12,6 +12,7 @@ from io import RawIOBase
 from typing import Annotated, TypeAlias, TypeVar
 
 from fastapi import APIRouter, Header, Request, Response
+from opentelemetry.trace import get_current_span
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -309,9 +310,8 @@ def _look_at(services: Deps, record: JobRecord, names: Mapping[str, str], sent: 
 
 def spool_and_queue(services: Deps, record: JobRecord) -> JobRecord:
     """Put what was received into the spool and then into the queue; the record that stands there. As enqueue()."""
-    request = traces.current()
-    request.set(job_id=record.job_id, input_bytes=record.input_bytes)
-    record = record.model_copy(update={"trace": request.traceparent})
+    traces.describe(get_current_span(), job_id=record.job_id, input_bytes=record.input_bytes)
+    record = record.model_copy(update={"trace": traces.traceparent()})
     with services.sweep.in_hand(record.job_id):
         with traces.span("spool"):
             services.store.accept(record)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 import zmq.asyncio
+from opentelemetry.trace import SpanKind
 from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 
@@ -113,7 +114,7 @@ class ZmqRenderer:
 
     async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
         connection = await self._connection(address)
-        with traces.span("ask worker", kind=traces.Kind.CLIENT, worker=address.name):
+        with traces.span("ask worker", kind=SpanKind.CLIENT, worker=address.name):
             answer = await connection.ask(request, patiently=patiently)
         return dataclasses.replace(answer, worker=address.endpoint)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Header, Query, Request, Response
+from opentelemetry.trace import get_current_span
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
@@ -216,7 +217,7 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
     caller.require(KeyScope.VIEW)
     with traces.span("find"):
         shown = await run_in_threadpool(_find, services, caller, scene)
-    traces.current().set(job_id=shown.scene_id)
+    traces.describe(get_current_span(), job_id=shown.scene_id)
     await services.audit.viewed(caller, shown.scene_id)
     return shown
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from opentelemetry.trace import INVALID_SPAN, Span, SpanKind
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -68,7 +69,7 @@ class RequestLog:
         answered, began_s = _Answered(), time.perf_counter()
         self._open += 1
         with _span_of(scope) as span:
-            request_id = given if KEPT_REQUEST_ID.fullmatch(given) else span.trace_id or uuid.uuid4().hex
+            request_id = given if KEPT_REQUEST_ID.fullmatch(given) else traces.trace_id() or uuid.uuid4().hex
             with answering(request_id):
                 try:
                     await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)
@@ -136,27 +137,27 @@ async def _nothing() -> Message:
 
 
 @contextmanager
-def _span_of(scope: Scope) -> Iterator[traces.Span]:
+def _span_of(scope: Scope) -> Iterator[Span]:
     """The span of a request, in the trace that its caller named. Each view of a WebSocket has one of its own."""
     if scope["type"] == "websocket" or scope["path"] in QUIET_ROUTES:
-        yield traces.NOT_RECORDED
+        yield INVALID_SPAN
         return
     parent = Headers(scope=scope).get(traces.TRACEPARENT, traces.NEW)
-    with traces.span(_method_of(scope), parent, kind=traces.Kind.SERVER) as span:
+    with traces.span(_method_of(scope), parent, kind=SpanKind.SERVER) as span:
         yield span
 
 
-def _describe(span: traces.Span, scope: Scope, request_id: str, status: int) -> None:
-    if span.traceparent is None:
+def _describe(span: Span, scope: Scope, request_id: str, status: int) -> None:
+    if not span.is_recording():
         return
     method, route = _method_of(scope), getattr(scope.get("route"), "path", NO_ROUTE)
-    span.rename(f"{method} {route}")
-    span.set(request_id=request_id, method=method, route=route, status=status)
+    span.update_name(f"{method} {route}")
+    traces.describe(span, request_id=request_id, method=method, route=route, status=status)
     for job_id in scope.get("path_params", {}).values():
         if is_job_id(str(job_id)):
-            span.set(job_id=str(job_id))
+            traces.describe(span, job_id=str(job_id))
     if status >= 500:
-        span.end(failed=str(status))
+        traces.fail(span, str(status))
 
 
 def _method_of(scope: Scope) -> str:

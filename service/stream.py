@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from opentelemetry.trace import SpanKind
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 from starlette.types import Message
@@ -181,7 +182,7 @@ class _Viewer:
         message = message_of(document)
         caller = self._known_caller()
         self._services.limiter.admit(caller.key_id or caller.address)
-        with traces.span("view of /stream", traces.NEW, kind=traces.Kind.SERVER):
+        with traces.span("view of /stream", traces.NEW, kind=SpanKind.SERVER):
             shown = await find_shown(self._services, caller, message.scene)
             request = request_of(message, shown, self._services.settings)
             shown, answer = await answer_to(self._services, caller, request, shown)

@@ -19,6 +19,7 @@ from http.cookiejar import CookieJar, DefaultCookiePolicy
 
 import httpx
 from anyio import CapacityLimiter, to_thread
+from opentelemetry.trace import SpanKind
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.webhook_secrets import signature, tenant_secret
@@ -122,9 +123,9 @@ class Webhooks:
         """The delivery after one more try."""
         began_s, job_id = time.time(), loan.delivery.job_id
         status_code = failure = retry_after_s = None
-        span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=traces.Kind.CLIENT, job_id=job_id)
+        span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=SpanKind.CLIENT, job_id=job_id)
         try:
-            span.set(method="POST", host=_host_of(httpx.URL(loan.url)))
+            traces.describe(span, method="POST", host=_host_of(httpx.URL(loan.url)))
             async with asyncio.timeout(TRY_S):
                 status_code = await self._post(http, loan)
         except TimeoutError:
@@ -136,8 +137,10 @@ class Webhooks:
             failure = TryFailure.FAULT
         finally:
             if status_code is not None:
-                span.set(status=status_code)
-            span.end(failed=failure or ("cancelled" if status_code is None else None))
+                traces.describe(span, status=status_code)
+            if failure is not None or status_code is None:
+                traces.fail(span, failure or "cancelled")
+            span.end()
         tried = DeliveryTry(at_s=began_s, status_code=status_code, failure=failure, retry_after_s=retry_after_s)
         return _after(loan.delivery, tried)
 

@@ -13,12 +13,12 @@ import httpx
 import pytest
 from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
-from opentelemetry.trace import SpanKind
+from opentelemetry.trace import INVALID_SPAN, SpanKind
 
 from client.demo import free_port, started_service
 from contract.queue.embedded import EmbeddedServer
 from contract.runtime import traces
-from contract.runtime.otlp import OtlpRecorder
+from contract.runtime.otlp import Recorder
 from contract.runtime.settings import Settings
 from intrasplat_client import Client
 from service import webhooks
@@ -40,7 +40,7 @@ STAGES = {"fetch", "decode", "stereo", "motion", "fusion", "train", "finish", "p
 def exporter() -> Iterator[InMemorySpanExporter]:
     """Of the spans of this process; ended spans are in it after traces.flush()."""
     memory = InMemorySpanExporter()
-    traces.use(OtlpRecorder("test", exporter=memory))
+    traces.use(Recorder("test", exporter=memory))
     yield memory
     traces.use(None)
 
@@ -182,7 +182,7 @@ class Away(SpanExporter):
 def test_a_collector_that_is_away_costs_spans_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_BSP_MAX_QUEUE_SIZE", "4")
     monkeypatch.setenv("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", "2")
-    traces.use(OtlpRecorder("test", exporter=Away()))
+    traces.use(Recorder("test", exporter=Away()))
     try:
         for service in running_service(tmp_path):
             for _ in range(20):
@@ -265,7 +265,7 @@ def test_what_cannot_be_sent_is_said_and_what_is_switched_off_is_not(
     variables: dict[str, str], said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     traces.configure("service", environment=variables)
-    assert traces.begin("x") is traces.NOT_RECORDED
+    assert traces.begin("x", TRACEPARENT) is INVALID_SPAN
     assert said in caplog.text
     assert bool(said) == bool(caplog.text)
 

@@ -119,7 +119,7 @@ def fields_of(record: logging.LogRecord) -> dict[str, object]:
     """The fields of a line that are allowed and there; the error's kind if the line tells of one."""
     given = {name: getattr(record, name, None) for name in FIELDS} if _is_ours(record) else {}
     given["request_id"] = given.get("request_id") or current_request_id()
-    given["trace_id"] = traces.current().trace_id
+    given["trace_id"] = traces.trace_id()
     if record.exc_info and record.exc_info[0] is not None:
         given["error"] = record.exc_info[0].__name__
     fields = {name: value for name, value in given.items() if value is not None}

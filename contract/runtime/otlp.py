@@ -1,4 +1,4 @@
-"""Spans of contract/runtime/traces.py by OpenTelemetry's SDK, sent to a collector by OTLP over HTTP (extra `otel`)."""
+"""Records spans (traces.py) by OpenTelemetry's SDK and sends them to a collector by OTLP over HTTP; extra `otel`."""
 
 from __future__ import annotations
 
@@ -10,83 +10,32 @@ import threading
 import time
 from collections.abc import Sequence
 
-from opentelemetry import trace
-from opentelemetry.context import Context
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.sdk.resources import Resource
 from opentelemetry.sdk.trace import ReadableSpan, SpanProcessor, TracerProvider
 from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
-from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
-from contract.runtime.traces import TRACEPARENT, Attributes, Kind, Span, flush
 from contract.runtime.version import version
 
-NAMES = {
-    "method": "http.request.method",
-    "route": "http.route",
-    "status": "http.response.status_code",
-    "host": "server.address",
-}
-"""Attributes that OpenTelemetry has names for; all others have ours."""
-MAX_CHARACTERS = 200
 FLUSH_LOOK_S = 0.01
+AT_EXIT_MS = 2000
+"""How long the end of a process waits for spans that are not sent yet."""
 
 logger = logging.getLogger("intrasplat.traces")
 
 
-class OtlpRecorder:
-    """Makes spans and sends them; the standard OTEL_ variables say where to, how often, and which share of them."""
+class Recorder:
+    """A tracer, and what sends its spans; the standard OTEL_ variables say where to, how often, and which share."""
 
     def __init__(self, process: str, instance: str | None = None, exporter: SpanExporter | None = None) -> None:
         told = {"service.name": os.environ.get("OTEL_SERVICE_NAME") or f"intrasplat-{process}"}
         told |= {"service.version": version()} | ({"service.instance.id": instance} if instance else {})
-        self._sender = Sender(exporter or OTLPSpanExporter())
+        self.sender = Sender(exporter or OTLPSpanExporter())
         provider = TracerProvider(resource=Resource.create(told), shutdown_on_exit=False)
-        provider.add_span_processor(self._sender)
-        self._tracer = provider.get_tracer("intrasplat", version())
-        self._propagator = TraceContextTextMapPropagator()
+        provider.add_span_processor(self.sender)
+        self.tracer = provider.get_tracer("intrasplat", version())
         logging.getLogger("opentelemetry").setLevel(logging.CRITICAL)  # the sender says it once
-        atexit.register(flush)
-
-    @property
-    def dropped(self) -> int:
-        return self._sender.dropped
-
-    def begin(self, name: str, parent: str, kind: Kind, since_s: float | None, attributes: Attributes) -> Span:
-        context = self._propagator.extract({TRACEPARENT: parent}, Context())
-        start_ns = None if since_s is None else round(since_s * 1e9)
-        begun = _OtelSpan(self._tracer.start_span(name, context, trace.SpanKind[kind], start_time=start_ns))
-        begun.set(**attributes)
-        return begun
-
-    def flush(self, timeout_s: float) -> None:
-        self._sender.force_flush(round(timeout_s * 1000))
-
-
-class _OtelSpan(Span):
-    """A span of the SDK."""
-
-    def __init__(self, span: trace.Span) -> None:
-        known = span.get_span_context()
-        self._span = span
-        self.trace_id = trace.format_trace_id(known.trace_id)
-        self.traceparent = f"00-{self.trace_id}-{trace.format_span_id(known.span_id)}-{known.trace_flags:02x}"
-
-    def set(self, **attributes: object) -> None:
-        for name, value in attributes.items():
-            known = value if isinstance(value, int | float) else str(value)[:MAX_CHARACTERS]
-            self._span.set_attribute(NAMES.get(name, f"intrasplat.{name}"), known)
-
-    def rename(self, name: str) -> None:
-        self._span.update_name(name)
-
-    def end(self, failed: str | None = None) -> None:
-        if not self._span.is_recording():
-            return
-        if failed is not None:
-            self._span.set_attribute("error.type", failed[:MAX_CHARACTERS])
-            self._span.set_status(trace.StatusCode.ERROR)
-        self._span.end()
+        atexit.register(self.sender.force_flush, AT_EXIT_MS)
 
 
 class Sender(SpanProcessor):

@@ -1,8 +1,8 @@
-"""What requests and jobs spend their time on, for OpenTelemetry; off unless its variables ask for it.
+"""Spans of requests and jobs, for OpenTelemetry; off unless its variables ask for it.
 
 A span holds Attributes: ids, codes, sizes and durations, and nothing of a patient. Of an error it holds the type, for
-texts may name files. This module imports no part of OpenTelemetry. contract/runtime/otlp.py does, where traces are on;
-elsewhere every function here returns at once.
+texts may name files. While traces are off, every span is INVALID_SPAN, whose methods do nothing. The SDK, which records
+spans and sends them, is an extra; configure() imports it (otlp.py) where traces are on.
 """
 
 from __future__ import annotations
@@ -11,14 +11,28 @@ import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import ContextVar
-from enum import StrEnum
-from typing import Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, TypedDict, Unpack
+
+from opentelemetry.context import Context
+from opentelemetry.trace import INVALID_SPAN, Span, SpanKind, StatusCode, format_trace_id, get_current_span, use_span
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+if TYPE_CHECKING:
+    from contract.runtime.otlp import Recorder
 
 TRACEPARENT = "traceparent"
 """The header of W3C Trace Context."""
 NEW = ""
 """As a parent: the span begins a trace of its own."""
+
+NAMES = {
+    "method": "http.request.method",
+    "route": "http.route",
+    "status": "http.response.status_code",
+    "host": "server.address",
+}
+"""Attributes that OpenTelemetry has names for; all others have ours."""
+MAX_CHARACTERS = 200
 
 EXPORTER, DISABLED = "OTEL_TRACES_EXPORTER", "OTEL_SDK_DISABLED"
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
@@ -51,52 +65,8 @@ class Attributes(TypedDict, total=False):
     shared: bool
 
 
-class Kind(StrEnum):
-    """Which side of a call a span is of, in the names of OpenTelemetry."""
-
-    INTERNAL = "INTERNAL"
-    SERVER = "SERVER"
-    CLIENT = "CLIENT"
-    CONSUMER = "CONSUMER"
-
-
-class Span:
-    """A span that is not recorded, and what one that is can do."""
-
-    traceparent: str | None = None
-    """Names this span to another process; None: traces are off."""
-    trace_id: str | None = None
-
-    def set(self, **attributes: Unpack[Attributes]) -> None:
-        """Add attributes."""
-
-    def rename(self, name: str) -> None:
-        """Give it another name."""
-
-    def end(self, failed: str | None = None) -> None:
-        """End it, once. failed: the type of the error, or another code."""
-
-
-class Recorder(Protocol):
-    """What makes spans where traces are on."""
-
-    @property
-    def dropped(self) -> int:
-        """Spans that were not sent: the collector was away, or too many waited."""
-        ...
-
-    def begin(self, name: str, parent: str, kind: Kind, since_s: float | None, attributes: Attributes) -> Span:
-        """As begin() below, with the parent known."""
-        ...
-
-    def flush(self, timeout_s: float) -> None:
-        """Send what waits."""
-        ...
-
-
-NOT_RECORDED = Span()
+_propagator = TraceContextTextMapPropagator()
 _recorder: Recorder | None = None
-_current: ContextVar[Span] = ContextVar("span", default=NOT_RECORDED)
 
 
 def configure(process: str, instance: str | None = None, environment: Mapping[str, str] | None = None) -> None:
@@ -111,21 +81,20 @@ def configure(process: str, instance: str | None = None, environment: Mapping[st
         logger.warning("traces are off: %s", lack)
         return
     try:
-        from contract.runtime.otlp import OtlpRecorder
+        from contract.runtime.otlp import Recorder
     except ModuleNotFoundError as error:
         logger.warning("traces are off: %s is not installed. %s", error.name, REMEDY)
         return
     try:
-        recorder = OtlpRecorder(process, instance)
+        use(Recorder(process, instance))
     except Exception as error:  # a value that OpenTelemetry does not accept must not stop a service
         logger.warning("traces are off: OpenTelemetry does not accept its variables (%s).", type(error).__name__)
         return
-    use(recorder)
     logger.info("traces are sent to the collector")
 
 
 def use(recorder: Recorder | None) -> None:
-    """Let this recorder make the spans of this process; None: nobody."""
+    """Let this recorder make the spans of this process; None: turn traces off."""
     global _recorder
     _recorder = recorder
 
@@ -134,7 +103,7 @@ def begin(
     name: str,
     parent: str | None = None,
     *,
-    kind: Kind = Kind.INTERNAL,
+    kind: SpanKind = SpanKind.INTERNAL,
     since_s: float | None = None,
     **attributes: Unpack[Attributes],
 ) -> Span:
@@ -144,10 +113,12 @@ def begin(
     None: the current span of this context. since_s: UNIX s; None: now.
     """
     if _recorder is None:
-        return NOT_RECORDED
-    if parent is None:
-        parent = current().traceparent or NEW
-    return _recorder.begin(name, parent, kind, since_s, attributes)
+        return INVALID_SPAN
+    context = None if parent is None else _propagator.extract({TRACEPARENT: parent}, Context())
+    start_ns = None if since_s is None else round(since_s * 1e9)
+    begun = _recorder.tracer.start_span(name, context, kind, start_time=start_ns)
+    describe(begun, **attributes)
+    return begun
 
 
 @contextmanager
@@ -155,40 +126,58 @@ def span(
     name: str,
     parent: str | None = None,
     *,
-    kind: Kind = Kind.INTERNAL,
+    kind: SpanKind = SpanKind.INTERNAL,
     since_s: float | None = None,
     **attributes: Unpack[Attributes],
 ) -> Iterator[Span]:
-    """A span that lasts as long as the context and is the current one in it; arguments as of begin()."""
+    """A span that lasts as long as the context and is the current one in it; arguments as for begin()."""
     if _recorder is None:
-        yield NOT_RECORDED
+        yield INVALID_SPAN
         return
     begun = begin(name, parent, kind=kind, since_s=since_s, **attributes)
-    token = _current.set(begun)
-    try:
-        yield begun
-    except BaseException as error:
-        begun.end(failed=type(error).__name__)
-        raise
-    finally:
-        _current.reset(token)
-        begun.end()
+    with use_span(begun, end_on_exit=True, record_exception=False, set_status_on_exception=False):
+        try:
+            yield begun
+        except BaseException as error:
+            fail(begun, type(error).__name__)
+            raise
 
 
-def current() -> Span:
-    """The span of this context."""
-    return _current.get()
+def describe(span: Span, **attributes: Unpack[Attributes]) -> None:
+    """Add attributes to a span."""
+    for name, value in attributes.items():
+        known = value if isinstance(value, int | float) else str(value)[:MAX_CHARACTERS]
+        span.set_attribute(NAMES.get(name, f"intrasplat.{name}"), known)
+
+
+def fail(span: Span, error: str) -> None:
+    """Mark a span as failed. error: the type of the error, or another code."""
+    span.set_attribute("error.type", error[:MAX_CHARACTERS])
+    span.set_status(StatusCode.ERROR)
+
+
+def traceparent() -> str | None:
+    """The name of the current span for another process; None: there is no span."""
+    carrier: dict[str, str] = {}
+    _propagator.inject(carrier)
+    return carrier.get(TRACEPARENT)
+
+
+def trace_id() -> str | None:
+    """The trace of the current span, 32 hexadecimal digits; None: there is no span."""
+    context = get_current_span().get_span_context()
+    return format_trace_id(context.trace_id) if context.is_valid else None
 
 
 def dropped() -> int | None:
     """How many spans of this process were not sent; None: traces are off."""
-    return None if _recorder is None else _recorder.dropped
+    return None if _recorder is None else _recorder.sender.dropped
 
 
 def flush(timeout_s: float = 2.0) -> None:
-    """Send what waits, before this process ends."""
+    """Send the spans that wait, before this process ends."""
     if _recorder is not None:
-        _recorder.flush(timeout_s)
+        _recorder.sender.force_flush(round(timeout_s * 1000))
 
 
 def _is_asked_for(variables: Mapping[str, str]) -> bool:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from contract.queue.interface import Claim, Order, Queue
+from contract.runtime import traces
 from contract.store.disk_errors import StoreFullError
 from contract.store.store import Store
 from contract.wire.errors import ErrorCode, IntrasplatError, UnavailableError
@@ -141,7 +142,7 @@ def run_job(
         except Exception as error:
             child.kill()
             outcome = job.settle(Failed(error=describe(error), fault=type(error).__name__))
-        span.set(outcome=outcome)
+        traces.describe(span, outcome=outcome)
         log.info("%s after %.1f s", outcome, time.monotonic() - started_s)
     if not job.is_scoring:
         return None

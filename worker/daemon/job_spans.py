@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from opentelemetry.trace import INVALID_SPAN, Span, SpanKind
+
 from contract.runtime import traces
 from contract.wire.job import JobRecord
 
 
 @contextmanager
-def attempt_span(record: JobRecord, worker: str) -> Iterator[traces.Span]:
+def attempt_span(record: JobRecord, worker: str) -> Iterator[Span]:
     """The span of one attempt at a job, in the trace of the request that submitted it.
 
     Before the first attempt there is one of the time that the job waited.
@@ -19,7 +21,7 @@ def attempt_span(record: JobRecord, worker: str) -> Iterator[traces.Span]:
     if record.attempt == 1:
         traces.begin("wait in queue", parent, since_s=record.created_at_s, job_id=record.job_id).end()
     told = traces.Attributes(job_id=record.job_id, attempt=record.attempt, worker=worker)
-    with traces.span("attempt", parent, kind=traces.Kind.CONSUMER, **told) as span:
+    with traces.span("attempt", parent, kind=SpanKind.CONSUMER, **told) as span:
         yield span
 
 
@@ -28,7 +30,7 @@ class StageSpans:
 
     def __init__(self) -> None:
         self._stage = ""
-        self._span = traces.NOT_RECORDED
+        self._span: Span = INVALID_SPAN
 
     def reached(self, stage: str) -> None:
         """Say at which stage the job is."""
@@ -38,5 +40,7 @@ class StageSpans:
 
     def end(self, failed: str | None = None) -> None:
         """No stage follows. failed: the type of the error that ended the last one."""
-        self._span.end(failed)
-        self._stage, self._span = "", traces.NOT_RECORDED
+        if failed is not None:
+            traces.fail(self._span, failed)
+        self._span.end()
+        self._stage, self._span = "", INVALID_SPAN
