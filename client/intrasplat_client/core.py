@@ -1,4 +1,4 @@
-"""What both clients do, written once: a method here is one of AsyncClient, and Client runs it (connection.py)."""
+"""What both clients do, written once: AsyncClient inherits these methods, and Client wraps each of them (client.py)."""
 
 from __future__ import annotations
 
@@ -178,6 +178,7 @@ class Core:
 
     async def render(
         self,
+        /,
         t: float = 0.0,
         *,
         scene: str | None = None,
@@ -209,6 +210,7 @@ class Core:
 
     async def render_array(
         self,
+        /,
         t: float = 0.0,
         *,
         scene: str | None = None,
@@ -280,6 +282,7 @@ class Core:
 
     async def measure(
         self,
+        /,
         scene: str,
         points: Sequence[tuple[float, float]],
         t: float = 0.0,
@@ -295,7 +298,7 @@ class Core:
         response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, **camera)
         return parsed(response, Measurement.model_validate_json, response.content)
 
-    async def export(self, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
+    async def export(self, /, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
         """The scene as a file of a format; docs/export.md lists the formats and their options."""
         return (await self._get("scenes", scene, "export", t=t, format=format, **options)).content
 

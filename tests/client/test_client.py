@@ -349,3 +349,5 @@ def test_both_clients_can_do_the_same() -> None:
     blocking, awaited = methods(Client), methods(AsyncClient)
     assert blocking.pop("close") == awaited.pop("aclose")
     assert blocking == awaited
+    assert {name for name in blocking if not inspect.getdoc(getattr(Client, name))} == set()
+    assert inspect.signature(Client.report).return_annotation == "Report"
