@@ -22,8 +22,8 @@ class StoreFullError(UnavailableError):
 
     code = ErrorCode.STORE_FULL
 
-    def __init__(self, problem: str, remedy: str, *, may_return: bool = True) -> None:
-        super().__init__(problem, remedy, may_return=may_return)
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(problem, remedy, may_return=True)
 
 
 @contextlib.contextmanager
