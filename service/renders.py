@@ -38,6 +38,7 @@ from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services, owned_scene
 from service.listing import SceneSearch
 from service.problems import Problem
+from service.request_log import GONE
 
 router = APIRouter(tags=["renders"])
 
@@ -72,8 +73,6 @@ DEPTH_UNITS = {ImageFormat.PNG: "0.01 mm", ImageFormat.NPY: "mm"}
 """What a value of 1 of layer=depth is."""
 STATUS_OF_REPLY = {"input": 422, "scene": 404, "not-yet": 503, "busy": 503, "internal": 500}
 NOT_YET_RETRY_S = "1"
-GONE = 499
-"""For the log alone: the caller left before it was answered."""
 
 Result = TypeVar("Result")
 
