@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from client.slicer import messages
 from client.slicer.frames import Matrix, ras_from_ijk, turned, world_from_camera
-from client.slicer.link import Link
+from client.slicer.link import Link, first_ended
 from client.slicer.playback import Playback
 from client.slicer.status import Status
 from client.slicer.surface import Surface
@@ -99,15 +99,8 @@ class Bridge:
         Raises:
             IntrasplatError: the scene is gone, or the key may not see it.
         """
-        work = [self._show(), self._surfaces(), _until(end)]
-        tasks = [asyncio.create_task(each) for each in work]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-        errors = [error for task in done if (error := task.exception()) is not None]
+        ended = await first_ended(self._show(), self._surfaces(), _until(end))
+        errors = [error for task in ended if (error := task.exception()) is not None]
         await self._farewell(errors[0] if errors else None)
         if errors:
             raise errors[0]

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 from client.slicer.messages import HEADER_BYTES, HEARD, DamagedError, Heard, read, read_header
 from client.slicer.say import say
@@ -112,6 +113,18 @@ class Link:
         say(f"{name} has gone: {why}")
 
 
+async def first_ended(*work: Coroutine[Any, Any, None]) -> set[asyncio.Task[None]]:
+    """Run the coroutines side by side until one ends, and cancel the others; the tasks that have ended."""
+    tasks = [asyncio.create_task(each) for each in work]
+    try:
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return ended
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
 class _Peer:
     """One connection: a task that reads, and one that writes the newest message of each device."""
 
@@ -148,14 +161,7 @@ class _Peer:
 
     async def serve(self) -> str:
         """Talk to it until it goes; why it went."""
-        tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._write())]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-        for task in done:
+        for task in await first_ended(self._read(), self._write()):
             error = task.exception()
             if isinstance(error, DamagedError):
                 return str(error)

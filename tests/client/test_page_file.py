@@ -74,9 +74,6 @@ def driver() -> Iterator[webdriver.Chrome]:
         yield driver
 
 
-AT_0_6 = "const t = document.getElementById('time'); t.value = '0.6'; t.dispatchEvent(new Event('input'));"
-
-
 def opened(driver: webdriver.Chrome, path: Path, state: str, view: str = "") -> None:
     driver.get("about:blank")
     driver.get_log("browser")
