@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -17,6 +16,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from contract.runtime.locks import held
 from contract.store.disk_errors import StoreFullError, disk_errors
 from contract.store.durable import flush
 
@@ -103,7 +103,7 @@ class AuditLog:
         line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
         while True:
             try:
-                with disk_errors():
+                with disk_errors(), held(self._path, "the audit"):
                     return self._write(line)
             except StoreFullError:
                 if not self._shrink_reserve():
@@ -122,13 +122,12 @@ class AuditLog:
     def _write(self, line: bytes) -> None:
         descriptor = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # else the truncation below could remove a line of another process
             size = os.fstat(descriptor).st_size
             if size and os.pread(descriptor, 1, size - 1) != b"\n":
                 line = b"\n" + line  # a crash cut off the last line; this one starts on its own line
             if os.write(descriptor, line) < len(line):
                 with contextlib.suppress(OSError):
-                    os.ftruncate(descriptor, size)
+                    os.ftruncate(descriptor, size)  # safe under the lock: nobody else has appended since
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(descriptor)
             if size == 0:
