@@ -75,7 +75,7 @@ _MEMORY = """
 
 `python benchmarks/bm_memory.py --csv docs/results/memory.csv` ([memory.csv](memory.csv)): the peak of the process's
 resident memory in each stage, for a clip of both eyes as recorded. `import` is with all libraries loaded, before the
-clip; another process decodes ([decision 033](../decisions/033-memory.md)).
+clip; another process decodes ([why](../decisions/input.md#memory-is-released-stage-by-stage)).
 """
 _LONG = """
 ## A long clip
@@ -84,7 +84,7 @@ _LONG = """
 both eyes, and parts of it alone with as many steps a frame. Scores of every8, in dB, left and right eye: of the clip or
 part trained alone, and of the whole clip's scene on the part's frames. The peak of the process's resident memory before
 training, in training, in finishing and in scoring, in MiB; seconds that storing and scoring take
-([decision 042](../decisions/042-long-clips.md)).
+([why](../decisions/motion.md#long-clips-get-more-bases-trained-without-first-moments)).
 """
 _CHAOS = """
 ## What survives what
@@ -100,10 +100,9 @@ marks memory that rose by more than 2 % between the eleventh to thirteenth minut
 threads of which there were at least three more. The service grew by 2.9 %, of which 1 MiB came at once in minute 21;
 from minute 40 to the end it grew by 0.3 %. So it settles, but not within ten minutes. An hour with gc.freeze() after
 the service's start grew by 3.3 %, and 26 minutes with MALLOC_ARENA_MAX=1 by 1.9 %: neither is used. The device
-child held files of a clip whose job had ended; it lets them go since, and had 14 and then 15 files in that other hour
-([decision 042](../decisions/042-long-clips.md)). The counted errors
-are the refusals that viewers are meant to get, who ask without pause: ServiceUnavailable while a clip has nothing to
-show yet, NotFound and Conflict once it is purged or cancelled.
+child held files of a clip whose job had ended; it lets them go since, and had 14 and then 15 files in that other hour.
+The counted errors are the refusals that viewers are meant to get, who ask without pause: ServiceUnavailable while a
+clip has nothing to show yet, NotFound and Conflict once it is purged or cancelled.
 """
 
 

@@ -111,7 +111,7 @@ _PARSIMONY = """
 ### No more than a scene needs
 
 Floats are those of the model for each Gaussian; bytes those of the scene on disk: ours in whole numbers
-([decision 012](../decisions/012-compact-scenes.md)), the published method and its variants as floats, as published.
+([why](../decisions/scenes.md)), the published method and its variants as floats, as published.
 `loss` is what storing it costs on held-out frames against the model as training left it, in dB; `spread` is the best
 seed less the worst. Sizes, seconds and loss are those with {holdout}. Rates, iterations and start differ between
 presets as well, so a row is not the effect of its size alone: the grid of capacities varies nothing else.

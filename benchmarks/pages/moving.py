@@ -18,7 +18,7 @@ _PATHS = """
 without poses. The absolute trajectory error of the estimated path, of training frames and of held-out ones, and what
 the report says of it. `d4d_stereo` has no true path; its camera is fixed, and its error is the distance from rest of
 the path before `estimate` decides that the camera is fixed. The rows ran beside other programs, so their seconds are
-too many ([decision 049](../decisions/049-what-is-camera-and-what-is-tissue.md)).
+too many ([how paths are found](../decisions/camera-path.md)).
 """
 _NOISY = """
 ### Given poses that jump
@@ -27,7 +27,7 @@ _NOISY = """
 --out docs/results/noisy_poses.csv` ([noisy_poses.csv](noisy_poses.csv)): clips with depth whose poses err by so many mm
 along each axis, and by as much again at the tissue by their angles; the absolute trajectory error as given and as
 trained on. Each report says by how much the given poses jump and what steadying may leave; warned is from two
-pixels of 640 on ([decision 051](../decisions/051-given-poses-that-jump.md)).
+pixels of 640 on ([how](../decisions/camera-path.md#given-poses-that-jump-are-corrected-by-the-pictures)).
 """
 _TISSUE = """
 ### Tissue that comes into view later
@@ -37,7 +37,7 @@ ran one after another ([keyframes.csv](keyframes.csv)): `fast` on stereo clips o
 those that `auto` finds. Held-out psnr_tissue in dB, left and right eye; the share of the tissue seen by any frame that
 the scene covers. Then what has left the view, from where the camera was a quarter of the clip before: the median error
 of its depth in mm, had it stayed as it was, and as shown; the mean confidence there, and of what is in view. The rows
-ran beside other programs ([decision 050](../decisions/050-keyframes.md)).
+ran beside other programs ([how](../decisions/motion.md#tissue-that-comes-into-view-is-tracked-from-keyframes)).
 """
 _MASKS = """
 ## Instruments found without masks
@@ -47,7 +47,7 @@ _MASKS = """
 `fast` with the true masks and with those found, over the tissue of the true ones: what is masked and never seen is a
 hole there, and counts. The masks of `d4d-a` and `d4d-a-stereo` are approximate, and `surgt_raw` has none. The rows ran
 beside other programs, so their seconds, of one core, are too many
-([decision 048](../decisions/048-instruments-found.md)).
+([how](../decisions/instruments.md)).
 """
 
 _PATH_COLUMNS = {

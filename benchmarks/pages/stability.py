@@ -22,7 +22,7 @@ _INTRODUCTION = f"""
 ways, {len(SEVERITIES)} severities each, reconstructs it and judges it by the truth. Harmed is what loses more than
 {MAX_LOSS_DB:g} dB to the clean clip, or {MAX_DEPTH_LOSS_MM:g} mm of depth. Silent is the defect: harmed, and
 the report has no warning that the clean clip's has not. What the user is told of each stands in
-[stability.md](stability.md), how it is judged in [decision 016](../decisions/016-stability.md). Each method is compared
+[stability.md](stability.md), how it is judged in [evaluation.md](../decisions/evaluation.md). Each method is compared
 with itself on the clean clip (a pull and a cut with the same motion, calm), so a map shows what a mishap costs a method
 and not which method is better: one that has hardly learnt loses little. The table counts severities
 {" and ".join(map(str, _COMPARED))}, beside the score on the clean clip. The report of a method from another paper has
@@ -47,8 +47,8 @@ assumptions, right or wrong alike, so that does not count as told here: compare 
 does and hides a few hundredths of the judged picture while the tissue there goes on unseen; a calm clip's instrument
 rests, and what it hides throughout is not judged. No score of training or of held-out frames looks there: none has a
 picture of it. What the frames do show loses 1 to 4 dB beside the calm clip and stays near what a clip that breathes
-comes to, and the speed of visible tissue is no sign either: good clips, the real one among them, move as fast
-([decision 016](../decisions/016-stability.md) has the numbers). A warning wherever an instrument hides tissue that
+comes to, and the speed of visible tissue is no sign either: good clips, the real one among them, move as fast.
+A warning wherever an instrument hides tissue that
 moves would stand in every report. It is told by the pixel instead: in a render, `confidence` falls where tissue was
 hidden for part of the clip. What is shown behind an instrument is a guess.
 """,

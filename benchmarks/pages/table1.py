@@ -23,7 +23,7 @@ _INTRODUCTION = """
 `make table1` ([table1/runs.csv](table1/runs.csv), [curves.csv](table1/curves.csv)): EndoNeRF, LerPlane and EndoGaussian
 written anew from descriptions of their methods, beside Deform3DGS (`paper`) and `fast`, on the same frames, by the same
 scores and clock. [rivals.md](../rivals.md) lists what had to differ and why,
-[decision 078](../decisions/078-rivals.md#judgement) says what the rows tell of the paper's order. `d4d-a-320x256` is
+and [what the rows show](../rivals.md#what-the-rows-show) of the paper's order. `d4d-a-320x256` is
 `d4d-a` at half its size. Hollow marks are published.
 
 ![Held-out psnr_tissue against seconds of training, for each system](table1/curves.png)

@@ -25,7 +25,8 @@ _CONFIDENCE = """
 
 `python -m benchmarks.bm_confidence --csv docs/results/confidence.csv` ([confidence.csv](confidence.csv)): pixels of
 synthetic clips by the confidence that the model reports; `right` is the share of them that is right. On the diagonal,
-confidence is a probability. [Decision 031](../decisions/031-confidence-is-a-probability.md) has the rank correlations.
+confidence is a probability.
+[views.md](../decisions/views.md#confidence-is-the-probability-that-a-pixel-is-right) has the rank correlations.
 
 ![Share of right pixels against confidence](confidence.png)
 """
@@ -49,7 +50,8 @@ _OFF_AXIS = """
 
 `python -m benchmarks.bm_off_axis --picture docs/results/off-axis.jpg`: a synthetic pull, from 12 and 20 degrees to the
 right, left, top and bottom. Columns: truth; trained on the left eye, its guesses shown; trained on both eyes, with what
-no frame showed hatched. [Decision 036](../decisions/036-beside-and-behind-instruments.md) says what is still wrong.
+no frame showed hatched.
+[stereo-depth.md](../decisions/stereo-depth.md#tissue-takes-no-depth-from-instruments) says what is still wrong.
 
 ![Truth, left eye alone and both eyes from 12 and 20 degrees](off-axis.jpg)
 """
