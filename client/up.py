@@ -7,7 +7,7 @@ over, and ends it when it ends itself.
 A child that ends is started again (contract/runtime/supervised.py). If it lacks something that cannot come back by
 itself, and has never worked, the next child would end as well; so `up` ends with the child's remedy instead.
 
-A full disk ends nothing that runs: views and purges go on, the rest waits for room (docs/decisions/041).
+A full disk ends nothing that runs: views and purges go on, the rest waits for room.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Take a backup of an installation while it works.
 
-The order makes it whole (docs/decisions/073): clips and scenes are copied, which may take long; then the queue's
+The order makes it whole: clips and scenes are copied, which may take long; then the queue's
 records are read; then the files once more, which are few by now. So the files of every record are there, unless the job
 was purged meanwhile. A last look at the queue and at the notes of removals tells which jobs those are, and they are
 left out. The audit comes last: it names every removal that had begun.

@@ -1,8 +1,8 @@
 """Points for all the tissue that the clip shows: the first frame's, then what later frames show of the rest.
 
 Tissue that is hidden in the first frame is read in a later frame, from where the tracks say it has moved to. Its point
-keeps its place among its neighbours in the first frame (docs/decisions/024). Where the camera moves on, later keyframes
-are searched likewise for what no point before shows (docs/decisions/050).
+keeps its place among its neighbours in the first frame, so that neighbours there move alike. Where the camera moves on,
+later keyframes are searched likewise for what no point before shows.
 
 Symbols: H W pixels (row i, column j), M cells, N points, k stride in pixels. Lengths in mm, points in the world frame.
 """

@@ -1,7 +1,7 @@
 """How large a model the scene needs: how many bases its motion has, and how far apart its Gaussians start.
 
 Both choices minimise the squared error of the picture that each is expected to leave, in squared grey levels (of 255) a
-channel of a tissue pixel. They are made before training, from training frames alone (docs/decisions/014, 018).
+channel of a tissue pixel. They are made before training, from training frames alone (docs/decisions/motion.md).
 
 Symbols: B bases.
 """

@@ -1,7 +1,7 @@
 """Keyframes: training frames whose views together hold what the clip shows, and the tracks that start in them.
 
 A fixed camera has one, the first training frame. Where the camera moves on, tissue that comes into view has its tracks
-from the keyframe that shows it, through the frames that see enough of that keyframe (docs/decisions/050).
+from the keyframe that shows it, through the frames that see enough of that keyframe.
 
 Symbols: K training frames, M sampled pixels of a frame.
 """

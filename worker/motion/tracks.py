@@ -2,7 +2,7 @@
 
 Dense flow (DIS) from the reference to every training frame that sees enough of it gives each reference pixel a track.
 Forward and backward flow check each other. A track's displacements and changes of colour are averages of its trusted
-neighbours, over a wider area where few are trusted (docs/decisions/024). fit_tracks fits the bases of a motion to them.
+neighbours, over a wider area where few are trusted. fit_tracks fits the bases of a motion to them.
 Held-out frames are never read.
 
 Symbols: T training frames, K of them followed; h w pixels of the coarse grid on which flow is computed; N points, B

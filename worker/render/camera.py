@@ -2,7 +2,7 @@
 
 Wet tissue mirrors the lamp elsewhere for each eye. A Gaussian's gloss is how much brighter the right eye saw it than
 the left one; between the eyes a view takes its share of it. Where the lamp's image lies for anybody else is not known:
-with the distance from both eyes the view turns to the mean of the two, which is the best guess (docs/decisions/032).
+with the distance from both eyes the view turns to the mean of the two, which is the best guess.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How likely each pixel of a view is right: the confidence layer.
 
 Symbols: H W pixels. A pixel is right if its depth errs by less than 2 % and its colour, in the mean of R G B, by
-less than 0.03 of white. Its likelihood is a logistic function of three numbers (docs/decisions/031):
+less than 0.03 of white. Its likelihood is a logistic function of three numbers (their ranks: docs/decisions/views.md):
 
 trust         the Gaussians' own (worker/report/trust.py), blended: what training frames say of them
 disagreement  mean |difference| of R G B between the pixel and the endoscope's view, at the same time, of the place that

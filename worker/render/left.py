@@ -1,7 +1,7 @@
 """What has left the view: a scene shows its last known state, and trusts that less.
 
 Nobody sees how tissue moves while it is out of view. What the model shows of it is the state in which it was seen last,
-or will be seen next (docs/decisions/050).
+or will be seen next.
 
 Symbols: N Gaussians, S sampled frames.
 """

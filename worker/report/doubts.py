@@ -1,7 +1,7 @@
 """What in the pictures, masks and depth of a clip makes its scene doubtful, in plain words.
 
 Symbols: T frames, H W pixels. Each check is one number and one bound. The bounds lie between what clean clips show,
-real and synthetic, and what harms a scene (docs/decisions/016-stability.md). Held-out frames are not looked at.
+real and synthetic, and what harms a scene (docs/decisions/evaluation.md). Held-out frames are not looked at.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Symbols: N Gaussians, H W pixels.
 
-Two things that the training frames know explain the errors of other views (docs/decisions/031): how many of them saw
-the Gaussian, and how far off the pixels are that it has a part in.
+Two things that the training frames know explain the errors of other views: how many of them saw the Gaussian, and how
+far off the pixels are that it has a part in (docs/decisions/views.md has the rank correlations).
 """
 
 from __future__ import annotations

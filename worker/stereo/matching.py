@@ -5,7 +5,7 @@ Symbols: H W pixels of one eye; d disparity, x_left - x_right in px of the full 
 Semi-global matching (Hirschmueller 2008; OpenCV's form with five paths) runs on half the resolution or less, where it
 costs an eighth, on pictures of even contrast. An edge-aware weighted-least-squares filter (Min et al. 2014,
 cv2.ximgproc) smooths what both eyes agree on and fills the rest. One Lucas-Kanade step along the row at full resolution
-then restores the sub-pixel part that the reduction lost (docs/decisions/001 and 029 have figures).
+then restores the sub-pixel part that the reduction lost (docs/decisions/stereo-depth.md has figures).
 """
 
 from __future__ import annotations

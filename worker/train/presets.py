@@ -98,7 +98,7 @@ class Preset:
 
     def with_bases(self, bases: int) -> Preset:
         """With so many bases; where they are many, without first moments, which gain next to nothing and take a third
-        of the model's memory (docs/decisions/042)."""
+        of the model's memory."""
         many = self.bases is None and bases > USUAL_BASES
         return replace(self, bases=bases, rates=replace(self.rates, beta1=0.0) if many else self.rates)
 
@@ -109,9 +109,9 @@ MIN_START = 1e-3
 """Of an opacity, a spread and a width at the start; an opacity stays as far below 1, for its logit is trained."""
 MIN_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
 MANY_POINTS_FROM_S = 9.0
-"""From this budget on MANY_POINTS score more than FEW_POINTS. This is wall-clock time of the two cores of
-docs/decisions/015; a faster machine could afford them sooner. Nothing measures it at run time, because a run that is
-resumed must start with the same points."""
+"""From this budget on MANY_POINTS score more than FEW_POINTS. This is wall-clock time of two cores
+(docs/decisions/training.md); a faster machine could afford them sooner. Nothing measures it at run time, because a run
+that is resumed must start with the same points."""
 
 _PAPER_ITERATIONS = 3000
 _PAPER_DECAY = (1.6e-3, 5.06e-5)
@@ -157,7 +157,7 @@ _PAPER = Preset(
     budget_s=None,
 )
 
-# Found on d4d_endonerf and on synthetic clips (docs/decisions/005 and 015): the published rates of motion are some
+# Found on d4d_endonerf and on synthetic clips (docs/decisions/training.md): the published rates of motion are some
 # thirty times too slow for a run of hundreds of steps, and Adam's moments remember too long, for successive steps see
 # frames from all over the clip.
 _FAST_RATES = Rates(
@@ -178,9 +178,10 @@ _FAST_RATES = Rates(
 )
 
 _HASTE = 1.6
-"""A run of a hundred steps gets nearer with larger ones: 0.2 to 0.4 dB on four clips (docs/decisions/044)."""
+"""A run of a hundred steps gets nearer with larger ones: 0.2 to 0.4 dB on four clips."""
 
-# A quarter of the Gaussians, half the bases and no change of size: what loses least for each byte (docs/decisions/017)
+# A quarter of the Gaussians, half the bases and no change of size lose least for each byte
+# (docs/decisions/training.md).
 _SMALL_RATES = replace(_FAST_RATES, motion_log_scale=Rate(0.0))
 
 _FAST = Preset(

@@ -49,7 +49,7 @@ def stride_for(points: int, intrinsics: Intrinsics) -> int:
 def settled(
     preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[Notice, ...]]:
-    """The preset with what it leaves to the scene settled (decisions 014, 018), and why, in words for the report.
+    """The preset with what it leaves to the scene settled, and why, in words for the report.
 
     tracks: of each keyframe, if there are any.
     """

@@ -86,7 +86,7 @@ def run(kernel: Callable[..., object], *args: object) -> None:
 def flushing(kernel: Callable[..., object]) -> Callable[..., None]:
     """The kernel, in which subnormal numbers count as 0, on whatever thread it runs.
 
-    Adam's moments fade through them, and a processor takes long over each (docs/decisions/080-subnormal-numbers.md).
+    Adam's moments fade through them, and an Intel core takes a hundred cycles and more for each.
     """
 
     def flushed(*args: object) -> None:

@@ -4,7 +4,7 @@ Symbols: F frames, H W pixels of one eye; h w pixels the matcher works on, D dis
 
 Reduced images are matched by census costs along four directions (kernels.py). The right eye's disparities are read
 from the same sums; where both agree, an edge-aware least-squares filter (Min et al. 2014) starts, fills the rest, and
-one Lucas-Kanade step along the row at full resolution restores the sub-pixel part (docs/decisions/021).
+one Lucas-Kanade step along the row at full resolution restores the sub-pixel part.
 """
 
 from __future__ import annotations
