@@ -26,7 +26,7 @@ from contract.store.store import Store
 from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, RenderRequest
 from worker.daemon.pace import Pace
-from worker.daemon.serve import NotYetError
+from worker.daemon.reply import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.clip import DepthClip, split_frames

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contract.wire.cameras import CamerasRequest, ClipCamera, SceneCameras
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 
 FRAMES, RATE_HZ = 40, 20
 STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))

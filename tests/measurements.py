@@ -10,7 +10,7 @@ import math
 from contract.wire.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
 from contract.wire.rendering import MeasureRequest
 from tests.cameras import CAMERAS, FRAMES, RATE_HZ
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 from worker.input.camera import Intrinsics
 
 DEPTH_MM, UNCERTAINTY_MM = 60.0, 0.4

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import contract.queue.interface
 import contract.store.disk_errors  # noqa: F401
-import worker.daemon.serve  # noqa: F401
+import worker.daemon.reply  # noqa: F401
 from contract.wire.checks import FindingCode
 from contract.wire.errors import ErrorCode, IntrasplatError
 from contract.wire.measuring import RefusalCode

@@ -52,9 +52,12 @@ def _obey(channel: Channel, orders: Orders) -> None:
 
 def _views(endpoint: str) -> AbstractContextManager[object]:
     """Answer every render with the same bytes as long as the context lasts."""
-    from worker.daemon.serve import Reply, RequestServer  # with OpenCV: too slow a start for who is killed often
+    # with OpenCV: too slow a start for who is killed often
+    from tests.answers import at_once
+    from worker.daemon.reply import Reply
+    from worker.daemon.serve import RequestServer
 
-    return RequestServer(endpoint, lambda request: Reply(PICTURE, "image/jpeg", 0.0))
+    return RequestServer(endpoint, at_once(lambda request: Reply(PICTURE, "image/jpeg", 0.0)))
 
 
 def _train(task: Task, order: RunJob, channel: Channel) -> Finished | Stopped:

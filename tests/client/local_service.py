@@ -36,10 +36,12 @@ from contract.wire.rendering import (
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.answers import at_once
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
-from worker.daemon.serve import Reply, RequestServer
+from worker.daemon.reply import Reply
+from worker.daemon.serve import RequestServer
 
 CLIP = Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4"
 SNAPSHOT_ITERATION = 7
@@ -115,7 +117,7 @@ class LocalService:
 def local_service(data_dir: Path, **changes: Any) -> Iterator[LocalService]:
     service = LocalService(data_dir, **changes)
     try:
-        with RequestServer(service.endpoint, paint):
+        with RequestServer(service.endpoint, at_once(paint)):
             service.announce()
             yield service
     finally:

@@ -53,11 +53,13 @@ from contract.wire.report import Report
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
+from tests.answers import at_once
 from tests.cameras import CAMERAS, cameras_reply
 from tests.measurements import RANGE_MM, measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from worker.daemon.pace import Pace
-from worker.daemon.serve import Reply, RequestServer
+from worker.daemon.reply import Reply
+from worker.daemon.serve import RequestServer
 from worker.scene.checkpoint import save_scene
 from worker.scene.scene import Scene
 
@@ -254,7 +256,7 @@ def site_at(data_dir: Path, answer: Callable[[SceneRequest], Reply] | None = Non
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, answer or painter.answer, pace=pace, max_wait_s=MAX_WAIT_S):
+    with RequestServer(endpoint, at_once(answer or painter.answer), pace=pace, max_wait_s=MAX_WAIT_S):
         site = Site(data_dir, endpoint, painter, pace, **changes)
         try:
             yield site

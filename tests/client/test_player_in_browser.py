@@ -19,7 +19,7 @@ from tests.client.player import drawing_browser
 from tests.client.test_player import scattered
 from tests.client.words import say
 from tests.worker.scenes import random_scene
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 from worker.daemon.views import Views
 from worker.scene.checkpoint import SCENE_FILE
 

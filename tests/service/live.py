@@ -25,7 +25,9 @@ from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.app import create_app
 from service.renderer import ZmqRenderer
 from service.server import Server
-from worker.daemon.serve import Reply, RequestServer
+from tests.answers import at_once
+from worker.daemon.reply import Reply
+from worker.daemon.serve import RequestServer
 
 WORKER = "worker-1"
 
@@ -87,7 +89,7 @@ def live_service(
     endpoint = f"ipc://{short_socket_path(store.run_dir, f'{WORKER}.sock')}"
     server = Server(create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s)), settings)
     thread = threading.Thread(target=server.run)
-    with RequestServer(endpoint, answer):
+    with RequestServer(endpoint, at_once(answer)):
         queue.announce(WorkerAddress(name=WORKER, endpoint=endpoint, device="cpu"))
         thread.start()
         try:

@@ -14,7 +14,7 @@ from contract.wire.rendering import ExportRequest, SceneRequest
 from service import exports
 from tests.service.live import live_service
 from tests.service.under_test import ServiceUnderTest, assert_problem
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 
 PARTS = 5
 

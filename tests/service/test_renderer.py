@@ -21,7 +21,9 @@ from contract.wire.errors import UnavailableError
 from contract.wire.rendering import ExportRequest, RenderRequest, WorkerAddress
 from service.connection import Answer
 from service.renderer import ZmqRenderer
-from worker.daemon.serve import Reply, RequestServer
+from tests.answers import at_once
+from worker.daemon.reply import Reply
+from worker.daemon.serve import RequestServer
 
 SCENES = [f"{number:032x}" for number in range(40)]
 SECRET, ANOTHER = "a secret of at least 32 characters", "another secret of 32 characters!"
@@ -59,7 +61,7 @@ class Workers:
             self.asked[name] += 1
             return Reply(name.encode(), "image/png", request.t)
 
-        server = RequestServer(self.endpoint(name), answer)
+        server = RequestServer(self.endpoint(name), at_once(answer))
         self._stack.enter_context(server)
         self.announce(name, self.endpoint(name), **about)
         return server
@@ -209,7 +211,7 @@ def test_who_gives_up_is_not_rendered_for(workers: Workers) -> None:
         go_on.set()
         await renderer.ask(scene(SCENES[0], t=1000))
 
-    with RequestServer(workers.endpoint("slow"), answer):
+    with RequestServer(workers.endpoint("slow"), at_once(answer)):
         workers.announce("slow", workers.endpoint("slow"))
         asking(workers, ask)
     assert asked[-1] == 1000
@@ -296,11 +298,11 @@ def named(request: RenderRequest | ExportRequest) -> Reply:
 def test_over_tcp_the_same_secret_opens_and_another_is_named_as_the_cause(workers: Workers, tcp_endpoint: str) -> None:
     async def ask(renderer: ZmqRenderer) -> bytes:
         with (
-            RequestServer(tcp_endpoint, named, render_secret=ANOTHER),
+            RequestServer(tcp_endpoint, at_once(named), render_secret=ANOTHER),
             pytest.raises(UnavailableError, match="INTRASPLAT_RENDER_SECRET"),
         ):
             await renderer.ask(scene(SCENES[0]))
-        with RequestServer(tcp_endpoint, named, render_secret=SECRET):
+        with RequestServer(tcp_endpoint, at_once(named), render_secret=SECRET):
             return (await renderer.ask(scene(SCENES[0]))).body
 
     workers.announce("worker-1", tcp_endpoint)

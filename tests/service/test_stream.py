@@ -20,7 +20,7 @@ from contract.wire.rendering import ExportRequest, Highlights, RenderRequest, Un
 from tests.reports import a_warning
 from tests.service.live import LiveService, live_service
 from tests.service.under_test import CAMERA
-from worker.daemon.serve import NotYetError, Reply
+from worker.daemon.reply import NotYetError, Reply
 
 TIMEOUT_S = 10.0
 LARGE = 4 * 2**20

@@ -33,11 +33,13 @@ from contract.wire.rendering import (
 from service.__main__ import KNOWN_WORKERS
 from service.app import create_app
 from service.renderer import ZmqRenderer
+from tests.answers import at_once
 from tests.cameras import cameras_reply
 from tests.measurements import measurement_reply
 from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.service.asgi import AsgiClient, serving
-from worker.daemon.serve import Reply, RequestServer
+from worker.daemon.reply import Reply
+from worker.daemon.serve import RequestServer
 
 CLIP = (Path(__file__).resolve().parents[1] / "data" / "stereo_sbs_h264.mp4").read_bytes()
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
@@ -148,7 +150,7 @@ def running_service(data_dir: Path, queue: Queue | None = None, **changes: Any) 
     app = create_app(settings, queue, store, ZmqRenderer(queue, settings.render_timeout_s, known=known))
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     with (
-        RequestServer(endpoint, painter.answer),
+        RequestServer(endpoint, at_once(painter.answer)),
         serving(app, "http://127.0.0.1:8765") as http,
     ):
         queue.announce(WorkerAddress(name="worker-1", endpoint=endpoint, device="cpu"))

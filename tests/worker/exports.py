@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from contract.wire.exports import check_export
 from contract.wire.rendering import ExportRequest, SceneRequest
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 
 
 def export_request(scene_id: str, name: str = "ply", **options: object) -> ExportRequest:

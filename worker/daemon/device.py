@@ -24,7 +24,6 @@ from contract.store.store import Store, open_store
 from contract.wire.errors import Cancelled, InputError, ResumeMismatch, UnavailableError
 from contract.wire.job import JobProgress, JobRecord
 from contract.wire.names import REPORT
-from contract.wire.rendering import SceneRequest
 from contract.wire.report import Imported, Report
 from worker.daemon.channel import Channel, Orders, Task
 from worker.daemon.job_errors import describe
@@ -42,7 +41,7 @@ from worker.daemon.orders import (
     job_progress,
 )
 from worker.daemon.pace import SHARE, Pace
-from worker.daemon.serve import Reply, RequestServer
+from worker.daemon.serve import RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.decode import keep_decoder_ready
@@ -111,10 +110,6 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
-    def answer(request: SceneRequest) -> Reply:
-        with alone(is_alone=pace.trains):
-            return views.answer(request)
-
     def report_held_scenes() -> None:
         views.forget_purged()
         channel.send_if_new(Holding(scenes=views.held))
@@ -122,15 +117,15 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     server = RequestServer(
         endpoint,
-        answer,
+        views.answer_in_parts,
         cost=views.cost,
         between=report_held_scenes,
         pace=pace,
+        within=lambda: alone(is_alone=pace.trains),
         spent_s=cpu_time_s,  # with what this thread waits for a GPU: it asks again and again
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
         render_secret=settings.render_secret,
     )
-    views.pause, views.level = server.pause, server.level
     with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)

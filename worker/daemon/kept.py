@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 from contract.wire.rendering import RenderRequest
-from worker.daemon.serve import Reply
+from worker.daemon.reply import Reply
 
 MAX_KEPT_BYTES = 32 * 2**20
 

@@ -39,7 +39,6 @@ class Turn:
     least_s: float
     arrived_s: float
     spent_s: float = 0.0
-    is_given_up: bool = False
     level: int = 0
     trace: str | None = None
 

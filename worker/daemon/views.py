@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -40,19 +39,23 @@ from contract.wire.rendering import (
 )
 from worker.daemon.exports import OpenExports
 from worker.daemon.kept import KeptReplies
-from worker.daemon.serve import NotYetError, Reply
+from worker.daemon.reply import NotYetError, Reply
 from worker.daemon.snapshot import Snapshot, Snapshots
 from worker.export import DRAWN, export_parts
 from worker.input.camera import Intrinsics
+from worker.machine.parts import Parts, whole
 from worker.raster.backend import CPU, Device
 from worker.raster.cpu.threads import beside
+from worker.raster.model import BAND_PIXELS
 from worker.render.camera import endoscope_pose, right_eye
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
+from worker.render.frame import Frame
+from worker.render.lenses import Lenses
 from worker.render.measure import WINDOW_PX
 from worker.render.measured import measured
 from worker.render.recorded import live_frame, stored_frame
-from worker.render.view import LARGE_PIXELS, ROUNDING, Frame, drawn_pixels, no_pause, render_frame, renderer_of
+from worker.render.view import ROUNDING, View, frame_in_parts, renderer_of
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
 from worker.train.targets import MEDIAN_DEPTH_UNITS
@@ -70,9 +73,7 @@ MAX_HELD_SCENES = 64
 class Views:
     """Answers render and export requests from the scenes of a store and the snapshots of a job; for one thread.
 
-    `held` names the scenes in memory, the last used one at the end; other threads may read it. `pause` is called
-    between the parts of a large render; it may ask for other answers meanwhile. `level` says at which of the LEVELS of
-    detail a picture in a format for eyes is drawn.
+    `held` names the scenes in memory, the last used one at the end; other threads may read it.
     """
 
     def __init__(
@@ -92,11 +93,17 @@ class Views:
         self._snapshot: Snapshot | None = None  # the last that was shown, of the job
         self._job_id = ""
         self.held: tuple[str, ...] = ()
-        self.pause: Callable[[], None] = no_pause
-        self.level: Callable[[], int] = lambda: 0
 
-    def answer(self, request: SceneRequest) -> Reply:
-        """The encoded image or file. Recorded frames and cameras count as kept: they say nothing of renders' time.
+    def answer(self, request: SceneRequest, level: int = 0) -> Reply:
+        """As answer_in_parts, at once."""
+        return whole(self.answer_in_parts(request, level))
+
+    def answer_in_parts(self, request: SceneRequest, level: int = 0) -> Parts[Reply]:
+        """The encoded image or file. Other answers may be made between its parts.
+
+        Recorded frames and cameras count as kept: they say nothing of renders' time.
+
+        level: of the LEVELS of detail, for a render in a format for eyes. Others are exact.
 
         Raises:
             SceneError: the scene is missing or damaged.
@@ -119,9 +126,9 @@ class Views:
         if isinstance(request, CamerasRequest):
             return _cameras(scene, snapshot)
         reply = self._kept.get(request)
-        level = self.level() if request.format in FOR_EYES else 0
+        level = level if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
-            reply = self._render(scene, request, snapshot, level)
+            reply = yield from self._rendered(scene, request, snapshot, level)
             # Between the parts of a render a scene may be purged, or a newer snapshot shown.
             is_held = (
                 (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
@@ -152,9 +159,8 @@ class Views:
         if scene is not None:
             asked = _seen_through(scene.intrinsics, request.camera)
             is_own, is_judged = request.is_from_endoscope, request.layer is Layer.CONFIDENCE
-            drawn = drawn_pixels(
-                asked, scene.intrinsics, request.max_pixels, confidence=is_judged, from_endoscope=is_own
-            )
+            lenses = Lenses.of(asked, scene.intrinsics, request.max_pixels)
+            drawn = lenses.pixels_drawn(confidence=is_judged, from_endoscope=is_own)
         else:
             drawn = request.most_drawn(size)
         return sum(render_cost(each, gaussians) for each in drawn)
@@ -215,7 +221,7 @@ class Views:
         self.held = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
-    def _render(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Reply:
+    def _rendered(self, scene: Scene, request: RenderRequest, snapshot: Snapshot | None, level: int) -> Parts[Reply]:
         """One render; snapshot: that the scene is of, None for a finished one; level: of detail."""
         pose, lens = self._standing(scene, request)
         camera = camera_of(lens, request.camera, request.max_pixels)
@@ -227,17 +233,19 @@ class Views:
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         drawn = thinned(scene, detail.gaussians)
         told = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
-        with traces.span("draw", **told):
-            frame = render_frame(
+        view = View(
             drawn, request.t, pose, camera, self._device,
-            highlights=highlights, is_coarse=level > 0, max_pixels=request.max_pixels, pause=self.pause,
+            highlights=highlights, is_coarse=level > 0, max_pixels=request.max_pixels,
         )  # fmt: skip
+        with traces.span("draw", **told):
+            frame = yield from frame_in_parts(view, with_confidence=request.layer is Layer.CONFIDENCE)
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
             range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
         frame = frame.enlarged(*size) if level else frame
-        reply = _reply(scene, frame, request, snapshot, level, range_mm, self.pause)
-        return dataclasses.replace(reply, camera=taken_by)
+        body = yield from _encoded(frame, request, range_mm)
+        reply = _reply(scene, frame, request, snapshot, body)
+        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=taken_by)
 
     def _standing(self, scene: Scene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
         """Where the caller stands, None at the endoscope's left eye, and the lens unless another is given.
@@ -287,23 +295,19 @@ class Views:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
 
 
-def _reply(
-    scene: Scene,
-    frame: Frame,
-    request: RenderRequest,
-    snapshot: Snapshot | None,
-    level: int,
-    depth_range_mm: tuple[float, float] | None,
-    pause: Callable[[], None],
-) -> Reply:
-    """A frame as it is sent. pause: called while a large one is encoded."""
-    iteration = None if snapshot is None else snapshot.iteration
-    if request.layer is Layer.CONFIDENCE:
-        _ = frame.confidence  # rendered by this thread, which has the buffers, and kept by the frame
+def _encoded(frame: Frame, request: RenderRequest, depth_range_mm: tuple[float, float] | None) -> Parts[bytes]:
+    """The file. A large picture takes long and cannot be encoded in parts, so another thread does it."""
     how = request.layer, request.format, request.quality, request.unseen
     encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
     with traces.span("encode", layer=request.layer.value, format=request.format.value):
-        body = beside(encode, pause) if frame.unseen.size > LARGE_PIXELS else encode()
+        if frame.unseen.size > BAND_PIXELS:
+            return (yield from beside(encode))
+        return encode()
+
+
+def _reply(scene: Scene, frame: Frame, request: RenderRequest, snapshot: Snapshot | None, body: bytes) -> Reply:
+    """A frame as it is sent."""
+    iteration = None if snapshot is None else snapshot.iteration
     warnings = frame.warnings
     if snapshot is not None:
         # What the clip shows of each place is counted when training has ended: until then nothing is vouched for.
@@ -318,10 +322,7 @@ def _reply(
     shown = shown_time(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    unseen = frame.unseen_share
-    return Reply(
-        body, media_type, shown, warnings, iteration, unseen, count, clip_size, level, depth_range_mm=depth_range_mm
-    )
+    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
 
 
 def _cameras(scene: Scene, snapshot: Snapshot | None) -> Reply:

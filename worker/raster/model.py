@@ -12,7 +12,8 @@ is a number and whether any Gaussian was in view.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -28,6 +29,61 @@ from worker.raster.step import StepSums, TrainingFrame
 Floats = NDArray[np.float32]
 FIRST_MOMENTS = "motion.first"
 """In Model.arrays()."""
+BAND_PIXELS = 1 << 19
+"""A CPU blends so many in some tens of milliseconds."""
+
+
+def bands_of(width: int, height: int, multiple: int = 1) -> list[slice]:
+    """The rows of an image, from top to bottom, in bands of about BAND_PIXELS that begin at multiples of a number."""
+    rows = multiple * max(1, BAND_PIXELS // (width * multiple))
+    return [slice(first, min(first + rows, height)) for first in range(0, height, rows)]
+
+
+class Projected(Protocol):
+    """The Gaussians at one time on one camera's image, in buffers of its own: its bands are blended one by one, and the
+    model may render other pictures in between."""
+
+    @property
+    def with_values(self) -> bool:
+        """Whether values are blended beside colour."""
+        ...
+
+    @property
+    def bands(self) -> Sequence[slice]:
+        """The image's rows, from top to bottom, about BAND_PIXELS of them at a time."""
+        ...
+
+    def blend(self, rows: slice) -> Floats:
+        """R G B Z A and the values of one of the bands, [5 or 6, h, W]; a view until close()."""
+        ...
+
+    def close(self) -> None:
+        """Give the buffers back to the model."""
+        ...
+
+
+@dataclass(frozen=True)
+class Blended:
+    """A Projected whose bands are blended already. image: [5 or 6, H, W]."""
+
+    image: Floats
+
+    @property
+    def with_values(self) -> bool:
+        """As of Projected."""
+        return len(self.image) == 6
+
+    @property
+    def bands(self) -> list[slice]:
+        """As of Projected."""
+        return bands_of(self.image.shape[2], self.image.shape[1])
+
+    def blend(self, rows: slice) -> Floats:
+        """As of Projected."""
+        return self.image[:, rows]
+
+    def close(self) -> None:
+        """There is nothing to give back."""
 
 
 class Model(Protocol):
@@ -76,19 +132,15 @@ class Model(Protocol):
         faint."""
         ...
 
-    def render(
-        self,
-        camera: NDArray[np.float64],
-        t: float,
-        values: Floats | None = None,
-        pause: Callable[[], None] | None = None,
-    ) -> Floats:
-        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites, with pause a copy.
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W], Z = sum(w z) in units; a view that the next render overwrites.
 
-        With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
-        called between the parts of a large render, if the device makes it in parts. It may render, and end the render
-        by an exception.
+        With values [N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
         """
+        ...
+
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+        """The same picture, to be blended in bands of rows, with the same bits. The caller closes it."""
         ...
 
     def blend_values(self, values: Floats) -> Floats:

@@ -5,12 +5,12 @@ N Gaussians, H W pixels. Scenes keep their kernels' buffers between frames, so t
 
 from __future__ import annotations
 
-import math
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import cached_property, partial
-from threading import Lock, RLock
+from functools import cached_property
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -19,15 +19,18 @@ from numpy.typing import NDArray
 from contract.wire.notices import Notice, NoticeCode
 from contract.wire.rendering import MAX_JUDGED_PIXELS
 from worker.input.camera import Intrinsics
+from worker.machine.parts import Parts, whole
 from worker.model.constants import SH_C0
 from worker.model.layout import COLOUR_ROW
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
-from worker.raster.cpu.threads import beside
-from worker.render.camera import as_recorded, endoscope_pose, view_camera
+from worker.raster.model import Projected
+from worker.render.camera import endoscope_pose, view_camera
 from worker.render.confidence import confidence, evidence, seen_from_endoscope
 from worker.render.depth_range import DepthRange
+from worker.render.frame import Frame
 from worker.render.left import OutOfView
+from worker.render.lenses import Lenses, pixel_count
 from worker.render.unseen import blended_values, unseen_pixels
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
@@ -43,84 +46,8 @@ HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see l
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
-COARSE = "This picture is coarse, because a job trains and time is short. It becomes sharp when the view rests."
-MAX_JUDGED_SIDE = 8192
-"""If they are so many, at most so many along a side: as many as a caller may ask for."""
-AS_FINE = 0.02
-"""A picture whose pixels are by no more larger or smaller than the recording's is judged in its own."""
-MOST = 0.5
-"""Of a pixel: more of it decides."""
-PART_PIXELS = 1 << 18
-"""Pixels between two pauses of a large render."""
-LARGE_PIXELS = 1 << 19
-"""What takes all pixels of more than these at once is done on another thread, and pauses go on meanwhile."""
 ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a decimal fraction may round i / T."""
-
-
-def no_pause() -> None:
-    """What a render does between its parts if nobody waits."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One rendered view.
-
-    rgb        [H, W, 3] uint8
-    depth_mm   [H, W] float32, camera z, 0 where nothing solid is
-    unseen     [H, W] bool: no training frame saw what is shown here; the other layers hold the model's guess
-    unseen_share   of the view, in [0, 1]
-    warnings   what to distrust about this frame, and what to know of it
-
-    Confidence, unseen_share and warnings do not depend on how many pixels show the view (docs/conventions.md, "Size of
-    a picture").
-    """
-
-    rgb: NDArray[np.uint8]
-    depth_mm: NDArray[np.float32]
-    unseen: NDArray[np.bool_]
-    unseen_share: float
-    warnings: tuple[Notice, ...]
-    _confidence: Callable[[], NDArray[np.float32]]
-
-    @cached_property
-    def confidence(self) -> NDArray[np.float32]:
-        """[H, W] float32 in [0, 1]: how likely colour and depth are right (confidence.py); 0 where nothing solid is.
-
-        Computed when it is first asked for: from another pose than the endoscope's it takes a second render.
-        """
-        return self._confidence()
-
-    def enlarged(self, width: int, height: int) -> Frame:
-        """The frame in more pixels, with a notice that says so."""
-        size = (width, height)
-        rgb = np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-        depth_mm = np.asarray(cv2.resize(self.depth_mm, size, interpolation=cv2.INTER_NEAREST), np.float32)
-        unseen = cv2.resize(self.unseen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
-        likely = self._confidence
-
-        def confidence() -> NDArray[np.float32]:
-            return np.asarray(cv2.resize(likely(), size, interpolation=cv2.INTER_LINEAR), np.float32)
-
-        warnings = (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE))
-        return Frame(rgb, depth_mm, unseen, self.unseen_share, warnings, confidence)
-
-    def reduced(self, width: int, height: int) -> Frame:
-        """The frame in fewer pixels: each is the mean of those it covers, as most of them are solid and seen or not."""
-
-        def mean(layer: NDArray[np.floating] | NDArray[np.uint8]) -> NDArray[np.floating]:
-            return np.asarray(cv2.resize(layer, (width, height), interpolation=cv2.INTER_AREA))
-
-        solid = mean((self.depth_mm > 0).astype(np.float32))
-        covered, safe = solid >= MOST, np.maximum(solid, MOST)
-        depth_mm = np.where(covered, mean(self.depth_mm) / safe, 0).astype(np.float32)
-        unseen, likely = mean(self.unseen.astype(np.float32)) > MOST, self._confidence
-
-        def confidence() -> NDArray[np.float32]:
-            return np.where(covered, mean(likely()), 0).astype(np.float32)
-
-        rgb = np.asarray(mean(self.rgb), np.uint8)
-        return Frame(rgb, depth_mm, unseen, self.unseen_share, self.warnings, confidence)
 
 
 class SceneRenderer:
@@ -134,7 +61,7 @@ class SceneRenderer:
         self._model = model_of(scene, device)
         self._values = blended_values(scene.seen.numpy())
         self._out_of_view = None if self._values is None else OutOfView.of(self.scene, self._model)
-        self._lock = RLock()  # who pauses a large render may make a small one
+        self._lock = Lock()
 
     @cached_property
     def depth_range(self) -> DepthRange:
@@ -143,20 +70,37 @@ class SceneRenderer:
             return DepthRange.of(self.scene, self._model)
 
     def layers(
+        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
+        camera = view_camera(self.scene, t, world_from_camera, intrinsics)
+        values = self.values(t)
+        with self._lock:
+            image = self._model.render(camera, t, values).copy()
+        return image[:5], None if values is None else image[5]
+
+    @contextmanager
+    def projected(
         self,
         t: float,
         world_from_camera: NDArray[np.float64],
         intrinsics: Intrinsics,
         *,
         highlights: bool = True,
-        pause: Callable[[], None] = no_pause,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """R G B Z A [5, H, W], Z unnormalised in units, and blended_values as they are blended [H, W], as copies."""
+    ) -> Iterator[Projected]:
+        """R G B Z A, and as sixth plane blended_values if they are known, to be blended in bands.
+
+        Other pictures of the scene may be rendered meanwhile.
+        """
         camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
         values = self.values(t)
         with self._lock:
-            image = self._model.render(camera, t, values, pause)
-        return image[:5], None if values is None else image[5]
+            picture = self._model.projected(camera, t, values)
+        try:
+            yield picture
+        finally:
+            with self._lock:
+                picture.close()
 
     def seen_from(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
         """The scene's colour, depth in mm and alpha at model time t."""
@@ -202,6 +146,56 @@ def renderer_of(scene: Scene, device: Device = CPU) -> SceneRenderer:
         return made[device]
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a frame shows, and how it is made.
+
+    t                  model time, held within the clip
+    world_from_camera  [4, 4] mm; None: the endoscope's own at t
+    intrinsics         None: the recording's
+    device             that renders
+    highlights         True: as the endoscope's eyes saw them, and away from both their mean; False: without
+    is_coarse          draw and judge no more pixels than asked for, because time is short
+    max_pixels         a picture of fewer is drawn and judged in no more
+    """
+
+    scene: Scene
+    t: float
+    world_from_camera: NDArray[np.float64] | None = None
+    intrinsics: Intrinsics | None = None
+    device: Device = CPU
+    highlights: bool = True
+    is_coarse: bool = False
+    max_pixels: int = MAX_JUDGED_PIXELS
+
+    @cached_property
+    def shown_t(self) -> float:
+        """The model time within the clip."""
+        return held_in_clip(self.scene, self.t)[0]
+
+    @cached_property
+    def endoscope_pose(self) -> NDArray[np.float64]:
+        """world_from_camera [4, 4] mm of the endoscope at that time."""
+        return endoscope_pose(self.scene, self.shown_t)
+
+    @cached_property
+    def pose(self) -> NDArray[np.float64]:
+        """world_from_camera [4, 4] mm of the frame."""
+        given = self.world_from_camera
+        return self.endoscope_pose if given is None else np.asarray(given, np.float64)
+
+    @cached_property
+    def lenses(self) -> Lenses:
+        """The cameras behind the frame."""
+        own = self.scene.intrinsics
+        return Lenses.of(self.intrinsics or own, own, self.max_pixels, is_coarse=self.is_coarse)
+
+    def projected(self, pose: NDArray[np.float64], lens: Intrinsics) -> AbstractContextManager[Projected]:
+        """The scene at that time, from a pose through a lens, to be blended (SceneRenderer.projected)."""
+        renderer = renderer_of(self.scene, self.device)
+        return renderer.projected(self.shown_t, pose, lens, highlights=self.highlights)
+
+
 def render_frame(
     scene: Scene,
     t: float,
@@ -210,118 +204,122 @@ def render_frame(
     device: Device = CPU,
     *,
     highlights: bool = True,
-    is_coarse: bool = False,
-    max_pixels: int = MAX_JUDGED_PIXELS,
-    pause: Callable[[], None] = no_pause,
 ) -> Frame:
-    """The scene at model time t (held within the clip) from a pose (mm; None: the endoscope's) through a camera.
+    """The scene at model time t from a pose through a camera. The arguments are those of a View."""
+    return whole(frame_in_parts(View(scene, t, world_from_camera, intrinsics, device, highlights)))
 
-    highlights: as the endoscope's eyes saw them, and away from both their mean; False: without.
-    is_coarse: draw and judge no more pixels than asked for, because time is short.
-    max_pixels: a picture of fewer is drawn and judged in no more.
-    pause: called between the parts of the work (worker/raster/model.py).
+
+def frame_in_parts(view: View, *, with_confidence: bool = False) -> Parts[Frame]:
+    """The frame of a view, in parts of some tens of milliseconds on a CPU.
+
+    with_confidence: compute it now, in parts, and not when somebody asks for it.
     """
-    shown, outside = held_in_clip(scene, t)
-    own_pose = endoscope_pose(scene, shown)
-    pose = own_pose if world_from_camera is None else np.asarray(world_from_camera, np.float64)
-    asked = intrinsics or scene.intrinsics
-    judged = asked if is_coarse else judged_camera(asked, scene.intrinsics, max_pixels)
-    drawn = max(asked, judged, key=_pixels)
-    camera = (drawn, pose)
-    image, blended = renderer_of(scene, device).layers(shown, pose, camera[0], highlights=highlights, pause=pause)
-    size = image.shape[1:]
-    rgb, solid = np.empty((*size, 3), np.uint8), np.empty(size, np.bool_)
-    # Of a snapshot nothing is known yet: nothing is blended, and 0 is shown.
-    depth_mm, trust = np.empty(size, np.float32), np.zeros(size, np.float32)
-    for rows in _parts(size):
-        part, alpha = image[:, rows], image[4, rows]
-        solid[rows] = alpha >= COVERED_ALPHA
-        if blended is not None:
-            trust[rows] = np.clip(blended[rows] / np.where(solid[rows], alpha, 1), 0, 1) * solid[rows]
-        rgb[rows] = np.clip(part[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255)
-        depth_mm[rows] = solid_depth_mm(part[3], alpha, scene.units_per_mm)
-        pause()
-    is_unseen = partial(unseen_pixels, solid, blended)
-    unseen = beside(is_unseen, pause) if solid.size > LARGE_PIXELS else is_unseen()
-    pause()
-    warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(_distance_from_trained(scene, pose), trust, unseen))
-    if not highlights and scene.right_eye_mm is None:
+    lenses, scene = view.lenses, view.scene
+    picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
+    unseen = unseen_pixels(picture.solid, picture.blended)
+    yield
+    outside = held_in_clip(scene, view.t)[1]
+    warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(view, picture.trust, unseen))
+    if not view.highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
-    pause()
-    if _pixels(judged) < _pixels(drawn):
-        again = partial(
-            render_frame, scene, shown, pose, judged, device,
-            highlights=highlights, max_pixels=max_pixels, pause=pause,
-        )  # fmt: skip
-        layer: Callable[[], NDArray[np.float32]] = partial(_enlarged_confidence, again, depth_mm > 0)
-    else:
-        most = _pixels(asked) if is_coarse else max_pixels
-        endoscope = (_compared_camera(drawn, scene.intrinsics, most), own_pose)
-        own_view = partial(_endoscope_rgb, scene, shown, endoscope, device, highlights, pause)
-        view = (image[:3], depth_mm, trust)
-        layer = partial(_confidence, endoscope, camera, view, own_view)
-    frame = Frame(rgb, depth_mm, unseen, _share(unseen), warnings, layer)
-    return frame if _pixels(drawn) == _pixels(asked) else frame.reduced(asked.width, asked.height)
+    yield
+    known = (yield from _confidence(view, picture)) if with_confidence else None
+
+    def likely() -> NDArray[np.float32]:
+        return whole(_confidence(view, picture)) if known is None else known
+
+    frame = Frame(picture.rgb, picture.depth_mm, unseen, _share(unseen), warnings, likely)
+    is_as_asked = pixel_count(lenses.drawn) == pixel_count(lenses.asked)
+    return frame if is_as_asked else frame.reduced(lenses.asked.width, lenses.asked.height)
 
 
-def judged_camera(asked: Intrinsics, own: Intrinsics, max_pixels: int = MAX_JUDGED_PIXELS) -> Intrinsics:
-    """The view in the pixels in which it is judged: the recording's, as far as they are not too many. A smaller picture
-    is drawn in them, too.
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A rendered view before it is judged.
 
-    The right eye's lens, and sizes rounded to whole pixels, count as the recording's.
+    rgb       [H, W, 3] uint8
+    depth_mm  [H, W] float32, camera z, 0 where nothing solid is
+    solid     [H, W] bool
+    trust     [H, W] float32 in [0, 1]; 0 everywhere if it is not known, as of a snapshot
+    blended   [H, W] float32 sum of w * blended_values; None: not known
+    colours   [3, H, W] float32, unclipped; None: not needed
     """
-    fine = as_recorded(asked, own)
-    if abs(_pixels(fine) / _pixels(asked) - 1) <= AS_FINE:
-        return asked
-    most = max(min(MAX_JUDGED_PIXELS, max_pixels), _pixels(asked))
-    return asked if _pixels(fine) > most == _pixels(asked) else _at_most(fine, most)
+
+    rgb: NDArray[np.uint8]
+    depth_mm: NDArray[np.float32]
+    solid: NDArray[np.bool_]
+    trust: NDArray[np.float32]
+    blended: NDArray[np.float32] | None
+    colours: NDArray[np.float32] | None
+
+    @classmethod
+    def empty(cls, height: int, width: int, *, with_blended: bool, with_colours: bool) -> _Picture:
+        """One to be filled."""
+        size = (height, width)
+        rgb, depth_mm, solid = np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty(size, np.bool_)
+        blended = np.empty(size, np.float32) if with_blended else None
+        colours = np.empty((3, *size), np.float32) if with_colours else None
+        return cls(rgb, depth_mm, solid, np.zeros(size, np.float32), blended, colours)
+
+    def fill(self, rows: slice, band: NDArray[np.float32], units_per_mm: float) -> None:
+        """These rows, from R G B Z A and, if they are known, the blended values: [5 or 6, h, W]."""
+        alpha = band[4]
+        self.solid[rows] = alpha >= COVERED_ALPHA
+        if self.blended is not None:
+            self.blended[rows] = band[5]
+            normalised = band[5] / np.where(self.solid[rows], alpha, 1)
+            self.trust[rows] = np.clip(normalised, 0, 1) * self.solid[rows]
+        if self.colours is not None:
+            self.colours[:, rows] = band[:3]
+        self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255)
+        self.depth_mm[rows] = solid_depth_mm(band[3], alpha, units_per_mm)
 
 
-def drawn_pixels(
-    asked: Intrinsics, own: Intrinsics, max_pixels: int, *, confidence: bool, from_endoscope: bool
-) -> list[int]:
-    """Pixels of each picture that render_frame draws, of a scene whose lens is `own`.
+def _rendered(view: View, lens: Intrinsics, *, with_colours: bool) -> Parts[_Picture]:
+    """The view's picture through a lens: a part for the projection and one for each band."""
+    with view.projected(view.pose, lens) as projected:
+        yield
+        picture = _Picture.empty(lens.height, lens.width, with_blended=projected.with_values, with_colours=with_colours)
+        for rows in projected.bands:
+            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm)
+            yield
+    return picture
 
-    confidence: it is asked for, too.
-    from_endoscope: the view is from the endoscope's own pose.
+
+def _confidence(view: View, picture: _Picture) -> Parts[NDArray[np.float32]]:
+    """[H, W] the confidence of a view's picture; 0 where nothing solid is drawn or trust is 0.
+
+    A picture of more pixels than it is judged in is rendered again in those, and its confidence enlarged.
     """
-    judged = judged_camera(asked, own, max_pixels)
-    drawn = [max(asked, judged, key=_pixels)]
-    if confidence:
-        if _pixels(judged) < _pixels(asked):
-            drawn.append(judged)
-        compared = _compared_camera(drawn[-1], own, max_pixels)
-        if not from_endoscope or compared != drawn[-1]:
-            drawn.append(compared)
-    return [_pixels(each) for each in drawn]
+    lenses, judged = view.lenses, picture
+    if picture.colours is None:
+        judged = yield from _rendered(view, lenses.judged, with_colours=True)
+    assert judged.colours is not None
+    known_rgb = judged.colours
+    if lenses.judged != lenses.endoscope or not np.array_equal(view.pose, view.endoscope_pose):
+        own_rgb = yield from _endoscope_rgb(view)
+        camera, endoscope = (lenses.judged, view.pose), (lenses.endoscope, view.endoscope_pose)
+        known_rgb = seen_from_endoscope(own_rgb, judged.depth_mm, camera, endoscope)
+        yield
+    likely = confidence(evidence(judged.trust, judged.colours, known_rgb))
+    likely = np.where(judged.trust > 0, likely, 0).astype(np.float32)
+    if judged is picture:
+        return likely
+    yield
+    enlarged = cv2.resize(likely, picture.solid.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.where(picture.depth_mm > 0, enlarged, 0).astype(np.float32)
 
 
-def _compared_camera(judged: Intrinsics, own: Intrinsics, max_pixels: int) -> Intrinsics:
-    """The endoscope's lens, in pixels as fine as those of a view that is compared with it, and no more than allowed."""
-    across, down = min(judged.fx / own.fx, 1.0), min(judged.fy / own.fy, 1.0)
-    as_fine = own
-    if across * down < 1 - AS_FINE:
-        as_fine = own.resized(max(1, round(own.width * across)), max(1, round(own.height * down)))
-    return _at_most(as_fine, max(max_pixels, _pixels(judged)))
-
-
-def _at_most(camera: Intrinsics, most: int) -> Intrinsics:
-    """The same view in at most so many pixels."""
-    if _pixels(camera) <= most:
-        return camera
-    share = math.sqrt(most / _pixels(camera))
-    width = min(max(1, int(camera.width * share)), MAX_JUDGED_SIDE, most)
-    return camera.resized(width, min(max(1, int(camera.height * share)), MAX_JUDGED_SIDE, most // width))
-
-
-def _pixels(camera: Intrinsics) -> int:
-    return camera.width * camera.height
-
-
-def _enlarged_confidence(judged: Callable[[], Frame], solid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """[H, W] the confidence of the frame between its pixels, 0 where nothing solid [H, W] is drawn."""
-    likely = cv2.resize(judged().confidence, solid.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.where(solid, likely, 0).astype(np.float32)
+def _endoscope_rgb(view: View) -> Parts[NDArray[np.float32]]:
+    """[3, h, w] of the endoscope's own view at the view's time."""
+    lens = view.lenses.endoscope
+    colours = np.empty((3, lens.height, lens.width), np.float32)
+    with view.projected(view.endoscope_pose, lens) as projected:
+        yield
+        for rows in projected.bands:
+            colours[:, rows] = projected.blend(rows)[:3]
+            yield
+    return colours
 
 
 def held_in_clip(scene: Scene, t: float) -> tuple[float, tuple[Notice, ...]]:
@@ -334,44 +332,8 @@ def held_in_clip(scene: Scene, t: float) -> tuple[float, tuple[Notice, ...]]:
     return shown, (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, text),)
 
 
-def _parts(size: tuple[int, ...]) -> Iterator[slice]:
-    """Rows of an image of H x W, PART_PIXELS of them at a time."""
-    height, width = size
-    step = max(1, PART_PIXELS // width)
-    return (slice(first, min(first + step, height)) for first in range(0, height, step))
-
-
-def _endoscope_rgb(
-    scene: Scene,
-    t: float,
-    endoscope: tuple[Intrinsics, NDArray[np.float64]],
-    device: Device,
-    highlights: bool,
-    pause: Callable[[], None],
-) -> NDArray[np.float32]:
-    """[3, h, w] of the endoscope's own view at t."""
-    lens, pose = endoscope
-    image, _ = renderer_of(scene, device).layers(t, pose, lens, highlights=highlights, pause=pause)
-    return image[:3]
-
-
-def _confidence(
-    endoscope: tuple[Intrinsics, NDArray[np.float64]],
-    camera: tuple[Intrinsics, NDArray[np.float64]],
-    view: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
-    own_view: Callable[[], NDArray[np.float32]],
-) -> NDArray[np.float32]:
-    """The confidence layer [H, W] of a view, given as colours [3, H, W], depth in mm and trust; 0 where trust is."""
-    rgb, depth_mm, trust = view
-    known_rgb = rgb
-    if not np.array_equal(camera[1], endoscope[1]) or camera[0] != endoscope[0]:
-        known_rgb = seen_from_endoscope(own_view(), depth_mm, camera, endoscope)
-    likely = confidence(evidence(trust, rgb, known_rgb))
-    return np.where(trust > 0, likely, 0).astype(np.float32)
-
-
-def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
-    if distance > FAR_POSE:
+def _warnings_of_pose(view: View, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
+    if (distance := _distance_from_trained(view.scene, view.pose)) > FAR_POSE:
         text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
     if (share := _share(unseen)) > MAX_UNSEEN_SHARE:
@@ -382,7 +344,7 @@ def _warnings_of_pose(distance: float, trust: NDArray[np.float32], unseen: NDArr
 
 
 def _share(pixels: NDArray[np.bool_]) -> float:
-    """Of the pixels that are true. mean() would take ten times as long, and no pause can interrupt it."""
+    """Of the pixels that are true. mean() would take ten times as long."""
     return float(np.count_nonzero(pixels) / pixels.size)
 
 

@@ -199,7 +199,7 @@ def rendering_site(data_dir: Path) -> Iterator[Site]:
     store = Store(data_dir)
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, Views(store).answer, pace=pace):
+    with RequestServer(endpoint, Views(store).answer_in_parts, pace=pace):
         site, ended = Site(data_dir, endpoint, Painter(), pace), threading.Event()
         heart = threading.Thread(target=_beat, args=(site, ended))
         heart.start()

@@ -49,7 +49,7 @@ def scene_id(store: Store) -> str:
 @pytest.fixture
 def worker(tmp_path: Path) -> Iterator[zmq.Socket[bytes]]:
     endpoint = f"ipc://{short_socket_path(tmp_path, 'worker.sock')}"
-    with RequestServer(endpoint, Views(Store(tmp_path)).answer), connected(endpoint) as socket:
+    with RequestServer(endpoint, Views(Store(tmp_path)).answer_in_parts), connected(endpoint) as socket:
         yield socket
 
 

@@ -17,7 +17,7 @@ from contract.wire.rendering import ImageFormat, IntrinsicsOverride, RecordedMas
 from contract.wire.report import Masks, RightEye
 from tests.reports import REPORT_OF_A_SCENE
 from tests.worker.scenes import FRAMES, random_scene
-from worker.daemon.serve import NotYetError
+from worker.daemon.reply import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.clip import DepthClip

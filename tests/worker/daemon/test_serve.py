@@ -18,10 +18,13 @@ from contract.access.render_keys import RenderKeys, service_keys, worker_keys
 from contract.queue.embedded import short_socket_path
 from contract.wire.errors import InputError, SceneError, UnavailableError
 from contract.wire.rendering import CancelRequest, ExportRequest, RenderRequest, WorkerReply, WorkerRequest
+from tests.answers import at_once
 from tests.reports import a_warning
 from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
-from worker.daemon.serve import MAX_REQUEST_BYTES, NotYetError, Reply, RequestServer
+from worker.daemon.reply import NotYetError, Reply
+from worker.daemon.serve import MAX_REQUEST_BYTES, RequestServer
 from worker.daemon.turns import FIRST_SPEEDS
+from worker.machine.parts import Parts
 
 SCENE = "0" * 32
 SECRET = "a secret of at least 32 characters"
@@ -63,7 +66,7 @@ def endpoint(tmp_path: Path) -> str:
 
 @pytest.fixture
 def socket(endpoint: str) -> Iterator[zmq.Socket[bytes]]:
-    with RequestServer(endpoint, answer), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(answer)), connected(endpoint) as socket:
         yield socket
 
 
@@ -117,7 +120,7 @@ def test_a_message_of_any_shape_leaves_the_thread_alive(socket: zmq.Socket[bytes
 
 
 def test_who_sends_too_much_is_cut_off_and_others_are_answered(endpoint: str) -> None:
-    with RequestServer(endpoint, answer), connected(endpoint) as flooding, connected(endpoint) as other:
+    with RequestServer(endpoint, at_once(answer)), connected(endpoint) as flooding, connected(endpoint) as other:
         flooding.send_multipart([b"1", b" " * (MAX_REQUEST_BYTES + 1)])
         assert ask(other, request(0))[0].error is None
 
@@ -126,7 +129,7 @@ def test_a_request_whose_cost_cannot_be_told_gets_an_error_and_the_next_is_answe
     def cost(asked: RenderRequest) -> float:
         return 1 / asked.t
 
-    with RequestServer(endpoint, answer, cost=cost), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(answer), cost=cost), connected(endpoint) as socket:
         head, _ = ask(socket, request(0))
         assert head.error is not None
         assert head.error.kind == "internal"
@@ -146,7 +149,7 @@ def test_what_is_to_be_done_between_requests_is_done_and_its_failure_ends_nothin
         called.set()
         raise OSError("the disk")
 
-    with RequestServer(endpoint, answer, between=fail), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(answer), between=fail), connected(endpoint) as socket:
         assert called.wait(5)
         assert ask(socket, request(0))[0].error is None
 
@@ -160,7 +163,7 @@ def tcp_endpoint() -> str:
 
 def test_over_tcp_the_services_of_the_same_secret_are_answered(tcp_endpoint: str) -> None:
     with (
-        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        RequestServer(tcp_endpoint, at_once(answer), render_secret=SECRET),
         connected(tcp_endpoint, service_keys(SECRET), worker_keys(SECRET).public) as socket,
     ):
         assert ask(socket, request(0))[1] == b"image"
@@ -182,7 +185,10 @@ def test_over_tcp_no_other_caller_is_answered(tcp_endpoint: str, keys: RenderKey
         asked.append(request)
         return answer(request)
 
-    with RequestServer(tcp_endpoint, note, render_secret=SECRET), connected(tcp_endpoint, keys, server) as socket:
+    with (
+        RequestServer(tcp_endpoint, at_once(note), render_secret=SECRET),
+        connected(tcp_endpoint, keys, server) as socket,
+    ):
         socket.setsockopt(zmq.RCVTIMEO, 300)
         socket.send_multipart([b"7", request(0)])
         with pytest.raises(zmq.Again):
@@ -192,7 +198,7 @@ def test_over_tcp_no_other_caller_is_answered(tcp_endpoint: str, keys: RenderKey
 
 def test_tcp_without_a_secret_is_refused_before_anything_listens() -> None:
     with pytest.raises(InputError, match="INTRASPLAT_RENDER_SECRET"):
-        RequestServer("tcp://127.0.0.1:7000", answer)
+        RequestServer("tcp://127.0.0.1:7000", at_once(answer))
 
 
 def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
@@ -203,7 +209,7 @@ def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
 
 def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
     pace = Pace()
-    with RequestServer(endpoint, answer, pace=pace), connected(endpoint) as socket, pace.training():
+    with RequestServer(endpoint, at_once(answer), pace=pace), connected(endpoint) as socket, pace.training():
         pace.charge(MAX_SAVED_S + 0.1 * SHARE)
         start_s = time.monotonic()
         assert ask(socket, request(0.25))[1] == b"image"
@@ -213,13 +219,13 @@ def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -
 class Studio:
     """Renders whose cost is their t, each in parts that are made when they are let go."""
 
-    def __init__(self, endpoint: str, **settings: Any) -> None:
-        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEEDS[0], **settings)
+    def __init__(self, endpoint: str) -> None:
+        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEEDS[0], max_wait_s=40.0)
         self.begun: list[float] = []
         self.has_begun = threading.Event()
         self.parts = threading.Semaphore(0)
 
-    def answer(self, request: RenderRequest | ExportRequest) -> Reply:
+    def answer(self, request: Any, level: int) -> Parts[Reply]:
         self.begun.append(request.t)
         self.has_begun.set()
         for _ in range(2 if request.t >= 1 else 0):
@@ -227,7 +233,7 @@ class Studio:
             spin_s = time.thread_time() + 0.01
             while time.thread_time() < spin_s:
                 pass
-            self.server.pause()
+            yield
         return Reply(str(request.t).encode(), "image/png", request.t)
 
 
@@ -239,19 +245,16 @@ def give_up(socket: zmq.Socket[bytes], number: int) -> None:
     socket.send_multipart([bytes([number]), WorkerRequest(request=CancelRequest()).model_dump_json().encode()])
 
 
-def test_small_renders_are_made_between_the_parts_of_a_large_one_and_before_other_large_ones(endpoint: str) -> None:
+def test_a_small_view_is_answered_while_a_large_one_is_made(endpoint: str) -> None:
     studio = Studio(endpoint)
-    with studio.server, connected(endpoint) as socket:
+    with studio.server, connected(endpoint) as socket, connected(endpoint) as other:
         send(socket, 1, 8.0)
         assert studio.has_begun.wait(5)
-        for number, t in ((2, 7.0), (3, 0.25), (4, 6.0), (5, 0.125)):
-            send(socket, number, t)
-        time.sleep(0.1)
-        studio.parts.release(6)
-        answered = [socket.recv_multipart()[0][0] for _ in range(5)]
-    assert set(answered[:2]) == {3, 5}
-    assert answered[2] == 1
-    assert sorted(answered[3:]) == [2, 4]
+        send(other, 2, 0.25)
+        studio.parts.release(1)
+        assert other.recv_multipart()[0] == bytes([2])
+        studio.parts.release(1)
+        assert socket.recv_multipart()[0] == bytes([1])
 
 
 def test_what_its_caller_gives_up_is_not_begun_or_ends_after_its_part(endpoint: str) -> None:
@@ -284,52 +287,43 @@ def test_who_asks_the_same_at_the_same_time_shares_one_answer(endpoint: str) -> 
     assert studio.begun == [2.0, 3.0]
 
 
-@pytest.mark.parametrize(("others", "level"), [(0, 0), (2, 1), (12, 2)])
-def test_the_more_wait_beside_training_the_coarser_they_are_drawn(endpoint: str, others: int, level: int) -> None:
-    levels: list[int] = []
-
-    def answer_one(request: RenderRequest | ExportRequest) -> Reply:
-        until_s = time.monotonic() + 5
-        while (found := server.level()) != level and not levels and time.monotonic() < until_s:
-            server.pause()  # the others' requests come in
-        levels.append(found)
-        return Reply(b"", "image/png", request.t)
-
-    cost = 0.5 * MAX_SAVED_S * FIRST_SPEEDS[0]
-    pace = Pace(clock=lambda: 0.0)
-    server = RequestServer(endpoint, answer_one, cost=lambda each: cost, pace=pace, spent_s=lambda: 0.0)
-    with server, connected(endpoint) as socket, pace.training():
-        for number in range(1 + others):
-            send(socket, number, number / 16)
-        socket.recv_multipart()
-    assert levels[0] == level
-
-
-def test_whose_turn_is_too_far_off_is_told_when_to_come_back_and_small_renders_are_not(endpoint: str) -> None:
-    studio = Studio(endpoint, max_wait_s=10.0)
+def test_whose_turn_is_too_far_off_is_told_when_to_come_back(endpoint: str) -> None:
+    studio = Studio(endpoint)
     with studio.server, connected(endpoint) as socket:
-        send(socket, 1, 8.0)
+        send(socket, 1, 45.0)
         assert studio.has_begun.wait(5)
-        send(socket, 2, 7.0)
-        send(socket, 3, 7.5)
-        time.sleep(0.1)
+        send(socket, 2, 44.0)
         studio.parts.release(1)
         number, head, _ = socket.recv_multipart()
         error = WorkerReply.model_validate_json(head).error
-        assert number == bytes([3])
+        assert number == bytes([2])
         assert error is not None
         assert error.kind == "busy"
-        assert error.retry_after_s == pytest.approx(15.0, abs=0.5)
-        send(socket, 4, 0.5)
+        assert error.retry_after_s == pytest.approx(45.0, abs=0.5)
+        studio.parts.release(1)
+        assert socket.recv_multipart()[0] == bytes([1])
+
+
+def test_a_server_that_ends_abandons_the_answer_that_is_being_made(endpoint: str) -> None:
+    ended = threading.Event()
+
+    def answer_slowly(request: Any, level: int) -> Parts[Reply]:
+        try:
+            while True:
+                yield
+        finally:
+            ended.set()
+
+    with RequestServer(endpoint, answer_slowly), connected(endpoint) as socket:
+        socket.send_multipart([b"1", request(0.5)])
         time.sleep(0.1)
-        studio.parts.release(3)
-        assert [socket.recv_multipart()[0][0] for _ in range(3)] == [4, 1, 2]
+    assert ended.is_set()
 
 
 def test_an_address_that_is_taken_is_an_error_with_a_remedy(tcp_endpoint: str) -> None:
     with (
-        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        RequestServer(tcp_endpoint, at_once(answer), render_secret=SECRET),
         pytest.raises(UnavailableError, match="INTRASPLAT_RENDER_ENDPOINT"),
-        RequestServer(tcp_endpoint, answer, render_secret=SECRET),
+        RequestServer(tcp_endpoint, at_once(answer), render_secret=SECRET),
     ):
         pass

@@ -16,7 +16,7 @@ from contract.wire.options import ReconstructionOptions
 from contract.wire.rendering import ImageFormat, RenderRequest
 from tests.worker.phantoms import bits, phantom_clip, prepared, view
 from tests.worker.scenes import random_scene
-from worker.daemon.serve import NotYetError
+from worker.daemon.reply import NotYetError
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.machine.hooks import Progress

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import shutil
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +36,14 @@ from contract.wire.rendering import (
 )
 from tests.worker.exports import export_request, exported
 from worker.daemon import views as views_module
-from worker.daemon.serve import GivenUpError, NotYetError
+from worker.daemon.reply import NotYetError, Reply
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import COPIES, Views, camera_of, pose_of, shown_time
 from worker.input.camera import Intrinsics
+from worker.machine.parts import Parts
 from worker.model.deformation import GaussianFdm
 from worker.model.gaussians import Gaussians
 from worker.raster.cpu.rasterizer import Rasterizer
-from worker.render import view as view_module
 from worker.scene.checkpoint import save_scene
 from worker.scene.scene import Scene
 
@@ -335,27 +337,52 @@ def test_who_asks_the_same_again_gets_the_same_answer_until_the_scene_or_the_sna
     assert views.cost(request_of(scene_id)) > 0
 
 
-def test_a_large_render_can_be_paused_for_a_small_one_of_the_same_scene_and_ended(store: Store, scene_id: str) -> None:
-    small = request_of(scene_id, t=0.5)
-    large = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=1600, height=1200)})
-    alone = [Views(store).answer(each).body for each in (large, small)]
-    views, pauses, between = Views(store), list[None](), list[bytes]()
+def made_with(parts: Parts[Reply], between: Callable[[int], None]) -> Reply:
+    """The reply; between is called after each part but the last, with its number."""
+    for number in itertools.count(1):
+        try:
+            next(parts)
+        except StopIteration as end:
+            reply: Reply = end.value
+            return reply
+        between(number)
+    raise AssertionError
 
-    def pause() -> None:
-        pauses.append(None)
-        if len(pauses) == 2:
-            between.append(views.answer(small).body)
 
-    views.pause = pause
-    assert [views.answer(large).body, *between] == alone
-    assert len(pauses) > 8
+def large_of(request: RenderRequest, **changes: object) -> RenderRequest:
+    return request.model_copy(update={"camera": IntrinsicsOverride(width=1600, height=1200), **changes})
 
-    def give_up() -> None:
-        raise GivenUpError
 
-    views.pause = give_up
-    with pytest.raises(GivenUpError):
-        views.answer(large.model_copy(update={"t": 0.25}))
+def test_between_the_parts_of_a_large_render_others_of_the_same_scene_are_made_to_the_same_bits(
+    store: Store, scene_id: str
+) -> None:
+    large, small = large_of(request_of(scene_id)), request_of(scene_id, t=0.5)
+    as_large = large.model_copy(update={"t": 0.25})
+    alone = [Views(store).answer(each).body for each in (large, small, as_large)]
+    views, between = Views(store), list[bytes]()
+
+    def look(number: int) -> None:
+        if number == 2:
+            between.extend(views.answer(each).body for each in (small, as_large))
+
+    assert [made_with(views.answer_in_parts(large), look).body, *between] == alone
+
+
+def test_a_large_render_has_many_parts_and_can_be_abandoned_between_any_two(store: Store, scene_id: str) -> None:
+    views, numbers = Views(store), list[int]()
+    large = large_of(request_of(scene_id), layer=Layer.CONFIDENCE, format=ImageFormat.JPEG)
+    whole = made_with(views.answer_in_parts(large), numbers.append)
+    assert len(numbers) > 8
+    for abandoned_after in range(0, 8):
+        parts = Views(store).answer_in_parts(large)
+        for _ in range(abandoned_after):
+            next(parts)
+        parts.close()
+    parts = views.answer_in_parts(large.model_copy(update={"t": 0.5}))
+    for _ in range(4):
+        next(parts)
+    parts.close()
+    assert Views(store).answer(large).body == whole.body
 
 
 @pytest.mark.parametrize("level", [1, 2])
@@ -370,15 +397,13 @@ def test_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(
         snapshots.offer(scene(), 40)
     else:
         publish(store, shown)
-    views.level = lambda: level
     request = RenderRequest(scene_id=shown, attempt=attempt, t=0, format=ImageFormat.JPEG)
-    coarse, exact = views.answer(request), views.answer(request_of(shown, attempt=attempt))
+    coarse, exact = (views.answer(each, level) for each in (request, request_of(shown, attempt=attempt)))
     assert NoticeCode.COARSE in [each.code for each in coarse.warnings]
     assert NoticeCode.COARSE not in [each.code for each in exact.warnings]
-    again = views.answer(request)
+    again = views.answer(request, level)
     assert (again.is_kept, again.level, again.body) == (True, level, coarse.body)
     assert views.cost(request) > 0  # it is rendered again when there is time
-    views.level = lambda: 0
     sharp = views.answer(request)
     assert views.cost(request) == 0
     assert NoticeCode.COARSE not in [each.code for each in sharp.warnings]
@@ -388,15 +413,13 @@ def test_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(
 
 
 def test_a_picture_of_a_scene_that_is_purged_while_it_is_rendered_is_not_kept(store: Store, scene_id: str) -> None:
-    views = Views(store)
-    large = request_of(scene_id).model_copy(update={"camera": IntrinsicsOverride(width=1600, height=1200)})
+    views, large = Views(store), large_of(request_of(scene_id))
 
-    def pause() -> None:
+    def purge(number: int) -> None:
         store.purge(scene_id)
         views.forget_purged()
 
-    views.pause = pause
-    views.answer(large)
+    made_with(views.answer_in_parts(large), purge)
     assert views.held == ()
     assert views.cost(large) > 0
 
@@ -464,21 +487,22 @@ def test_a_small_picture_through_a_wide_lens_counts_what_is_drawn_for_it_towards
     assert wide.model_copy(update={"max_pixels": 50_000}).most_drawn((640, 512)) == [50_000]
 
 
-@pytest.mark.parametrize("name", ["encode_layer", "unseen_pixels"])
 def test_others_are_answered_while_a_large_picture_is_encoded(
-    name: str, store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
+    store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = views_module if name == "encode_layer" else view_module
-    begun, paused, work = threading.Event(), threading.Event(), getattr(module, name)
+    begun, answered, encode = threading.Event(), threading.Event(), views_module.encode_layer
 
-    def slow(*args: Any, **named: Any) -> Any:
+    def slow(*args: Any, **named: Any) -> bytes:
         begun.set()
-        assert paused.wait(60), "nobody was answered meanwhile"
-        return work(*args, **named)
+        assert answered.wait(60), "nobody was answered meanwhile"
+        return encode(*args, **named)
 
-    monkeypatch.setattr(module, name, slow)
-    views = Views(store)
-    views.pause = lambda: paused.set() if begun.is_set() else None
-    large = {"camera": IntrinsicsOverride(width=1600, height=1200), "format": ImageFormat.JPEG}
-    assert views.answer(request_of(scene_id).model_copy(update=large)).body
-    assert paused.is_set()
+    monkeypatch.setattr(views_module, "encode_layer", slow)
+
+    def look(number: int) -> None:
+        if begun.is_set():
+            answered.set()
+
+    large = large_of(request_of(scene_id), format=ImageFormat.JPEG)
+    assert made_with(Views(store).answer_in_parts(large), look).body
+    assert answered.is_set()

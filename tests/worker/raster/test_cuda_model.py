@@ -151,10 +151,14 @@ def test_what_was_trained_on_the_device_renders_on_the_cpu_within_an_8_bit_step(
     train(cuda, frames(1))
     cpu = CpuModel(*cuda.export(), WIDTH, HEIGHT)
     values = np.linspace(0, 1, COUNT, dtype=np.float32)
-    image = cuda.render(CAMERA, 0.6, values)
+    image = cuda.render(CAMERA, 0.6, values).copy()
+    picture = cuda.projected(CAMERA, 0.6, values)
+    cuda.render(CAMERA, 0.1)
+    np.testing.assert_array_equal(np.concatenate([picture.blend(rows) for rows in picture.bands], axis=1), image)
     wanted = cpu.render(CAMERA, 0.6, values)
     assert_close(image, wanted, relative=0.0, absolute=1 / 255, name="image")
     assert np.abs(image[[0, 1, 2, 4]] - wanted[[0, 1, 2, 4]]).mean() < 1e-5
+    cuda.render(CAMERA, 0.6)
     assert_close(cuda.blend_values(values[::-1].copy()), cpu.blend_values(values[::-1].copy()), absolute=1e-3)
     assert_close(cuda.deformed_mean(0.6), cpu.deformed_mean(0.6), relative=1e-6)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from contract.wire.errors import InputError
 from tests.worker.raster.test_cpu import NORMALISED, RATES, moving_gaussians, random_frame
+from worker.machine.parts import whole
 from worker.raster.cpu import update
 from worker.raster.cpu.model import CpuModel
 from worker.raster.cpu.threads import THREADS_VARIABLE, alone, beside, cpu_time_s, flushing, run, thread_count
@@ -57,20 +58,22 @@ def train(kind: str, steps: int) -> list[NDArray[np.float32]]:
 
 
 def test_what_is_done_beside_counts_as_the_callers_and_its_error_is_the_callers() -> None:
-    begun, calls, before_s = threading.Event(), list[bool](), cpu_time_s()
+    go_on, before_s = threading.Event(), cpu_time_s()
 
     def work() -> int:
-        begun.set()
+        assert go_on.wait(PATIENCE_S)
         start_s = time.thread_time()
         while time.thread_time() - start_s < 0.05:
             pass
         return threading.get_ident()
 
-    assert beside(work, lambda: calls.append(begun.is_set())) != threading.get_ident()
-    assert any(calls)
+    parts = beside(work)
+    next(parts)  # comes back although the work goes on
+    go_on.set()
+    assert whole(parts) != threading.get_ident()
     assert cpu_time_s() - before_s >= 0.05
     with pytest.raises(ZeroDivisionError):
-        beside(lambda: 1 // 0, lambda: None)
+        whole(beside(lambda: 1 // 0))
 
 
 def render(kind: str, frames: int) -> list[NDArray[np.float32]]:

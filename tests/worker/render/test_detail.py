@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from tests.worker.phantoms import phantom_clip, prepared, trained
+from worker.machine.parts import whole
 from worker.model.metrics import psnr_tissue
 from worker.outcome import snapshot_of
 from worker.render.detail import LEVELS, thinned
-from worker.render.view import render_frame
+from worker.render.view import View, frame_in_parts, render_frame
 from worker.scene.scene import Scene
 
 
@@ -23,13 +24,12 @@ def scene() -> Scene:
 @pytest.mark.parametrize(("level", "least_db"), [(1, 26.0), (2, 22.0)])
 def test_a_coarse_picture_resembles_the_whole_one_and_leaves_no_gaps(scene: Scene, level: int, least_db: float) -> None:
     detail, clip = LEVELS[level], scene.intrinsics
-    whole = render_frame(scene, 0.4)
+    sharp = render_frame(scene, 0.4)
     camera = clip.resized(clip.width // detail.pixels, clip.height // detail.pixels)
-    coarse = render_frame(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True).enlarged(
-        clip.width, clip.height
-    )
-    solid = whole.depth_mm > 0
-    assert psnr_tissue(coarse.rgb, whole.rgb, solid) > least_db
+    view = View(thinned(scene, detail.gaussians), 0.4, None, camera, is_coarse=True)
+    coarse = whole(frame_in_parts(view)).enlarged(clip.width, clip.height)
+    solid = sharp.depth_mm > 0
+    assert psnr_tissue(coarse.rgb, sharp.rgb, solid) > least_db
     assert (coarse.depth_mm[solid] > 0).mean() > 0.98
 
 

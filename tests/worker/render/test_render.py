@@ -21,7 +21,9 @@ from worker.model.metrics import psnr_tissue
 from worker.outcome import scene_of, snapshot_of
 from worker.phantom import orbit_pose
 from worker.render.camera import endoscope_pose
-from worker.render.view import FAR_POSE, judged_camera, render_frame, renderer_of
+from worker.render.frame import Frame
+from worker.render.lenses import judged_camera
+from worker.render.view import FAR_POSE, View, frame_in_parts, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import POSE_DOUBTS, Scene
 from worker.train.presets import PRESETS
@@ -234,18 +236,36 @@ def test_sizes_come_and_go_without_changing_a_picture(scene: Scene) -> None:
     np.testing.assert_array_equal(render_frame(scene, 0.2).rgb, first)
 
 
-def test_a_view_of_the_same_size_in_a_pause_changes_nothing(scene: Scene) -> None:
-    renderer, camera = renderer_of(scene), scene.intrinsics.resized(1100, 1000)
-    poses = [orbit_pose(yaw_deg, 0.0) for yaw_deg in (0.0, 10.0)]
-    alone = [renderer.layers(0.5, pose, camera)[0] for pose in poses]
-    in_pauses: list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]] = []
-    shown, _ = renderer.layers(
-        0.5, poses[0], camera, pause=lambda: in_pauses.append(renderer.layers(0.5, poses[1], camera)[0])
-    )
-    np.testing.assert_array_equal(shown, alone[0])
-    assert len(in_pauses) > 3
-    for each in in_pauses:
-        np.testing.assert_array_equal(each, alone[1])
+def test_frames_of_one_size_that_are_made_in_turn_part_by_part_are_what_each_is_alone(scene: Scene) -> None:
+    camera = scene.intrinsics.resized(1100, 1000)
+    views = [View(scene, 0.5, orbit_pose(yaw_deg, 0.0), camera) for yaw_deg in (0.0, 10.0)]
+    alone = [render_frame(scene, 0.5, each.pose, camera) for each in views]
+    under_way = {place: frame_in_parts(each, with_confidence=place == 1) for place, each in enumerate(views)}
+    made: dict[int, Frame] = {}
+    rounds = 0
+    while under_way:
+        rounds += 1
+        for place, parts in list(under_way.items()):
+            try:
+                next(parts)
+            except StopIteration as end:
+                made[place] = end.value
+                del under_way[place]
+    assert rounds > 8
+    for place, expected in enumerate(alone):
+        for name in ("rgb", "depth_mm", "unseen", "confidence"):
+            np.testing.assert_array_equal(getattr(made[place], name), getattr(expected, name))
+        assert (made[place].unseen_share, made[place].warnings) == (expected.unseen_share, expected.warnings)
+
+
+def test_a_frame_that_is_abandoned_leaves_the_next_as_it_is(scene: Scene) -> None:
+    camera = scene.intrinsics.resized(1100, 1000)
+    expected = render_frame(scene, 0.5, None, camera).rgb
+    parts = frame_in_parts(View(scene, 0.2, None, camera))
+    next(parts)
+    next(parts)
+    parts.close()
+    np.testing.assert_array_equal(render_frame(scene, 0.5, None, camera).rgb, expected)
 
 
 def test_a_scene_that_is_dropped_takes_its_renderer_along() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 
@@ -35,10 +35,11 @@ from worker.model.layout import (
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates, adam_step
 from worker.raster.cpu import harmonics, update
+from worker.raster.cpu.bins import TILE_ROWS
 from worker.raster.cpu.motion import Motion, kept_where_old, motion_of
 from worker.raster.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from worker.raster.cpu.threads import flushing, run
-from worker.raster.model import put_back
+from worker.raster.model import Projected, bands_of, put_back
 from worker.raster.step import StepSums, TrainingFrame, camera_centre, image_size
 
 PAD_LOGIT = -30.0
@@ -122,41 +123,29 @@ class CpuModel:
         self.motion.deform(self.canonical, t, self.state)
         self._project_state(camera, sh_degree, self._rasterizer(*image_size(camera)))
 
-    def _project_state(
-        self,
-        camera: NDArray[np.float64],
-        sh_degree: int,
-        rasterizer: Rasterizer,
-        pause: Callable[[], None] | None = None,
-    ) -> None:
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
         """The Gaussians of the state on this camera's image."""
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        rasterizer.project(camera, self.state, self.opacity_logit, self.colour, pause)
+        rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
         self.rasterizer = rasterizer
 
-    def render(
-        self,
-        camera: NDArray[np.float64],
-        t: float,
-        values: Floats | None = None,
-        pause: Callable[[], None] | None = None,
-    ) -> Floats:
-        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites, or
-        with pause a copy."""
-        if pause is None:
-            self.project(camera, t, self.sh_degree)
-            return self.rasterizer.render(values)
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
+        """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
+        self.project(camera, t, self.sh_degree)
+        return self.rasterizer.render(values)
+
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+        """The same picture, to be blended in bands. Until it is closed, others of its size take other buffers."""
         size = image_size(camera)
-        rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)  # a pause that renders takes other buffers
-        try:
-            self.motion.deform(self.canonical, t, self.state)
-            self._project_state(camera, self.sh_degree, rasterizer, pause)
-            return _copied(rasterizer.render(values, pause), pause)
-        finally:
-            self.rasterizer = self._kept(rasterizer)
+        rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)
+        self.motion.deform(self.canonical, t, self.state)
+        self._project_state(camera, self.sh_degree, rasterizer)
+        if values is not None:
+            rasterizer.set_values(values)
+        return _Projected(rasterizer, values is not None, self._kept)
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""
@@ -295,6 +284,27 @@ class CpuModel:
         return gaussians, self.motion.export(self.count, as_it_lies=as_it_lies)
 
 
+@dataclass(frozen=True)
+class _Projected:
+    """See worker/raster/model.py. keep: takes the rasterizer back."""
+
+    rasterizer: Rasterizer
+    with_values: bool
+    keep: Callable[[Rasterizer], object]
+
+    @property
+    def bands(self) -> list[slice]:
+        return bands_of(self.rasterizer.width, self.rasterizer.height, TILE_ROWS)
+
+    def blend(self, rows: slice) -> Floats:
+        return self.rasterizer.render_rows(rows.start // TILE_ROWS, -(-rows.stop // TILE_ROWS))[
+            : 6 if self.with_values else 5
+        ]
+
+    def close(self) -> None:
+        self.keep(self.rasterizer)
+
+
 def _adam(value: Floats, gradient: Floats, moments: Floats, rate: float, rates: StepRates, iteration: int) -> None:
     if rate == 0.0:
         return
@@ -307,12 +317,3 @@ def _flat(array: Floats) -> Floats:
     if not array.flags.c_contiguous:
         raise ValueError(f"an array of shape {array.shape} and strides {array.strides} has no flat view")
     return array.reshape(-1)
-
-
-def _copied(planes: Floats, pause: Callable[[], None]) -> Floats:
-    """A copy of [P, H, W]; pause is called after each plane."""
-    copy = np.empty(planes.shape, np.float32)
-    for to, plane in zip(copy, planes, strict=True):
-        to[:] = plane
-        pause()
-    return copy

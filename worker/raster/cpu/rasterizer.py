@@ -5,7 +5,6 @@ N Gaussians (a multiple of LANES, see padded), M slots, H W pixels. All arrays a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +19,6 @@ from worker.raster.step import Target
 
 Floats = NDArray[np.float32]
 _NO_LOSS = np.zeros(5, np.float32)
-PART_PIXELS = 1 << 19
-"""A render may pause after so many pixels are blended: some tens of milliseconds."""
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -62,8 +59,8 @@ class Rasterizer:
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height, self.threads = width, height, thread_count()
-        self.tiles_x, tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
-        self.tiles = self.tiles_x * tiles_y
+        self.tiles_x, self.tiles_y = -(-width // LANES), -(-height // bins.TILE_ROWS)
+        self.tiles = self.tiles_x * self.tiles_y
         self.stride = self.tiles_x * LANES
         self.image = np.zeros(6 * height * self.stride, np.float32)
         self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
@@ -95,29 +92,8 @@ class Rasterizer:
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
 
-    def project(
-        self,
-        camera: NDArray[np.float64],
-        state: Floats,
-        opacity_logit: Floats,
-        colour: Floats,
-        pause: Callable[[], None] | None = None,
-    ) -> None:
-        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N].
-
-        pause: called between the thirds of a large image, as in render.
-        """
-        is_large = self.width * self.height > PART_PIXELS
-        self.place(camera, state, opacity_logit, colour)
-        if is_large and pause is not None:
-            pause()
-        self.bin()
-        if is_large and pause is not None:
-            pause()
-        self.sort()
-
-    def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """First third of project: the splats on the image."""
+    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
@@ -126,9 +102,11 @@ class Rasterizer:
             project.project, camera, state, opacity_logit, colour, self.splats.reshape(-1), self.radius2,
             self._extent.reshape(-1),
         )  # fmt: skip
+        self._bin()
+        self._sort()
 
-    def bin(self) -> None:
-        """Second third: the slots and homes of every splat."""
+    def _bin(self) -> None:
+        """The slots and homes of every splat."""
         if not self._filled():
             self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
@@ -150,8 +128,8 @@ class Rasterizer:
         """Slots and homes of the thread that has most."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
-    def sort(self) -> None:
-        """Last third: the slots of every tile, nearest first."""
+    def _sort(self) -> None:
+        """The slots of every tile, nearest first."""
         ranks, keys = self._order, self._keys
         count, is_first = bins.depth_order(self.splats, self.radius2, ranks[0], keys[0], ranks[1], keys[1])
         bins.sort_into_tiles(
@@ -181,7 +159,7 @@ class Rasterizer:
         self._reserve()
         if mode != RENDER:
             self._empty_homes()
-        first, end = bands or (0, self.tiles // self.tiles_x)
+        first, end = bands or (0, self.tiles_y)
         self._next_block[0] = first * -(-self.tiles_x // bins.BLOCK_TILES)
         run(
             blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats,
@@ -190,23 +168,27 @@ class Rasterizer:
             loss_settings, image,
         )  # fmt: skip
 
-    def render(self, values: Floats | None = None, pause: Callable[[], None] | None = None) -> Floats:
+    def render(self, values: Floats | None = None) -> Floats:
         """R G B Z A of the projected splats, [5, H, W]; a view of a buffer the next render overwrites.
 
-        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them. pause is
-        called after every PART_PIXELS but the last; it may use other rasterizers, and end the render by an exception.
+        With values [<= N], a number per Gaussian, they are blended as colour is, and [6, H, W] ends with them.
         """
         if values is not None:
-            self.splats[: len(values), 11] = values
-        bands = self.tiles // self.tiles_x
-        part = bands if pause is None else max(1, PART_PIXELS // (self.stride * bins.TILE_ROWS))
-        for first in range(0, bands, part):
-            if pause is not None and first > 0:
-                pause()
-            end = min(first + part, bands)
-            self.blend(RENDER, self._no_target, _NO_LOSS, self.image, (first, end))
-        planes = 5 if values is None else 6
-        return self.image.reshape(6, self.height, self.stride)[:planes, :, : self.width]
+            self.set_values(values)
+        return self.render_rows(0, self.tiles_y)[: 5 if values is None else 6]
+
+    def set_values(self, values: Floats) -> None:
+        """Blend values [<= N], a number per Gaussian, beside colour until the next projection."""
+        self.splats[: len(values), 11] = values
+
+    def render_rows(self, first: int, end: int) -> Floats:
+        """Rows of tiles [first, end) of the projected splats: R G B Z A and the values that are set, [6, h, W].
+
+        A view of these rows of a buffer. Rows rendered apart have the same bits as in one call.
+        """
+        self.blend(RENDER, self._no_target, _NO_LOSS, self.image, (first, end))
+        rows = slice(first * bins.TILE_ROWS, min(end * bins.TILE_ROWS, self.height))
+        return self.image.reshape(6, self.height, self.stride)[:, rows, : self.width]
 
     def loss_backward(
         self,

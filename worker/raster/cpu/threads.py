@@ -21,11 +21,12 @@ from typing import TypeVar
 import torch
 
 from contract.wire.errors import InputError
+from worker.machine.parts import Parts
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
 
 WAKE_S = 0.002
-"""How often beside() calls: what comes meanwhile waits no longer."""
+"""A part of beside(): what comes meanwhile waits no longer."""
 
 T = TypeVar("T")
 
@@ -112,10 +113,10 @@ def alone(*, is_alone: bool = True) -> Iterator[None]:
         _own.is_alone = before
 
 
-def beside(work: Callable[[], T], meanwhile: Callable[[], None]) -> T:
-    """What work() returns. Another thread does it, and this one calls meanwhile() until it is done.
+def beside(work: Callable[[], T]) -> Parts[T]:
+    """What work() returns. Another thread does it, and this one waits for it, WAKE_S in each part.
 
-    Its CPU seconds count as this thread's. An error of meanwhile() is raised at once: the work ends by itself.
+    Its CPU seconds count as this thread's. If the parts are closed, the work ends by itself.
     """
     spent_s = 0.0
 
@@ -129,7 +130,7 @@ def beside(work: Callable[[], T], meanwhile: Callable[[], None]) -> T:
 
     done = _beside(os.getpid()).submit(timed)
     while not wait([done], WAKE_S).done:
-        meanwhile()
+        yield
     _own.elsewhere_s = getattr(_own, "elsewhere_s", 0.0) + spent_s
     return done.result()
 

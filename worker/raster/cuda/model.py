@@ -17,7 +17,7 @@ for its picture; the first use of a frame, for its copy; when buffers grow.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -50,7 +50,7 @@ from worker.raster.cuda.frames import FrameStore
 from worker.raster.cuda.motion import Motion, Trained, kept_where_old, motion_of
 from worker.raster.cuda.rasterizer import Gradients
 from worker.raster.cuda.update import MADE, SEEN, SUMS, padded
-from worker.raster.model import put_back
+from worker.raster.model import Blended, Projected, put_back
 from worker.raster.step import StepSums, TrainingFrame, image_size
 
 Floats = NDArray[np.float32]
@@ -285,17 +285,14 @@ class CudaModel:
         self._project(view, self.sh_degree)
         view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
 
-    def render(
-        self,
-        camera: NDArray[np.float64],
-        t: float,
-        values: Floats | None = None,
-        pause: Callable[[], None] | None = None,
-    ) -> Floats:
+    def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
         """R G B Z A, [5, H, W]; with values [N], blended as colour is, [6, H, W]. A view the next render overwrites."""
-        del pause  # a GPU makes a render in one part
         image: Floats = self.render_times(camera, [t], values)[0].cpu().numpy()
         return image
+
+    def projected(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Projected:
+        """The same picture, which a GPU blends in one part."""
+        return Blended(self.render_times(camera, [t], values)[0].to("cpu", copy=True).numpy())
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""

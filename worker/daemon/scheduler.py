@@ -1,0 +1,196 @@
+"""Decides which answer is computed next, part by part: small ones first, and no more than the pace allows.
+
+An answer is computed in parts (worker/machine/parts.py). Between two parts the scheduler may start a request that
+takes less than SMALL_SHARE of the time: the large answer waits until the small one is done. Small answers get as much
+CPU time as the large one's last part took; then its next part is due. No part runs inside another.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from contextvars import Context, copy_context
+from dataclasses import dataclass, field
+
+from contract.wire.rendering import RenderRequest, SceneRequest
+from worker.daemon.pace import Pace
+from worker.daemon.reply import Reply
+from worker.daemon.turn_spans import answer_span, shared_span
+from worker.daemon.turns import COARSEST, Turn, Turns
+from worker.machine.parts import Parts
+from worker.render.encode import FOR_EYES
+
+SMALL_SHARE = 0.25
+"""An answer that takes less than this share of a larger one's time is made between the parts of that one."""
+
+ALL_WITHIN_S = 1.0
+"""Each viewer's picture is at most so old, where a coarser one can make it so."""
+
+MIN_CHARGE_S = 0.01
+"""Counted for each answer while a job trains: service and viewer have work with it, too."""
+
+Answer = Callable[[SceneRequest, int], Parts[Reply]]
+"""What makes the reply to a request at a level of detail (worker/render/detail.py)."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    """Requests that asked the same, and their answer.
+
+    seconds: wall time from the first part to the last, with all that was done in between
+    """
+
+    turns: tuple[Turn, ...]
+    outcome: Reply | Exception
+    seconds: float
+
+
+@dataclass(eq=False)
+class _Task:
+    """An answer in progress. small_s: CPU seconds that smaller answers may take before its next part."""
+
+    turn: Turn
+    parts: Parts[Reply]
+    context: Context = field(default_factory=copy_context)
+    small_s: float = 0.0
+    start_s: float = field(default_factory=time.perf_counter)
+
+
+class Scheduler:
+    """The requests of one worker, from their arrival until they are answered.
+
+    Args:
+        answer: makes a reply in parts.
+        pace: how much of the time answers may take.
+        within: a context for each part.
+        spent_s: CPU seconds that this thread has used.
+        max_wait_s: requests whose turn is farther off are refused.
+    """
+
+    def __init__(
+        self,
+        answer: Answer,
+        pace: Pace,
+        *,
+        within: Callable[[], AbstractContextManager[None]] = nullcontext,
+        spent_s: Callable[[], float] = time.thread_time,
+        max_wait_s: float = math.inf,
+    ) -> None:
+        self._answer = answer
+        self._pace = pace
+        self._within = within
+        self._spent_s = spent_s
+        self._max_wait_s = max_wait_s
+        self._turns = Turns()
+        self._tasks: list[_Task] = []  # a stack: each is much smaller than the one before it, which waits for it
+
+    def take_in(
+        self, caller: bytes, request_id: bytes, request: SceneRequest, cost: float, trace: str | None = None
+    ) -> float | None:
+        """Answer a request when its turn comes: None. Or refuse it: the seconds until its turn, as far as known.
+
+        cost: what the answer takes, in pixels x Gaussians. trace: of its asker (Turn).
+        """
+        seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
+        turn = Turn(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
+        if (wait_s := self._wait_s(turn)) > self._max_wait_s:
+            return wait_s
+        self._turns.add(turn)
+        return None
+
+    def give_up(self, caller: bytes, request_id: bytes) -> None:
+        """Nobody waits for this request any more: forget it, or abandon its answer."""
+        self._turns.give_up(caller, request_id)
+        for task in [each for each in self._tasks if (each.turn.caller, each.turn.request_id) == (caller, request_id)]:
+            self._abandon(task)
+
+    def close(self) -> None:
+        """Abandon all answers."""
+        for task in reversed(self._tasks.copy()):
+            self._abandon(task)
+
+    def rest_s(self) -> float:
+        """Seconds until the next part may be made; infinity if nobody waits for one."""
+        return self._pace.rest_s() if self._tasks or len(self._turns) else math.inf
+
+    def advance(self) -> Answered | None:
+        """Make the next part, if one may be made now. Returns those whose answer it completes."""
+        if self.rest_s() > 0.0:
+            return None
+        if (turn := self._next()) is not None:
+            turn.level = self._level(turn)
+            self._tasks.append(_Task(turn, self._traced(turn)))
+        return self._make_part(self._tasks[-1])
+
+    def _next(self) -> Turn | None:
+        """The request to begin now, if any; the others wait for the task on top."""
+        if not self._tasks:
+            return self._turns.take()
+        top = self._tasks[-1]
+        return self._turns.take(SMALL_SHARE * top.turn.seconds) if top.small_s > 0.0 else None
+
+    def _traced(self, turn: Turn) -> Parts[Reply]:
+        with answer_span(turn):
+            return (yield from self._answer(turn.request, turn.level))
+
+    def _make_part(self, task: _Task) -> Answered | None:
+        outcome: Reply | Exception | None = None
+        start_s = self._spent_s()
+        try:
+            with self._within():
+                task.context.run(next, task.parts)
+        except StopIteration as end:
+            outcome = end.value
+        except Exception as error:  # what one caller asks must not end the thread for all
+            outcome = error
+        task.small_s = self._spent_s() - start_s
+        task.turn.spent_s += task.small_s
+        self._pace.charge(task.small_s)
+        return None if outcome is None else self._end(task, outcome)
+
+    def _end(self, task: _Task, outcome: Reply | Exception) -> Answered:
+        self._remove(task)
+        turn = task.turn
+        if isinstance(outcome, Reply) and not outcome.is_kept:
+            self._turns.learn(turn)
+        turns = (turn, *self._turns.take_same(turn.request))
+        self._pace.charge(max(0.0, len(turns) * MIN_CHARGE_S - turn.spent_s))
+        for each in turns[1:]:
+            shared_span(each)
+        return Answered(turns, outcome, time.perf_counter() - task.start_s)
+
+    def _wait_s(self, turn: Turn) -> float:
+        """Seconds until its turn, as far as known."""
+        larger = [each.turn for each in self._tasks if turn.seconds >= SMALL_SHARE * each.turn.seconds]
+        left_s = (max(0.0, self._turns.seconds(each.cost, each.level) - each.spent_s) for each in larger)
+        before_s = self._turns.seconds_before(turn) + sum(left_s)
+        return self._pace.rest_s() + before_s / self._pace.rate
+
+    def _abandon(self, task: _Task) -> None:
+        task.context.run(task.parts.close)
+        self._remove(task)
+
+    def _remove(self, task: _Task) -> None:
+        place = self._tasks.index(task)
+        if place > 0:
+            self._tasks[place - 1].small_s -= task.turn.spent_s
+        del self._tasks[place]
+
+    def _coarsest(self, request: SceneRequest) -> int:
+        """The coarsest level of detail that will do."""
+        may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
+        return COARSEST if self._pace.trains and may_be_coarse else 0
+
+    def _level(self, turn: Turn) -> int:
+        """The level of detail at which it is answered now: as fine as time allows.
+
+        0, the finest, if no job trains, the format is exact, or nobody else waits and the pace affords it. 1 if the
+        answers of this level to all who wait take less than ALL_WITHIN_S. 2 otherwise.
+        """
+        others = self._turns.others(turn.request)
+        if self._coarsest(turn.request) == 0 or (others == 0 and self._pace.affords(turn.seconds)):
+            return 0
+        all_s = (1 + others) * self._turns.seconds(turn.cost, 1)
+        return 1 if all_s <= ALL_WITHIN_S * self._pace.rate else COARSEST
