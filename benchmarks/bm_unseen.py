@@ -29,7 +29,7 @@ from worker.outcome import scene_of
 from worker.phantom import MOTIONS, PhantomSettings, make_phantom
 from worker.raster.cpu import compile_kernels
 from worker.raster.step import camera_vector
-from worker.render.unseen import blended_values, hatched, unseen_pixels
+from worker.render.unseen import blended_values, hatched, missing_pixels, unseen_pixels
 from worker.render.view import render_frame
 from worker.scene.model import model_of
 from worker.scene.scene import Scene
@@ -91,8 +91,8 @@ def differs(scene: Scene) -> float:
         *_, alpha, blended = model.render(vector(scene, pose), 0.5, blended_values(seen)).copy()
         seen_weight = model.blend_values((seen > 0).astype(np.float32))
         solid = alpha >= COVERED_ALPHA
-        by_majority = unseen_pixels(solid & (seen_weight >= 0.5 * alpha), None)
-        found.append(float((unseen_pixels(solid, blended) != by_majority).mean()))
+        by_majority = unseen_pixels(~(solid & (seen_weight >= 0.5 * alpha)))
+        found.append(float((unseen_pixels(missing_pixels(solid, blended)) != by_majority).mean()))
     return mean(found)
 
 

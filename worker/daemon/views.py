@@ -46,7 +46,6 @@ from worker.input.camera import Intrinsics
 from worker.machine.parts import Parts, whole
 from worker.raster.backend import CPU, Device
 from worker.raster.cpu.threads import beside
-from worker.raster.model import BAND_PIXELS
 from worker.render.camera import endoscope_pose, right_eye
 from worker.render.detail import LEVELS, thinned
 from worker.render.encode import FOR_EYES, encode_layer
@@ -68,6 +67,10 @@ MEDIA_TYPE_OF_BYTES, MEDIA_TYPE_OF_JSON = "application/octet-stream", "applicati
 
 MAX_HELD_SCENES = 64
 """However small they are: each announcement of the worker names all of them."""
+
+
+LARGE_PIXELS = 1 << 19
+"""Pictures of more take so long to encode that other answers are made meanwhile."""
 
 
 class Views:
@@ -300,7 +303,7 @@ def _encoded(frame: Frame, request: RenderRequest, depth_range_mm: tuple[float, 
     how = request.layer, request.format, request.quality, request.unseen
     encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
     with traces.span("encode", layer=request.layer.value, format=request.format.value):
-        if frame.unseen.size > BAND_PIXELS:
+        if frame.unseen.size > LARGE_PIXELS:
             return (yield from beside(encode))
         return encode()
 

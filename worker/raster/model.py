@@ -29,8 +29,8 @@ from worker.raster.step import StepSums, TrainingFrame
 Floats = NDArray[np.float32]
 FIRST_MOMENTS = "motion.first"
 """In Model.arrays()."""
-BAND_PIXELS = 1 << 19
-"""A CPU blends so many in some tens of milliseconds."""
+BAND_PIXELS = 1 << 18
+"""One core blends and converts so many in some 12 ms."""
 
 
 def bands_of(width: int, height: int, multiple: int = 1) -> list[slice]:
@@ -42,11 +42,6 @@ def bands_of(width: int, height: int, multiple: int = 1) -> list[slice]:
 class Projected(Protocol):
     """The Gaussians at one time on one camera's image, in buffers of its own: its bands are blended one by one, and the
     model may render other pictures in between."""
-
-    @property
-    def with_values(self) -> bool:
-        """Whether values are blended beside colour."""
-        ...
 
     @property
     def bands(self) -> Sequence[slice]:
@@ -67,11 +62,6 @@ class Blended:
     """A Projected whose bands are blended already. image: [5 or 6, H, W]."""
 
     image: Floats
-
-    @property
-    def with_values(self) -> bool:
-        """As of Projected."""
-        return len(self.image) == 6
 
     @property
     def bands(self) -> list[slice]:

@@ -25,7 +25,7 @@ from worker.model.metrics import COVERED_ALPHA
 from worker.raster.backend import CPU, Device
 from worker.render.camera import as_recorded, endoscope_pose
 from worker.render.confidence import confidence, evidence
-from worker.render.unseen import unseen_pixels
+from worker.render.unseen import missing_pixels, unseen_pixels
 from worker.render.view import renderer_of
 from worker.scene.scene import Scene
 from worker.train.targets import solid_depth_mm
@@ -134,7 +134,7 @@ class _View:
         if own_depth_mm <= 0:
             own_depth_mm = depth_mm
         sigma_mm = uncertainty_mm(scene, own_depth_mm, spread_mm, likely)
-        unseen = bool(unseen_pixels(solid, blended, camera.width)[i, j])
+        unseen = bool(unseen_pixels(missing_pixels(solid, blended), camera.width)[i, j])
         return Place(point_mm, ray, depth_mm, own_depth_mm, sigma_mm, likely, unseen, gaussians, shares)
 
     def _ray(self, x: float, y: float) -> NDArray[np.float64]:

@@ -30,17 +30,21 @@ def blended_values(seen: NDArray[np.float32]) -> NDArray[np.float32] | None:
     return np.where(seen > 0, seen, np.float32(NEVER_SEEN))
 
 
-def unseen_pixels(
-    solid: NDArray[np.bool_], blended: NDArray[np.float32] | None, picture_width: int | None = None
-) -> NDArray[np.bool_]:
-    """[H, W] whether most pixels around show nothing solid, or mostly what no training frame saw.
+def missing_pixels(solid: NDArray[np.bool_], blended: NDArray[np.float32] | None) -> NDArray[np.bool_]:
+    """[H, W] whether each pixel by itself shows nothing solid, or mostly what no training frame saw.
 
     Args:
         solid: [H, W] whether something solid is drawn.
         blended: [H, W] sum of w * blended_values; None: not known.
-        picture_width: of the picture that these pixels are a part of; None: they are all of it.
     """
-    missing = ~solid if blended is None else ~(solid & (blended >= 0))
+    return ~solid if blended is None else ~(solid & (blended >= 0))
+
+
+def unseen_pixels(missing: NDArray[np.bool_], picture_width: int | None = None) -> NDArray[np.bool_]:
+    """[H, W] whether most pixels around are missing [H, W].
+
+    picture_width: of the picture that these pixels are a part of; None: they are all of it.
+    """
     if not missing.any():
         return missing
     side = 2 * round((picture_width or missing.shape[1]) * SMOOTHED_SHARE / 2) + 1

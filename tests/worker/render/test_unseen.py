@@ -15,7 +15,7 @@ from tests.worker.clips import HEIGHT, WIDTH, plane_clip
 from tests.worker.phantoms import phantom_clip, prepared, trained
 from worker.input.clip import DepthClip
 from worker.outcome import scene_of, snapshot_of
-from worker.render.unseen import NEVER_SEEN, blended_values, hatched, unseen_pixels
+from worker.render.unseen import NEVER_SEEN, blended_values, hatched, missing_pixels, unseen_pixels
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
 from worker.scene.scene import Scene
@@ -113,15 +113,15 @@ def test_specks_and_holes_of_a_pixel_do_not_show_and_straight_edges_stay() -> No
     solid[100:, :300] = False
     expected = ~solid
     solid[20:220:10, 20:620:10] ^= True
-    np.testing.assert_array_equal(unseen_pixels(solid, None)[:90], expected[:90])
-    found = unseen_pixels(solid, None)
+    np.testing.assert_array_equal(unseen_pixels(~solid)[:90], expected[:90])
+    found = unseen_pixels(~solid)
     assert (found != expected).mean() < 1e-3  # the corner is rounded
 
 
 def test_a_number_that_is_none_is_unseen() -> None:
     solid, blended = np.ones((64, 64), np.bool_), np.ones((64, 64), np.float32)
     blended[20:40, 20:40] = np.nan
-    assert unseen_pixels(solid, blended)[25:35, 25:35].all()
+    assert unseen_pixels(missing_pixels(solid, blended))[25:35, 25:35].all()
 
 
 @pytest.mark.parametrize("size", [(8, 8), (80, 96), (540, 674), (1080, 1920)])
