@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from worker.daemon.pace import Pace
 from worker.daemon.reply import Reply
-from worker.daemon.scheduler import Answer
+from worker.daemon.scheduler import Scheduler
 from worker.machine.parts import Parts
 
 
-def at_once(answer: Callable[[Any], Reply]) -> Answer:
-    """The answer in one part, at any level of detail."""
+def at_once(answer: Callable[[Any], Reply], pace: Pace | None = None, **settings: Any) -> Scheduler:
+    """A scheduler whose answers have one part each. settings: as of Scheduler."""
 
     def parts(request: Any, level: int) -> Parts[Reply]:
         del level
         return answer(request)
         yield
 
-    return parts
+    return Scheduler(parts, pace or Pace(), **settings)

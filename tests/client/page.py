@@ -256,7 +256,7 @@ def site_at(data_dir: Path, answer: Callable[[SceneRequest], Reply] | None = Non
     painter = Painter()
     endpoint = f"ipc://{short_socket_path(Store(data_dir).run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, at_once(answer or painter.answer), pace=pace, max_wait_s=MAX_WAIT_S):
+    with RequestServer(endpoint, at_once(answer or painter.answer, pace, max_wait_s=MAX_WAIT_S)):
         site = Site(data_dir, endpoint, painter, pace, **changes)
         try:
             yield site

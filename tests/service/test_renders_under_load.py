@@ -35,7 +35,7 @@ def test_an_image_tag_of_a_page_from_elsewhere_is_refused_and_a_link_is_not(
 def test_a_worker_with_no_time_left_says_when_to_come_back_and_another_is_asked(service: ServiceUnderTest) -> None:
     scene, pace = service.finished_scene(), Pace()
     endpoint = f"ipc://{short_socket_path(service.store.run_dir, 'busy.sock')}"
-    with RequestServer(endpoint, at_once(service.painter.answer), pace=pace, max_wait_s=1.0), pace.training():
+    with RequestServer(endpoint, at_once(service.painter.answer, pace, max_wait_s=1.0)), pace.training():
         pace.charge(MAX_SAVED_S + 5.0 * SHARE)
         busy = WorkerAddress(name="busy", endpoint=endpoint, device="cpu", scenes=(scene,))
         service.queue.announce(busy)

@@ -41,6 +41,7 @@ from worker.daemon.orders import (
     job_progress,
 )
 from worker.daemon.pace import SHARE, Pace
+from worker.daemon.scheduler import Scheduler
 from worker.daemon.serve import RequestServer
 from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
@@ -115,17 +116,15 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         channel.send_if_new(Holding(scenes=views.held))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
-    server = RequestServer(
-        endpoint,
+    scheduler = Scheduler(
         views.answer_in_parts,
+        pace,
         cost=views.cost,
-        between=report_held_scenes,
-        pace=pace,
-        within=lambda: alone(is_alone=pace.trains),
+        within=lambda: alone(is_alone=pace.trains),  # shares in the pool would make those of a training step wait
         spent_s=cpu_time_s,  # with what this thread waits for a GPU: it asks again and again
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
-        render_secret=settings.render_secret,
     )
+    server = RequestServer(endpoint, scheduler, between=report_held_scenes, render_secret=settings.render_secret)
     with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)

@@ -64,6 +64,7 @@ class Scheduler:
     Args:
         answer: makes a reply in parts.
         pace: how much of the time answers may take.
+        cost: what an answer takes, in pixels x Gaussians.
         within: a context for each part.
         spent_s: CPU seconds that this thread has used.
         max_wait_s: requests whose turn is farther off are refused.
@@ -74,12 +75,14 @@ class Scheduler:
         answer: Answer,
         pace: Pace,
         *,
+        cost: Callable[[SceneRequest], float] = lambda request: 0.0,
         within: Callable[[], AbstractContextManager[None]] = nullcontext,
         spent_s: Callable[[], float] = time.thread_time,
         max_wait_s: float = math.inf,
     ) -> None:
         self._answer = answer
         self._pace = pace
+        self._cost = cost
         self._within = within
         self._spent_s = spent_s
         self._max_wait_s = max_wait_s
@@ -87,12 +90,13 @@ class Scheduler:
         self._tasks: list[_Task] = []  # a stack: each is much smaller than the one before it, which waits for it
 
     def take_in(
-        self, caller: bytes, request_id: bytes, request: SceneRequest, cost: float, trace: str | None = None
+        self, caller: bytes, request_id: bytes, request: SceneRequest, trace: str | None = None
     ) -> float | None:
         """Answer a request when its turn comes: None. Or refuse it: the seconds until its turn, as far as known.
 
-        cost: what the answer takes, in pixels x Gaussians. trace: of its asker (Turn).
+        trace: of its asker (Turn). Raises whatever cost raises.
         """
+        cost = self._cost(request)
         seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
         turn = Turn(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
         if (wait_s := self._wait_s(turn)) > self._max_wait_s:

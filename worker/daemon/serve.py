@@ -14,7 +14,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -24,10 +23,9 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.errors import InputError, SceneError, UnavailableError
-from contract.wire.rendering import CancelRequest, ReplyError, SceneRequest, WorkerReply, WorkerRequest
-from worker.daemon.pace import Pace
+from contract.wire.rendering import CancelRequest, ReplyError, WorkerReply, WorkerRequest
 from worker.daemon.reply import NotYetError, Reply
-from worker.daemon.scheduler import Answer, Answered, Scheduler
+from worker.daemon.scheduler import Answered, Scheduler
 
 POLL_MS = 50
 """How soon the thread notices that it shall end."""
@@ -47,25 +45,18 @@ class RequestServer:
     """A context manager that answers requests at `endpoint`.
 
     Args:
-        answer: makes the reply to a request in parts. Its InputError, SceneError or NotYetError is sent to the caller;
-            any other error is logged, and the caller gets its type.
-        cost: what an answer will take, in pixels x Gaussians.
+        scheduler: answers them. An InputError, SceneError or NotYetError is sent to the caller; any other error is
+            logged, and the caller gets its type.
         between: called about once a second, in the same thread.
-        pace, within, spent_s, max_wait_s: as of Scheduler.
         render_secret: needed for tcp:// alone.
     """
 
     def __init__(
         self,
         endpoint: str,
-        answer: Answer,
+        scheduler: Scheduler,
         *,
-        cost: Callable[[SceneRequest], float] = lambda request: 0.0,
         between: Callable[[], None] | None = None,
-        pace: Pace | None = None,
-        within: Callable[[], AbstractContextManager[None]] = nullcontext,
-        spent_s: Callable[[], float] = time.thread_time,
-        max_wait_s: float = math.inf,
         render_secret: str | None = None,
     ) -> None:
         if endpoint.startswith("tcp:") and render_secret is None:
@@ -75,10 +66,9 @@ class RequestServer:
                 "Set it, to 32 or more characters.",
             )
         self.endpoint = endpoint
-        self._scheduler = Scheduler(answer, pace or Pace(), within=within, spent_s=spent_s, max_wait_s=max_wait_s)
+        self._scheduler = scheduler
         self._between = between
         self._between_at_s = 0.0
-        self._cost = cost
         self._render_secret = render_secret
         self._end = threading.Event()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -150,11 +140,11 @@ class RequestServer:
             self._scheduler.give_up(caller, request_id)
             return
         try:
-            cost = self._cost(request)
+            wait_s = self._scheduler.take_in(caller, request_id, request, envelope.trace)
         except Exception as error:  # what one caller asks must not end the loop for all
             self._send(caller, request_id, WorkerReply(error=_reply_error(error)))
             return
-        if (wait_s := self._scheduler.take_in(caller, request_id, request, cost, envelope.trace)) is not None:
+        if wait_s is not None:
             self._send(caller, request_id, WorkerReply(error=_busy(wait_s)))
 
     def _send_answer(self, answered: Answered) -> None:

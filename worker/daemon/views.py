@@ -123,6 +123,7 @@ class Views:
             return self._measured(self._stored(request.scene_id, request.attempt), request)
         if request.attempt is not None:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
+            yield  # it may have been loaded
         else:
             snapshot = self._trained(request.scene_id)
             scene = snapshot.scene

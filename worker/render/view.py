@@ -215,6 +215,8 @@ def frame_in_parts(view: View, *, with_confidence: bool = False) -> Parts[Frame]
     with_confidence: compute it now, in parts, and not when somebody asks for it.
     """
     lenses, scene = view.lenses, view.scene
+    renderer_of(scene, view.device)  # the first of a scene takes long
+    yield
     picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
     unseen = unseen_pixels(picture.missing)
     yield

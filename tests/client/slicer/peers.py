@@ -29,6 +29,7 @@ from tests.reports import REPORT_OF_A_SCENE, a_warning
 from tests.test_repository import REPOSITORY
 from tests.worker.export.sheet import tissue
 from worker.daemon.pace import Pace
+from worker.daemon.scheduler import Scheduler
 from worker.daemon.serve import RequestServer
 from worker.daemon.views import Views
 from worker.render.view import render_frame
@@ -199,7 +200,7 @@ def rendering_site(data_dir: Path) -> Iterator[Site]:
     store = Store(data_dir)
     endpoint = f"ipc://{short_socket_path(store.run_dir, 'worker-1.sock')}"
     pace = Pace()
-    with RequestServer(endpoint, Views(store).answer_in_parts, pace=pace):
+    with RequestServer(endpoint, Scheduler(Views(store).answer_in_parts, pace)):
         site, ended = Site(data_dir, endpoint, Painter(), pace), threading.Event()
         heart = threading.Thread(target=_beat, args=(site, ended))
         heart.start()

@@ -13,6 +13,7 @@ from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.errors import SceneError, UnavailableError
 from contract.wire.rendering import ExportRequest, WorkerReply, WorkerRequest
+from tests.answers import at_once
 from tests.worker.daemon.test_serve import ask, connected
 from tests.worker.exports import export_request, exported
 from tests.worker.scenes import random_scene
@@ -49,7 +50,7 @@ def scene_id(store: Store) -> str:
 @pytest.fixture
 def worker(tmp_path: Path) -> Iterator[zmq.Socket[bytes]]:
     endpoint = f"ipc://{short_socket_path(tmp_path, 'worker.sock')}"
-    with RequestServer(endpoint, Views(Store(tmp_path)).answer_in_parts), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(Views(Store(tmp_path)).answer)), connected(endpoint) as socket:
         yield socket
 
 

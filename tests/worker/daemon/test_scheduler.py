@@ -39,7 +39,12 @@ class Studio:
 
     def __init__(self, pace: Pace | None = None, **settings: Any) -> None:
         self.pace = pace or Pace(clock=Clock())
-        self.scheduler = Scheduler(self.answer, self.pace, spent_s=lambda: self.cpu_s, within=self.within, **settings)
+        settings |= {
+            "cost": lambda request: request.t * FIRST_SPEEDS[0],
+            "within": self.within,
+            "spent_s": lambda: self.cpu_s,
+        }
+        self.scheduler = Scheduler(self.answer, self.pace, **settings)
         self.cpu_s = 0.0
         self.made, self.left, self.levels = list[float](), list[float](), list[int]()
         self.parts_under_way = 0
@@ -75,7 +80,7 @@ class Studio:
         refused = None
         for t in times:
             request = RenderRequest(scene_id=SCENE, t=t, format=image_format)
-            refused = self.scheduler.take_in(CALLER, str(number or t).encode(), request, t * FIRST_SPEEDS[0])
+            refused = self.scheduler.take_in(CALLER, str(number or t).encode(), request)
         return refused
 
     def finish(self) -> list[float]:

@@ -22,6 +22,7 @@ from tests.answers import at_once
 from tests.reports import a_warning
 from worker.daemon.pace import MAX_SAVED_S, SHARE, Pace
 from worker.daemon.reply import NotYetError, Reply
+from worker.daemon.scheduler import Scheduler
 from worker.daemon.serve import MAX_REQUEST_BYTES, RequestServer
 from worker.daemon.turns import FIRST_SPEEDS
 from worker.machine.parts import Parts
@@ -129,7 +130,7 @@ def test_a_request_whose_cost_cannot_be_told_gets_an_error_and_the_next_is_answe
     def cost(asked: RenderRequest) -> float:
         return 1 / asked.t
 
-    with RequestServer(endpoint, at_once(answer), cost=cost), connected(endpoint) as socket:
+    with RequestServer(endpoint, at_once(answer, cost=cost)), connected(endpoint) as socket:
         head, _ = ask(socket, request(0))
         assert head.error is not None
         assert head.error.kind == "internal"
@@ -209,7 +210,7 @@ def test_keys_follow_from_the_secret_and_each_side_has_its_own() -> None:
 
 def test_who_asks_while_the_worker_rests_is_answered_afterwards(endpoint: str) -> None:
     pace = Pace()
-    with RequestServer(endpoint, at_once(answer), pace=pace), connected(endpoint) as socket, pace.training():
+    with RequestServer(endpoint, at_once(answer, pace)), connected(endpoint) as socket, pace.training():
         pace.charge(MAX_SAVED_S + 0.1 * SHARE)
         start_s = time.monotonic()
         assert ask(socket, request(0.25))[1] == b"image"
@@ -220,7 +221,8 @@ class Studio:
     """Renders whose cost is their t, each in parts that are made when they are let go."""
 
     def __init__(self, endpoint: str) -> None:
-        self.server = RequestServer(endpoint, self.answer, cost=lambda each: each.t * FIRST_SPEEDS[0], max_wait_s=40.0)
+        scheduler = Scheduler(self.answer, Pace(), cost=lambda each: each.t * FIRST_SPEEDS[0], max_wait_s=40.0)
+        self.server = RequestServer(endpoint, scheduler)
         self.begun: list[float] = []
         self.has_begun = threading.Event()
         self.parts = threading.Semaphore(0)
@@ -314,7 +316,7 @@ def test_a_server_that_ends_abandons_the_answer_that_is_being_made(endpoint: str
         finally:
             ended.set()
 
-    with RequestServer(endpoint, answer_slowly), connected(endpoint) as socket:
+    with RequestServer(endpoint, Scheduler(answer_slowly, Pace())), connected(endpoint) as socket:
         socket.send_multipart([b"1", request(0.5)])
         time.sleep(0.1)
     assert ended.is_set()
