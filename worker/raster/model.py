@@ -48,6 +48,10 @@ class Projected(Protocol):
         """The image's rows, from top to bottom, about BAND_PIXELS of them at a time."""
         ...
 
+    def sort(self) -> None:
+        """Call it once before the first band: it may take as long as some of them."""
+        ...
+
     def blend(self, rows: slice) -> Floats:
         """R G B Z A and the values of one of the bands, [5 or 6, h, W]; a view until close()."""
         ...
@@ -67,6 +71,9 @@ class Blended:
     def bands(self) -> list[slice]:
         """As of Projected."""
         return bands_of(self.image.shape[2], self.image.shape[1])
+
+    def sort(self) -> None:
+        """There is nothing left to do."""
 
     def blend(self, rows: slice) -> Floats:
         """As of Projected."""

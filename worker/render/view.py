@@ -88,7 +88,7 @@ class SceneRenderer:
         *,
         highlights: bool = True,
     ) -> Iterator[Projected]:
-        """R G B Z A, and as sixth plane blended_values if they are known, to be blended in bands.
+        """R G B Z A, and as sixth plane blended_values if they are known, to be sorted and blended in bands.
 
         Other pictures of the scene may be rendered meanwhile.
         """
@@ -274,8 +274,10 @@ class _Picture:
 
 
 def _rendered(view: View, lens: Intrinsics, *, with_colours: bool) -> Parts[_Picture]:
-    """The view's picture through a lens: a part for the projection and one for each band."""
+    """The view's picture through a lens: two parts for the projection and one for each band."""
     with view.projected(view.pose, lens) as projected:
+        yield
+        projected.sort()
         yield
         picture = _Picture.empty(lens.height, lens.width, with_colours=with_colours)
         for rows in projected.bands:
@@ -313,6 +315,8 @@ def _endoscope_rgb(view: View) -> Parts[NDArray[np.float32]]:
     lens = view.lenses.endoscope
     colours = np.empty((3, lens.height, lens.width), np.float32)
     with view.projected(view.endoscope_pose, lens) as projected:
+        yield
+        projected.sort()
         yield
         for rows in projected.bands:
             colours[:, rows] = projected.blend(rows)[:3]

@@ -458,13 +458,13 @@ def test_no_picture_is_drawn_of_more_pixels_than_the_limit_and_a_view_costs_all_
     scene_id: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    drawn, project = list[int](), Rasterizer.project
+    drawn, place = list[int](), Rasterizer.place
 
     def noted(rasterizer: Rasterizer, *args: Any) -> None:
         drawn.append(rasterizer.width * rasterizer.height)
-        project(rasterizer, *args)
+        place(rasterizer, *args)
 
-    monkeypatch.setattr(Rasterizer, "project", noted)
+    monkeypatch.setattr(Rasterizer, "place", noted)
     views = Views(store)
     asked = {"camera": IntrinsicsOverride(**lens), "max_pixels": max_pixels, "layer": layer}
     view = request_of(scene_id, t=0.5).model_copy(update={**asked, "pose": pose and parse_pose(pose)})

@@ -125,11 +125,16 @@ class CpuModel:
 
     def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
         """The Gaussians of the state on this camera's image."""
+        self._place_state(camera, sh_degree, rasterizer)
+        rasterizer.sort()
+
+    def _place_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
+        """First half of that, after which the state is not needed any more."""
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
+        rasterizer.place(camera, self.state, self.opacity_logit, self.colour)
         self.rasterizer = rasterizer
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -142,7 +147,7 @@ class CpuModel:
         size = image_size(camera)
         rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)
         self.motion.deform(self.canonical, t, self.state)
-        self._project_state(camera, self.sh_degree, rasterizer)
+        self._place_state(camera, self.sh_degree, rasterizer)
         if values is not None:
             rasterizer.set_values(values)
         return _Projected(rasterizer, values is not None, self._kept)
@@ -296,10 +301,12 @@ class _Projected:
     def bands(self) -> list[slice]:
         return bands_of(self.rasterizer.width, self.rasterizer.height, TILE_ROWS)
 
+    def sort(self) -> None:
+        self.rasterizer.sort()
+
     def blend(self, rows: slice) -> Floats:
-        return self.rasterizer.render_rows(rows.start // TILE_ROWS, -(-rows.stop // TILE_ROWS))[
-            : 6 if self.with_values else 5
-        ]
+        planes = self.rasterizer.render_rows(rows.start // TILE_ROWS, -(-rows.stop // TILE_ROWS))
+        return planes if self.with_values else planes[:5]
 
     def close(self) -> None:
         self.keep(self.rasterizer)

@@ -94,6 +94,11 @@ class Rasterizer:
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Splats of this camera in tiles, nearest first. camera: camera_vector; state [>= 10, N], colour [3, N]."""
+        self.place(camera, state, opacity_logit, colour)
+        self.sort()
+
+    def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """First half of project: the splats on the image."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
@@ -102,14 +107,18 @@ class Rasterizer:
             project.project, camera, state, opacity_logit, colour, self.splats.reshape(-1), self.radius2,
             self._extent.reshape(-1),
         )  # fmt: skip
-        self._bin()
-        self._sort()
 
-    def _bin(self) -> None:
-        """The slots and homes of every splat."""
+    def sort(self) -> None:
+        """Second half of project: the slots and homes of every splat, and the slots of every tile, nearest first."""
         if not self._filled():
             self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
+        ranks, keys = self._order, self._keys
+        count, is_first = bins.depth_order(self.splats, self.radius2, ranks[0], keys[0], ranks[1], keys[1])
+        bins.sort_into_tiles(
+            ranks[0 if is_first else 1], count, self.slot_start, self._slot_count, self._slot_info, self._region_end,
+            self._tile_start, self._entries,
+        )  # fmt: skip
 
     def _filled(self) -> bool:
         """Write the slots; False where a thread's region is too small for its own."""
@@ -127,15 +136,6 @@ class Rasterizer:
     def _needed(self) -> NDArray[np.int64]:
         """Slots and homes of the thread that has most."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
-
-    def _sort(self) -> None:
-        """The slots of every tile, nearest first."""
-        ranks, keys = self._order, self._keys
-        count, is_first = bins.depth_order(self.splats, self.radius2, ranks[0], keys[0], ranks[1], keys[1])
-        bins.sort_into_tiles(
-            ranks[0 if is_first else 1], count, self.slot_start, self._slot_count, self._slot_info, self._region_end,
-            self._tile_start, self._entries,
-        )  # fmt: skip
 
     def _reserve(self) -> None:
         """Room for what a thread keeps of the fullest tile; untouched memory costs nothing."""
