@@ -19,6 +19,7 @@ from contract.wire.options import ReconstructionOptions
 from worker.evaluate.rows import commit, machine, write_rows
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.outcome import scene_of
 from worker.phantom import PhantomSettings, make_phantom
 from worker.scene.checkpoint import MANIFEST_FILE, SCENE_FILE, load_scene, save_scene
@@ -26,7 +27,6 @@ from worker.scene.model import model_of
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.rate_distortion import round_model
 from worker.train.scoring import HeldOutScore, held_out_score
 from worker.train.setup import Setup

@@ -31,6 +31,7 @@ from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, StereoClip, split_frames
 from worker.machine.hooks import Hooks
 from worker.machine.timing import Timings
+from worker.methods.registry import preset_named
 from worker.model.metrics import psnr_tissue
 from worker.phantom import Motion, Phantom, PhantomSettings, make_phantom
 from worker.phantom.shading import add_noise
@@ -39,7 +40,6 @@ from worker.stereo.opening import match_eyes
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import preset_named
 from worker.train.run import Run
 from worker.train.scoring import HeldOutScore, frame_renderer
 from worker.train.setup import Setup

@@ -30,6 +30,7 @@ from worker.evaluate.sources import OpenClip, open_source, source_of
 from worker.evaluate.truth import Expected, SceneCandidate, Truth, seen_now
 from worker.input.clip import split_frames
 from worker.machine.hooks import Hooks
+from worker.methods.registry import preset_named
 from worker.outcome import scene_of
 from worker.raster.cpu import compile_kernels
 from worker.render.unseen import hatched
@@ -38,7 +39,6 @@ from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import preset_named
 from worker.train.scoring import HeldOutScore
 from worker.train.setup import Setup
 from worker.train.targets import MEDIAN_DEPTH_UNITS

@@ -28,13 +28,14 @@ from contract.wire.options import ReconstructionOptions
 from worker.evaluate.sources import DATA_VARIABLE, open_source, source_of
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.hooks import Hooks
+from worker.methods.method import Preset
+from worker.methods.registry import preset_named
 from worker.model.metrics import clear_of_highlights, psnr_tissue
 from worker.model.optimize import Rate
 from worker.raster.cpu import compile_kernels
 from worker.report.right_eye import warped_left
 from worker.train.loop import step
 from worker.train.prepare import prepare
-from worker.train.presets import Preset, preset_named
 from worker.train.run import Run
 from worker.train.schedule import Schedule
 from worker.train.scoring import frame_renderer, judged_pixels

@@ -24,6 +24,7 @@ from contract.wire.options import ReconstructionOptions
 from worker.input.calibration import RectifiedClip, rectify
 from worker.input.clip import DepthClip, Eye, held_out_frames, split_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.model.metrics import psnr_tissue
 from worker.phantom import Phantom, PhantomSettings, make_phantom
 from worker.raster.cpu import compile_kernels
@@ -33,7 +34,6 @@ from worker.stereo.turn import Turn
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.run import Run
 from worker.train.scoring import HeldOutScore, frame_renderer
 from worker.train.setup import Setup

@@ -31,6 +31,7 @@ from worker.daemon.snapshot import Snapshots
 from worker.daemon.views import Views
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.outcome import snapshot_of
 from worker.phantom import PhantomSettings, make_phantom
 from worker.raster.cpu import compile_kernels
@@ -39,7 +40,6 @@ from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.scoring import HeldOutScore
 from worker.train.setup import Setup
 

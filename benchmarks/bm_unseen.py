@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from contract.wire.options import ReconstructionOptions
 from contract.wire.pose import OrbitPose, world_from_camera
 from worker.input.clip import DepthClip, FrameSplit, split_frames
+from worker.methods.registry import PRESETS
 from worker.model.metrics import COVERED_ALPHA, psnr_tissue
 from worker.outcome import scene_of
 from worker.phantom import MOTIONS, PhantomSettings, make_phantom
@@ -36,7 +37,6 @@ from worker.scene.scene import Scene
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.scoring import HeldOutScore
 from worker.train.setup import Setup
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units

@@ -39,6 +39,7 @@ ROOMS = {
         "model",
         "raster",
         "scene",
+        "methods",
         "train",
         "render",
         "export",

@@ -27,7 +27,7 @@ from worker.machine.forecast import Forecast
 from worker.machine.hooks import Hooks
 from worker.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from worker.machine.timing import Timings
-from worker.model.deformation import HexPlane
+from worker.model.deformation import motion_named
 from worker.outcome import scene_of, snapshot_of, training_of
 from worker.poses import placed, with_poses
 from worker.raster.backend import CPU, Device, choose_device, device_for, examine
@@ -170,7 +170,8 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     timings.add("compile_s", compile_coder())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
-    torch.set_num_threads(cores() if preset.deformation == HexPlane.kind else 1)  # else kernels do what takes time
+    by_kernels = motion_named(preset.deformation).has_kernels  # they have threads of their own, so torch needs one
+    torch.set_num_threads(1 if by_kernels else cores())
     idle = device != choose_device(request.device)
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 

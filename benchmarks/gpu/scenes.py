@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.worker.raster.scenes import SplatScene, pixels_near_a_cut
-from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.layout import CAMERA
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference

@@ -23,12 +23,13 @@ from benchmarks.gpu.rows import CLIP, CLIP_READY, KERNELS_READY, Part
 from contract.wire.errors import Cancelled
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, split_frames
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS
 from worker.raster.backend import CPU, Device
 from worker.train import loop as training
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS, Preset
 from worker.train.run import CurvePoint, Run
 from worker.train.scoring import held_out_score
 from worker.train.setup import Setup

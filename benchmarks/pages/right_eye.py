@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.pages.markdown import number, origin, table
 from worker.evaluate.rows import read_rows
 from worker.evaluate.summary import Group, groups_of
-from worker.train.presets import PRESETS
+from worker.methods.registry import PRESETS
 
 TWO_EYES = "two-eyes.csv"
 """Rows of bm_two_eyes.py."""

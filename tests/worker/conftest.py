@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from worker.evaluate.variants import register_variants
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> Iterator[None]:
@@ -25,3 +27,9 @@ def triton_cache(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     """
     kept = getattr(pytestconfig, "cache", None)
     return tmp_path if kept is None else Path(kept.mkdir("triton"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _variants() -> None:
+    """Presets and motions of the laboratory are known to every test here by their names."""
+    register_variants()

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.model.deformation import GaussianFdm, HexPlane, SharedBasis
+from worker.evaluate.variants.hexplane import HexPlane
+from worker.model.deformation import GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians, initial_gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates

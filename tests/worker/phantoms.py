@@ -11,12 +11,13 @@ import numpy as np
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS
 from worker.outcome import scene_of
 from worker.phantom import Motion, PhantomSettings, make_phantom
 from worker.train.hooks import RenderedFrame, TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS, Preset
 from worker.train.resume import begin_save, resume
 from worker.train.run import Run
 from worker.train.scoring import HeldOutScore, frame_renderer

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from worker.evaluate.variants.hexplane import HexPlane
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
 from worker.input.camera import Intrinsics
-from worker.model.deformation import Deformation, GaussianFdm, HexPlane, PolynomialFourier, QuarticFdm, SharedBasis
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.scene.scene import Scene
 

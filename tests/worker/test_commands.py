@@ -20,8 +20,8 @@ from contract.wire.names import CURVE, RECORDED, REPORT, PresetName
 from contract.wire.notices import NoticeCode
 from contract.wire.report import Report
 from worker.__main__ import main
+from worker.methods.registry import PRESETS
 from worker.scene.resume_file import RESUME_FILE, load_resume
-from worker.train.presets import PRESETS
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
 TRAINING_S = 1.0

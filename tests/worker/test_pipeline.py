@@ -29,6 +29,8 @@ from contract.wire.report import Masks, Report
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 from worker.input.clip import DepthClip, open_clip, split_frames
 from worker.machine.hooks import Progress
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS
 from worker.model.metrics import coverage, psnr_tissue
 from worker.model.optimize import Rate
 from worker.outcome import scene_of
@@ -41,7 +43,6 @@ from worker.scene.checkpoint import load_scene
 from worker.scene.model import model_of
 from worker.scene.resume_file import RESUME_FILE
 from worker.train.hooks import TrainingHooks
-from worker.train.presets import PRESETS, Preset
 from worker.train.rate_distortion import TOLERANCE_DB, round_model
 from worker.train.request import ReconstructionRequest
 from worker.train.targets import camera_in_units

@@ -17,7 +17,8 @@ from contract.wire.errors import InputError
 from contract.wire.names import Eyes
 from contract.wire.options import ReconstructionOptions, parse_options
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
-from worker.train.presets import PRESETS, Preset
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS
 
 OURS = tuple(name for name in ("instant", "fast", "quality", "small") if name in PRESETS)
 PUBLISHED = "paper"

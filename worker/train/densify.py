@@ -11,7 +11,6 @@ their centre: 0 for an endoscope that stands still. Nothing is smaller than 0, s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,42 +19,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from contract.wire.errors import TrainingDiverged
+from worker.methods.method import DensifySettings
 from worker.model.layout import LOG_SCALE, MEAN, QUATERNION
 from worker.raster.model import Model
 
 SPLIT_SHRINK = 0.8
 """Children of a Gaussian split into n are 1 / (0.8 n) as wide in every direction."""
-
-
-@dataclass(frozen=True)
-class DensifySettings:
-    """When and what to split and prune.
-
-    from_iteration      the first iteration after which it happens; statistics are gathered from the first step on
-    every               iterations between two densifications
-    gradient_threshold  NDC; a Gaussian whose mean gradient is above it is split
-    split_into          children of one Gaussian
-    min_opacity         a Gaussian below it is dropped
-    max_count           no more Gaussians than this: with FDM's 17 bases and Adam's moments one takes 6.8 kB, these
-                        1.4 GB; the threshold alone bounds nothing on a clip that cannot be fitted
-    """
-
-    from_iteration: int = 600
-    every: int = 100
-    gradient_threshold: float = 2e-4
-    split_into: int = 2
-    min_opacity: float = 0.005
-    max_count: int = 200_000
-
-    def __post_init__(self) -> None:
-        if self.every < 1 or self.split_into < 2 or self.max_count < 1:
-            raise ValueError(f"every, split_into and max_count must be at least 1, 2 and 1: {self}")
-        if not (0 < self.min_opacity < 1 and self.gradient_threshold > 0):
-            raise ValueError(f"min_opacity must lie in (0, 1), gradient_threshold above 0: {self}")
-
-    def due(self, iteration: int) -> bool:
-        """Whether to densify after this iteration (from 1)."""
-        return iteration >= self.from_iteration and iteration % self.every == 0
 
 
 class Densifier:

@@ -8,6 +8,7 @@ from functools import partial
 from contract.wire.notices import Notice
 from worker.fusion import fuse
 from worker.machine.memory import LITTLE_BYTES, keep_free_memory
+from worker.methods.method import Preset
 from worker.model.deformation import SharedBasis
 from worker.motion.keyframes import track_keyframes
 from worker.motion.tracks import Tracks, moved_along
@@ -15,7 +16,6 @@ from worker.raster.backend import CPU, examine
 from worker.raster.model import Model
 from worker.train.calibrate import measured_schedule, warm_up
 from worker.train.densify import Densifier
-from worker.train.presets import Preset
 from worker.train.run import Box, Run
 from worker.train.schedule import Schedule, validation_frames
 from worker.train.setup import Setup

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import ClipLimits, DepthClip
-from worker.train.presets import Preset, preset_named
+from worker.methods.method import Preset
+from worker.methods.registry import preset_named
 
 
 @dataclass(frozen=True)

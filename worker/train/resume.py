@@ -16,10 +16,10 @@ from torch import Tensor
 
 from contract.wire.errors import ResumeMismatch, SceneError
 from contract.wire.notices import Notice
+from worker.methods.method import Preset
 from worker.raster.model import Model, state_of
 from worker.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from worker.train.prepare import begun, examine_device, frames_of
-from worker.train.presets import Preset
 from worker.train.run import CurvePoint, Run
 from worker.train.schedule import Schedule
 from worker.train.setup import Setup

@@ -11,11 +11,11 @@ import numpy as np
 from contract.wire.names import Eyes
 from contract.wire.notices import Notice
 from worker.machine.hooks import Progress
+from worker.methods.method import Preset
 from worker.raster.backend import Device
 from worker.raster.model import Model
 from worker.train.average import RunningMean
 from worker.train.densify import Densifier
-from worker.train.presets import Preset
 from worker.train.schedule import Schedule, validation_frames
 from worker.train.setup import Setup
 from worker.train.targets import TrainingFrames

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from contract.wire.options import ReconstructionOptions
 from worker.input.clip import DepthClip, Eye, FrameSplit
 from worker.machine.timing import Stopwatch, Timings
+from worker.methods.method import Preset
 from worker.raster.backend import CPU, Device
 from worker.train.hooks import TrainingHooks
-from worker.train.presets import Preset
 
 
 @dataclass(frozen=True, eq=False)

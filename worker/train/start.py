@@ -14,6 +14,7 @@ from contract.wire.notices import Notice, NoticeCode
 from worker.fusion import FusionSettings, PointCloud, nearest_pixels
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
+from worker.methods.method import Preset
 from worker.model.constants import SH_C0
 from worker.model.deformation import AtRest, SharedBasis, motion_named
 from worker.model.gaussians import NEIGHBOURS, Gaussians, initial_gaussians
@@ -23,7 +24,6 @@ from worker.motion.tracks import GUESSED, Tracks, fit_tracks
 from worker.raster.backend import CPU, Device, make_model
 from worker.raster.model import Model
 from worker.scene.compact import MAX_WEIGHTS
-from worker.train.presets import Preset
 from worker.train.run import Box
 from worker.train.setup import Setup
 

@@ -18,7 +18,7 @@ from worker.evaluate.cells import (
     plan,
     preset_of,
 )
-from worker.train.presets import PRESETS
+from worker.methods.registry import PRESETS
 
 
 def test_a_series_is_a_preset_with_its_changes_made() -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from benchmarks.bm_one_eye import colours_alone, main
-from worker.train.presets import preset_named
+from worker.methods.registry import preset_named
 
 LINES = ["warp", "warp by flow", "left eye", "both eyes", "left's colours"]
 

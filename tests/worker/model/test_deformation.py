@@ -11,16 +11,10 @@ import torch
 from torch import Tensor
 
 from tests.helpers import assert_close
-from worker.model.deformation import (
-    Deformation,
-    FlexibleDeformation,
-    GaussianFdm,
-    HexPlane,
-    PolynomialFourier,
-    QuarticFdm,
-    SharedBasis,
-    restore,
-)
+from worker.evaluate.variants.hexplane import HexPlane
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
+from worker.model.deformation import Deformation, FlexibleDeformation, GaussianFdm, SharedBasis, restore
 from worker.model.gaussians import Gaussians
 from worker.model.layout import CHANNELS
 

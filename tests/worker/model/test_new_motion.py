@@ -1,4 +1,4 @@
-"""A motion from outside the tree: one line in the registry, and it trains, is stored, loaded and rendered."""
+"""A motion from outside the tree: one call of register_motion, and it trains, is stored, loaded and rendered."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 
 from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import phantom_clip
-from worker.model.deformation import MOTIONS, AtRest, Deformation, LinearDeformation, add_offsets
+from worker.methods.method import DensifySettings
+from worker.methods.registry import PRESETS
+from worker.model.deformation import AtRest, Deformation, LinearDeformation, add_offsets, register_motion
 from worker.model.gaussians import Gaussians
 from worker.model.layout import CHANNELS
 from worker.pipeline import reconstruct
 from worker.render.view import render_frame
 from worker.scene.checkpoint import load_scene
-from worker.train.densify import DensifySettings
 from worker.train.hooks import TrainingHooks
-from worker.train.presets import PRESETS
 from worker.train.request import ReconstructionRequest
 
 
@@ -67,10 +67,8 @@ class LinearDrift(LinearDeformation):
 
 
 @pytest.mark.parametrize("motion", [ConstantVelocity, LinearDrift], ids=lambda motion: motion.kind)
-def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(
-    motion: type[Deformation], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(MOTIONS, motion.kind, motion)
+def test_a_motion_from_outside_is_trained_stored_loaded_and_rendered(motion: type[Deformation], tmp_path: Path) -> None:
+    register_motion(motion)
     clip = phantom_clip()
     preset = dataclasses.replace(
         PRESETS["paper"],

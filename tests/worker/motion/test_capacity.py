@@ -11,6 +11,7 @@ import pytest
 
 from tests.worker.phantoms import phantom_clip, prepared_on
 from worker.input.clip import DepthClip, split_frames
+from worker.methods.registry import PRESETS
 from worker.motion.capacity import (
     BASES,
     MAX_COARSENING,
@@ -25,7 +26,6 @@ from worker.motion.capacity import (
 from worker.motion.tracks import Tracks, track
 from worker.motion.trials import FitError
 from worker.phantom import Motion
-from worker.train.presets import PRESETS
 from worker.train.start import MIN_STRIDE, basis_values, fusion_for, settled
 
 FAST = PRESETS["fast"]

@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from worker.model.deformation import Deformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
+from worker.model.deformation import Deformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates

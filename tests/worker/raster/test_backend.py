@@ -12,6 +12,7 @@ import torch
 from contract.wire.errors import InputError, UnavailableError
 from tests.worker.models import HEIGHT, WIDTH, moving_fdm, moving_hexplane, moving_shared, wall
 from worker.machine.gpu import Gpu
+from worker.methods.registry import PRESETS
 from worker.raster.backend import (
     CPU,
     CPU_BY_VARIABLE,
@@ -22,7 +23,6 @@ from worker.raster.backend import (
     make_model,
 )
 from worker.raster.cpu.model import CpuModel
-from worker.train.presets import PRESETS
 
 H200 = Gpu(build="13.0", name="NVIDIA H200", triton="3.6.0")
 CPU_BUILD = Gpu(build=None, name=None, triton=None)

@@ -21,14 +21,9 @@ from torch import Tensor
 
 from tests.helpers import assert_close
 from tests.worker.raster.scenes import SplatScene, opaque_wall, pixels_near_a_cut, random_scene
-from worker.model.deformation import (
-    FlexibleDeformation,
-    GaussianFdm,
-    PolynomialFourier,
-    QuarticFdm,
-    SharedBasis,
-    restore,
-)
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
+from worker.model.deformation import FlexibleDeformation, GaussianFdm, SharedBasis, restore
 from worker.model.gaussians import Gaussians
 from worker.model.layout import COLOUR_CHANNELS, ROWS
 from worker.model.loss import LossSettings, training_loss

@@ -20,7 +20,10 @@ from tests.helpers import assert_close
 from tests.worker import models
 from tests.worker.raster import replays
 from tests.worker.raster.scenes import random_scene
-from worker.model.deformation import FlexibleDeformation, GaussianFdm, PolynomialFourier, QuarticFdm, SharedBasis
+from worker.evaluate.variants.polynomial import PolynomialFourier
+from worker.evaluate.variants.quartic import QuarticFdm
+from worker.methods.method import MAX_FRAMES_A_STEP
+from worker.model.deformation import FlexibleDeformation, GaussianFdm, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.layout import POSE, SIDE
 from worker.model.layout import WIDTH as WIDTH_PLACE
@@ -30,7 +33,6 @@ from worker.raster.cpu.model import CpuModel
 from worker.raster.cuda.bins import MAX_FRAMES
 from worker.raster.cuda.model import CHECK_EVERY, CudaModel
 from worker.raster.step import Target, TrainingFrame, camera_vector
-from worker.train.presets import MAX_FRAMES_A_STEP
 
 WIDTH, HEIGHT, COUNT = 20, 16, 32
 Fused = SharedBasis | PolynomialFourier | FlexibleDeformation

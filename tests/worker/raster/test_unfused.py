@@ -27,7 +27,8 @@ from tests.worker.models import (
     training_frames,
     wall,
 )
-from worker.model.deformation import Deformation, HexPlane
+from worker.evaluate.variants.hexplane import HexPlane
+from worker.model.deformation import Deformation
 from worker.model.gaussians import Gaussians
 from worker.model.loss import LossSettings, training_loss
 from worker.raster import reference

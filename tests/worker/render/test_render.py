@@ -17,6 +17,7 @@ from tests.helpers import assert_close
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
 from tests.worker.scenes import random_scene
 from worker.input.camera import Intrinsics
+from worker.methods.registry import PRESETS
 from worker.model.metrics import psnr_tissue
 from worker.outcome import scene_of, snapshot_of
 from worker.phantom import orbit_pose
@@ -24,7 +25,6 @@ from worker.render.camera import endoscope_pose
 from worker.render.view import FAR_POSE, judged_camera, render_frame, renderer_of
 from worker.scene.checkpoint import load_scene, save_scene
 from worker.scene.scene import POSE_DOUBTS, Scene
-from worker.train.presets import PRESETS
 from worker.train.run import Run
 
 LAST = (FRAMES - 1) / FRAMES

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from tests.worker.phantoms import phantom_clip, prepared
+from worker.methods.registry import PRESETS
 from worker.train import aside
 from worker.train.average import PREFIX, RunningMean
-from worker.train.presets import PRESETS
 
 Parameters = dict[str, Tensor]
 

@@ -18,13 +18,13 @@ from tests.helpers import assert_close
 from tests.worker.clips import plane_clip
 from tests.worker.phantoms import keep, kept
 from worker.input.clip import DepthClip, FrameSplit, split_frames
+from worker.methods.registry import PRESETS
 from worker.outcome import scene_of
 from worker.raster.backend import CPU, Device
 from worker.raster.cuda.model import CudaModel
 from worker.render.view import render_frame
 from worker.train.loop import step
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.run import Run
 from worker.train.setup import Setup
 

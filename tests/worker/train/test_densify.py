@@ -25,6 +25,7 @@ from tests.worker.models import (
     training_frames,
     wall,
 )
+from worker.methods.method import DensifySettings
 from worker.model.deformation import FlexibleDeformation, SharedBasis
 from worker.model.gaussians import Gaussians
 from worker.model.layout import LOG_SCALE, MEAN
@@ -34,7 +35,7 @@ from worker.raster.cpu.unfused import AutogradMotion
 from worker.raster.model import Model
 from worker.raster.step import camera_vector
 from worker.scene.resume_file import begin_resume, load_resume
-from worker.train.densify import Densifier, DensifySettings
+from worker.train.densify import Densifier
 
 NOTHING = DensifySettings(gradient_threshold=1e9)
 EVERYTHING = DensifySettings(gradient_threshold=1e-30)

@@ -14,6 +14,7 @@ import torch
 from contract.wire.errors import TrainingDiverged
 from tests.worker.phantoms import bits, phantom_clip, prepared, trained
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.model.loss import LossSettings
 from worker.model.optimize import StepRates
 from worker.raster.cpu.model import CpuModel
@@ -21,7 +22,6 @@ from worker.raster.step import StepSums, TrainingFrame
 from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule, warm_up
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
-from worker.train.presets import PRESETS
 from worker.train.run import Run
 from worker.train.schedule import Schedule
 

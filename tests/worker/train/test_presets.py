@@ -7,8 +7,9 @@ import dataclasses
 import pytest
 
 from contract.wire.errors import InputError
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS, preset_named
 from worker.model.optimize import Rate
-from worker.train.presets import PRESETS, Preset, preset_named
 
 VARIANTS = {
     "paper-released": {"deformation"},

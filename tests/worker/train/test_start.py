@@ -16,6 +16,8 @@ from worker.fusion import PointCloud, fuse
 from worker.fusion.points import cells_of
 from worker.input.camera import Intrinsics
 from worker.input.clip import DepthClip
+from worker.methods.method import Preset
+from worker.methods.registry import PRESETS
 from worker.model.layout import ROWS
 from worker.motion.keyframes import track_keyframes
 from worker.motion.lifted import cell_means
@@ -23,7 +25,6 @@ from worker.motion.tracks import moved_along
 from worker.phantom import PhantomSettings, make_phantom
 from worker.raster.model import Model
 from worker.scene.compact import MAX_WEIGHTS
-from worker.train.presets import PRESETS, Preset
 from worker.train.start import MIN_STRIDE, bounded, fusion_for, settled, start_model
 from worker.train.targets import units_per_mm
 

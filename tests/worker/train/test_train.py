@@ -19,13 +19,13 @@ from tests.worker.phantoms import bits, keep, kept, phantom_clip, prepared, prep
 from worker.input.clip import DepthClip, split_frames
 from worker.machine.hooks import Progress
 from worker.machine.timing import Stopwatch
+from worker.methods.method import DensifySettings, Preset
+from worker.methods.registry import PRESETS
 from worker.model.metrics import psnr_tissue
 from worker.model.optimize import Rate
 from worker.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule
-from worker.train.densify import DensifySettings
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
-from worker.train.presets import PRESETS, Preset
 from worker.train.resume import resume
 from worker.train.run import CurvePoint, Run, frames_at, write_curve
 from worker.train.schedule import Schedule

@@ -14,12 +14,12 @@ from contract.wire.options import Eyes, ReconstructionOptions
 from tests.worker.phantoms import bits, trained
 from worker.input.calibration import rectify
 from worker.input.clip import DepthClip, split_frames
+from worker.methods.registry import PRESETS
 from worker.model.optimize import rates_at
 from worker.phantom import PhantomSettings, make_phantom
 from worker.stereo import estimate_depth
 from worker.train.loop import step
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.run import Run
 from worker.train.scoring import held_out_score
 from worker.train.setup import Setup

@@ -16,13 +16,13 @@ from contract.wire.options import ReconstructionOptions
 from tests.worker.phantoms import bits, keep, kept, phantom_clip, prepared_on, trained
 from worker.input.clip import DepthClip, FrameSplit, split_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.model.metrics import psnr_tissue
 from worker.outcome import snapshot_of
 from worker.raster.model import Model
 from worker.train.hooks import TrainingHooks
 from worker.train.loop import train
 from worker.train.prepare import prepare
-from worker.train.presets import PRESETS
 from worker.train.run import Run, frames_at
 from worker.train.schedule import AVERAGED, Schedule, validation_frames
 from worker.train.scoring import HeldOutScore

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
+from worker.methods.method import DensifySettings
 from worker.raster import Camera
 from worker.raster.reference import rotation
-from worker.train.densify import SPLIT_SHRINK, DensifySettings, successors
+from worker.train.densify import SPLIT_SHRINK, successors
 
 PARAMETERS = 6
 """Of Gaussians, each in a group of its own, and these the optimiser's first groups: mean [N, 3] in units,

@@ -26,11 +26,11 @@ from worker.evaluate.rivals.fields import rays
 from worker.evaluate.rivals.planes import Smoothness, mean_squared_difference
 from worker.evaluate.rivals.rival import Rival, Seen, decayed, seeded, torch_threads
 from worker.input.camera import Intrinsics
+from worker.methods.method import DensifySettings
 from worker.model.gaussians import Gaussians, initial_gaussians, sh_colour
 from worker.model.loss import LossSettings, training_loss
 from worker.model.metrics import COVERED_ALPHA
 from worker.raster import Camera, Rendered
-from worker.train.densify import DensifySettings
 from worker.train.hooks import RenderedFrame
 from worker.train.targets import MEDIAN_DEPTH_UNITS, camera_in_units, solid_depth_mm
 

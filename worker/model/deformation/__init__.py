@@ -1,16 +1,17 @@
-"""How the canonical Gaussians move: FDM and its alternatives, one promise for all (base.Deformation).
+"""How the canonical Gaussians move: FDM and ours, one promise for all (base.Deformation).
 
-| kind                       | numbers per Gaussian | bases                                                      |
-|----------------------------|----------------------|------------------------------------------------------------|
-| fdm-gaussian, fdm-quartic  | 30 B                 | own centres and widths per Gaussian and channel, trained   |
-| shared                     | 10 B                 | one fixed set for all                                      |
-| pfs                        | 10 B                 | polynomials and harmonics                                  |
-| hexplane                   | 0                    | six shared feature planes at two resolutions and a network |
+| kind          | numbers per Gaussian | bases                                                    |
+|---------------|----------------------|----------------------------------------------------------|
+| fdm-gaussian  | 30 B                 | own centres and widths per Gaussian and channel, trained |
+| shared        | 10 B                 | one fixed set for all                                    |
 
-MOTIONS is the registry. A new motion is a file here and a line there (docs/extending.md).
+register_motion adds a motion from outside (docs/extending.md).
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -20,9 +21,7 @@ from worker.model.deformation.base import (
     LinearDeformation,
     add_offsets,
 )
-from worker.model.deformation.fdm import FlexibleDeformation, GaussianFdm, QuarticFdm
-from worker.model.deformation.hexplane import HexPlane
-from worker.model.deformation.polynomial import PolynomialFourier
+from worker.model.deformation.fdm import FlexibleDeformation, GaussianFdm
 from worker.model.deformation.shared import SharedBasis
 
 __all__ = [
@@ -31,24 +30,27 @@ __all__ = [
     "Deformation",
     "FlexibleDeformation",
     "GaussianFdm",
-    "HexPlane",
     "LinearDeformation",
-    "PolynomialFourier",
-    "QuarticFdm",
     "SharedBasis",
     "add_offsets",
     "motion_named",
+    "register_motion",
     "restore",
 ]
 
-MOTIONS: dict[str, type[Deformation]] = {
-    GaussianFdm.kind: GaussianFdm,
-    QuarticFdm.kind: QuarticFdm,
-    SharedBasis.kind: SharedBasis,
-    PolynomialFourier.kind: PolynomialFourier,
-    HexPlane.kind: HexPlane,
-}
+_MOTIONS: dict[str, type[Deformation]] = {GaussianFdm.kind: GaussianFdm, SharedBasis.kind: SharedBasis}
+MOTIONS: Mapping[str, type[Deformation]] = MappingProxyType(_MOTIONS)
 """Every motion by its name in presets and in stored scenes."""
+
+
+def register_motion(motion: type[Deformation]) -> None:
+    """Make a motion known by its kind, for this process. To register it again changes nothing.
+
+    Raises:
+        ValueError: another motion has the kind.
+    """
+    if _MOTIONS.setdefault(motion.kind, motion) is not motion:
+        raise ValueError(f"there is another deformation kind {motion.kind!r}")
 
 
 def motion_named(kind: str) -> type[Deformation]:

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from worker.model.constants import MIN_WIDTH, QUARTIC_FLOOR
+from worker.model.constants import MIN_WIDTH
 from worker.model.deformation.base import AtRest, Deformation, add_offsets
 from worker.model.gaussians import Gaussians
 from worker.model.layout import CHANNELS
@@ -91,13 +91,3 @@ class GaussianFdm(FlexibleDeformation):
     def basis(self, t: float) -> Tensor:
         variance = torch.clamp(self.width**2, min=MIN_WIDTH**2)
         return torch.exp(-((t - self.centre) ** 2) / (2 * variance))
-
-
-class QuarticFdm(FlexibleDeformation):
-    """The released code's form: b_j(t) = exp(-((t - theta_j)^2 / (sigma_j^2 + QUARTIC_FLOOR))^2)."""
-
-    kind = "fdm-quartic"
-    quartic = True
-
-    def basis(self, t: float) -> Tensor:
-        return torch.exp(-(((t - self.centre) ** 2 / (self.width**2 + QUARTIC_FLOOR)) ** 2))

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from contract.wire.errors import TrainingDiverged
 from worker.evaluate.rivals.adaptive_density import AdaptiveDensity
+from worker.methods.method import DensifySettings
 from worker.raster import Camera
 from worker.raster.reference import project
-from worker.train.densify import DensifySettings
 
 SETTINGS = DensifySettings(max_count=20)
 

@@ -20,8 +20,8 @@ from tests.worker.evaluate.rivals.cases import (
 from worker.evaluate.rivals.endogaussian import EndoGaussian, EndoGaussianSettings
 from worker.evaluate.rivals.planes import Smoothness
 from worker.evaluate.rivals.rival import Seen
+from worker.methods.method import DensifySettings
 from worker.raster import Rendered
-from worker.train.densify import DensifySettings
 
 SMALL = EndoGaussianSettings(
     start_share=0.4, cells=(16,), features=4, time_cells=4, mean_rate=(1e-2, 1e-3),

@@ -29,9 +29,9 @@ from worker.evaluate.sources import source_of
 from worker.input.clip import FrameSplit
 from worker.input.clip.sampling import most_frames
 from worker.machine.timing import Stopwatch
+from worker.methods.registry import PRESETS
 from worker.raster.backend import choose_device
 from worker.train.hooks import TrainingHooks
-from worker.train.presets import PRESETS
 
 CLIP = "phantom:pull:64x48:9frames"
 

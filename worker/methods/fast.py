@@ -1,0 +1,142 @@
+"""`fast`, our default: `paper` with the departures below, in the order in which a clip meets them.
+
+What no departure names is as in paper.py. A line "Gain" says what `fast` loses without the departure, on held-out
+frames after the same number of iterations, and the processor seconds that it costs (saves, where negative);
+`python -m benchmarks.bm_departures` measures and writes these lines. docs/method.md has the table.
+
+`instant`, `quality` and `small` are `fast` with other numbers; they stand at the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from contract.wire.names import BUDGETS_S
+from worker.fusion import FusionSettings
+from worker.methods.method import Departure, Preset, departing, leaving_out
+from worker.methods.paper import PAPER
+from worker.model.deformation import SharedBasis
+from worker.model.optimize import Rate
+
+MIN_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
+"""Points per image."""
+MANY_POINTS_FROM_S = 9.0
+"""From this budget on MANY_POINTS score more than FEW_POINTS. This is wall-clock time of the two cores of
+docs/decisions/015; a faster machine could afford them sooner. Nothing measures it at run time, because a run that is
+resumed must start with the same points."""
+
+DEPARTURES = (
+    # Points
+    #
+    # A grid on the first frame; tissue that is hidden there comes from later frames (worker/fusion/fill.py). The paper
+    # draws a tenth of the pixels at random.
+    Departure(
+        "grid of points",
+        {"fusion": FusionSettings(mode="fill"), "points_per_image": MANY_POINTS, "points_by_budget": True},
+    ),
+    # The grid leaves no gaps, so nothing has to be split, and a step costs the same from first to last.
+    Departure("no densification", {"densify": None}),
+    #
+    # Motion
+    #
+    # All Gaussians share the centres and widths of their bases (model/deformation/shared.py): a third of the numbers,
+    # linear in them, so that tracks can start them.
+    Departure("shared bases", {"deformation": SharedBasis.kind, "start_width": None}),
+    # As many bases as the motion of the tracks needs, not 17 (worker/motion/capacity.py).
+    Departure("bases by the scene", {"bases": None}, needs=("shared bases",)),
+    # Optical flow gives every Gaussian its motion before the first step, by linear least squares
+    # (worker/motion/tracks.py); the paper starts at rest.
+    Departure("tracks", {"tracks": True}, needs=("shared bases",)),
+    # The colour moves on the same bases, because the lamp moves with the camera and wet tissue glitters.
+    Departure("moving colour", rates={"motion_colour": Rate(5e-2, 5e-3)}, needs=("shared bases",)),
+    #
+    # Start
+    #
+    # Opaque Gaussians of half the size show the first frame before the first step.
+    Departure("opaque and small at the start", {"opacity": 0.9, "spread": 0.5}),
+    # One colour for all directions: an endoscope sees tissue from too few directions to tell harmonics.
+    Departure("no harmonics", {"sh_degree": 0, "sh_every": 0}, rates={"sh_rest": Rate(0.0)}),
+    #
+    # Steps
+    #
+    # Every frame once before any comes again, so that successive steps see frames from all over the clip.
+    Departure("epochs", {"order": "epochs"}),
+    # A step draws both eyes of its frame, from one motion (docs/decisions/030).
+    Departure("both eyes", {"both_eyes": True}),
+    # One number of each Gaussian says how much brighter the right eye sees it (docs/decisions/032).
+    Departure("gloss", rates={"gloss": Rate(2e-2, 5e-3), "motion_gloss": Rate(2e-2, 2e-3)}, needs=("both eyes",)),
+    # Motion learns up to thirty times faster: the published rates are made for 3000 steps (docs/decisions/005).
+    Departure(
+        "faster motion",
+        rates={
+            "motion_mean": Rate(1.5e-2, 1.5e-3),
+            "motion_quaternion": Rate(5e-2, 5e-3),
+            "motion_log_scale": Rate(5e-2, 5e-3),
+        },
+    ),
+    # Colour and shape learn four to ten times faster, and all rates fall (docs/decisions/015).
+    Departure(
+        "faster colour and shape",
+        rates={
+            "mean": Rate(1.6e-3, 5e-5),
+            "quaternion": Rate(1e-2, 3e-3),
+            "log_scale": Rate(2e-2, 6e-3),
+            "opacity": Rate(5e-2, 1.5e-2),
+            "colour": Rate(2.5e-2, 6e-3),
+        },
+    ),
+    # Adam forgets sooner (0.9 and 0.999 in the paper): what it remembers is about other frames (docs/decisions/015).
+    Departure("short moments of Adam", rates={"beta1": 0.3, "beta2": 0.95}),
+    # The slope of L1 does not fall with the error; Huber's loss lets steps shrink near the end (docs/decisions/015).
+    Departure("Huber loss of colour", loss={"colour_huber_delta": 0.1}),
+    # Depth is divided by alpha, so that a half-transparent surface is not taken for a near one (model/loss.py).
+    Departure("mean depth", loss={"normalised_depth": True}),
+    #
+    # Schedule and end
+    #
+    # Rates rise again when the iterations have doubled, and the last models of each cycle are averaged
+    # (worker/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one number.
+    Departure("warm restarts and averages", {"warm_restarts": True}, needs=("no densification",)),
+    # A run with a budget ends when doubling its iterations gained less on validation frames (docs/decisions/017).
+    Departure("early stopping", {"min_gain_db": 0.25}, needs=("warm restarts and averages",)),
+    # Seconds end a run, not iterations.
+    Departure("budget in seconds", {"iterations": None, "budget_s": BUDGETS_S["fast"]}),
+)
+"""What `fast` does otherwise than `paper`. No two departures set one value."""
+
+FAST = departing(PAPER, DEPARTURES, "fast")
+
+
+def fast_without(name: str) -> Preset:
+    """`fast` without the departure of this name and without those that need it. Raises KeyError if there is none."""
+    return departing(PAPER, leaving_out(DEPARTURES, name), f"fast without {name}")
+
+
+INSTANT = replace(
+    FAST,
+    name="instant",
+    points_per_image=FEW_POINTS,
+    rates=FAST.rates.times(1.6),  # a run of a hundred steps gains 0.2 to 0.4 dB by it (docs/decisions/044)
+    budget_s=BUDGETS_S["instant"],
+)
+"""`fast` for a few seconds."""
+
+QUALITY = replace(FAST, name="quality", min_gain_db=0.05, budget_s=BUDGETS_S["quality"])
+"""`fast` for minutes: it stops later."""
+
+SMALL = replace(
+    FAST,
+    name="small",
+    points_per_image=MIN_POINTS,
+    points_by_budget=False,
+    max_bases=17,
+    rates=replace(FAST.rates, motion_log_scale=Rate(0.0)),
+    budget_s=BUDGETS_S["small"],
+)
+"""`fast` for little room: a quarter of the Gaussians, half the bases and sizes that do not move. That loses least for
+each byte (docs/decisions/017)."""
+
+
+def points_for(budget_s: float) -> int:
+    """Points per image that score most in so many seconds of training."""
+    return FEW_POINTS if budget_s < MANY_POINTS_FROM_S else MANY_POINTS
