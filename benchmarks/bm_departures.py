@@ -1,0 +1,310 @@
+"""Measure what each departure of `fast` from `paper` is worth: train `fast` without one of them at a time.
+
+    python -m benchmarks.bm_departures [--clips CLIP ...] [--iterations 800] [--seeds 1] [--only NAME ...]
+
+A row per run goes to docs/results/departures.csv as soon as it is measured; runs that have a row are not repeated, so
+an interrupted command goes on, and a file that is moved away is measured anew. Then the table and the picture of
+docs/method.md and the lines "Gain" of worker/methods/fast.py are written from the rows.
+
+The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
+of preparing and training, all cores together, without scoring. Early stopping alone is measured in runs of
+STOPPING_ITERATIONS planned iterations, with it and without. A clip that is not there is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import re
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import torch
+
+from benchmarks.pages.markdown import origin, table
+from contract.wire.errors import InputError
+from contract.wire.options import ReconstructionOptions
+from worker.evaluate.rows import commit, machine
+from worker.evaluate.sources import open_source, source_of
+from worker.evaluate.style import FAINT, GREY, PNG_DPI, SETTINGS
+from worker.input.clip import DepthClip, split_frames
+from worker.machine.hooks import Hooks
+from worker.methods.fast import DEPARTURES, FAST, fast_without
+from worker.methods.method import Preset
+from worker.methods.paper import PAPER
+from worker.raster.cpu import compile_kernels
+from worker.train.hooks import TrainingHooks
+from worker.train.loop import train
+from worker.train.prepare import prepare
+from worker.train.schedule import Schedule
+from worker.train.scoring import HeldOutScore, held_out_score
+from worker.train.setup import Setup
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+CSV = REPOSITORY / "docs" / "results" / "departures.csv"
+PAGE = REPOSITORY / "docs" / "method.md"
+PICTURE = REPOSITORY / "docs" / "images" / "departures.png"
+METHOD = REPOSITORY / "worker" / "methods" / "fast.py"
+BEGIN, END = "<!-- departures: written by benchmarks/bm_departures.py -->", "<!-- end of departures -->"
+HOLDOUT = "every8"
+STOPPING, STOPPED = "early stopping", "fast, stopping early"
+STOPPING_ITERATIONS = 2000
+"""Long enough for three cycles on a clip of 96 frames: two scores of validation frames, and a cycle that is spared."""
+OF_TWO_EYES = ("both eyes", "gloss")
+"""Departures that change nothing on a clip of one eye."""
+UNMEASURED = ("budget in seconds",)
+"""It says when training ends and changes no step."""
+KEY = ("run", "clip", "iterations", "seed")
+FIELDS = (
+    *KEY, "psnr_tissue_db", "psnr_right_db", "cpu_s", "seconds", "gaussians", "bases", "load_1min", "machine", "commit",
+)  # fmt: skip
+
+Row = Mapping[str, str]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=["d4d_stereo", "phantom:pull"])
+    parser.add_argument("--iterations", type=int, default=800)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--only", nargs="*", choices=[each.name for each in DEPARTURES], help="these departures alone")
+    parser.add_argument("--csv", type=Path, default=CSV)
+    options = parser.parse_args()
+    os.environ.setdefault("INTRASPLAT_DATA", str(REPOSITORY.parent / "shared" / "data"))
+    torch.set_num_threads(1)  # as in a reconstruction: the kernels have threads of their own
+    names = options.only or [each.name for each in DEPARTURES]
+    for argument in options.clips:
+        try:
+            source = source_of(argument)
+        except InputError as error:
+            print(f"{argument} is left out: {error}")
+            continue
+        clip: DepthClip | None = None
+        for run in planned(names, options.iterations, options.seeds):
+            if key_of(run, source.name) in {tuple(row[name] for name in KEY) for row in read(options.csv)}:
+                continue
+            if clip is None:
+                clip = open_source(source, HOLDOUT, Hooks()).clip
+                compile_kernels()
+            if run.name in OF_TWO_EYES and clip.right is None:
+                continue
+            row = dict(zip(KEY, key_of(run, source.name), strict=True)) | measure(run, clip)
+            append(options.csv, row)
+            print("  ".join(f"{name} {row[name]}" for name in FIELDS[:-2]), flush=True)
+    if options.csv == CSV:
+        write_all(read(CSV))
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One training: its name in rows, the preset, how long, whether it may stop early."""
+
+    name: str
+    preset: Preset
+    iterations: int
+    seed: int
+    stops_early: bool = False
+
+
+def planned(names: Iterable[str], iterations: int, seeds: int) -> list[PlannedRun]:
+    """The runs that the gains of these departures are made of."""
+    runs = []
+    for seed in range(seeds):
+        runs += [PlannedRun("fast", FAST, iterations, seed), PlannedRun("paper", PAPER, iterations, seed)]
+        for name in names:
+            if name == STOPPING:
+                runs.append(PlannedRun(STOPPED, FAST, STOPPING_ITERATIONS, seed, stops_early=True))
+                runs.append(PlannedRun(name, fast_without(name), STOPPING_ITERATIONS, seed))
+            elif name not in UNMEASURED:
+                runs.append(PlannedRun(name, fast_without(name), iterations, seed))
+    return runs
+
+
+def key_of(run: PlannedRun, clip_name: str) -> tuple[str, ...]:
+    """The values of KEY of the run's row."""
+    return run.name, clip_name, str(run.iterations), str(run.seed)
+
+
+def measure(run: PlannedRun, clip: DepthClip) -> dict[str, object]:
+    """Train and score; the values of the row."""
+    load, started_s, scoring_s = os.getloadavg()[0], time.process_time(), 0.0
+    options = ReconstructionOptions(iterations=run.iterations, seed=run.seed)
+    training = prepare(Setup(clip, split_frames(clip, HOLDOUT), run.preset, options))
+    if run.stops_early:
+        training.schedule = Schedule(
+            run.iterations, run.preset.warm_restarts, run.preset.min_gain_db, training.steps_an_epoch
+        )
+
+    def score() -> HeldOutScore:
+        nonlocal scoring_s
+        before_s = time.process_time()
+        found = held_out_score(training)
+        scoring_s += time.process_time() - before_s
+        return found
+
+    train(training, training.setup.clock, score, TrainingHooks())
+    cpu_s, seconds = time.process_time() - started_s - scoring_s, training.setup.clock.elapsed_s
+    reached = training.curve[-1]
+    right_db = "" if reached.psnr_right_db is None else round(reached.psnr_right_db, 3)
+    return {
+        "psnr_tissue_db": round(reached.psnr_tissue_db, 3),
+        "psnr_right_db": right_db,
+        "cpu_s": round(cpu_s, 1),
+        "seconds": round(seconds, 1),
+        "gaussians": training.model.count,
+        "bases": training.model.export()[1].bases,
+        "load_1min": round(load, 1),
+        "machine": machine(),
+        "commit": commit(),
+    }
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV; none if there is no file."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(path: Path, row: Mapping[str, object]) -> None:
+    """Add the row to the CSV, with a header if the file is new; a file of other columns is refused."""
+    fresh = not path.exists()
+    if not fresh and path.read_text().splitlines()[:1] != [",".join(FIELDS)]:
+        raise SystemExit(f"{path} has other columns than {', '.join(FIELDS)}: move it away first.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a departure is worth on a clip: medians over the seeds of `fast` less `fast` without it."""
+
+    left_db: float
+    right_db: float | None
+    cpu_s: float
+
+    def __str__(self) -> str:
+        right = "" if self.right_db is None else f" (right eye {self.right_db:+.2f})"
+        return f"{self.left_db:+.2f} dB{right}, {self.cpu_s:+.0f} s"
+
+
+def gains_of(rows: Sequence[Row], clip: str) -> dict[str, Gain]:
+    """The gains on a clip by departure; those without rows are left out."""
+    found = {}
+    for departure in DEPARTURES:
+        name = departure.name
+        with_it = [row for row in rows if (row["run"], row["clip"]) == (STOPPED if name == STOPPING else "fast", clip)]
+        pairs = [
+            (one, other)
+            for one in with_it
+            for other in rows
+            if (other["run"], *(other[key] for key in KEY[1:])) == (name, *(one[key] for key in KEY[1:]))
+        ]
+        if pairs:
+            by_figure = {
+                figure: [float(one[figure]) - float(other[figure]) for one, other in pairs if one[figure]]
+                for figure in ("psnr_tissue_db", "psnr_right_db", "cpu_s")
+            }
+            right = by_figure["psnr_right_db"]
+            found[name] = Gain(
+                median(by_figure["psnr_tissue_db"]), median(right) if right else None, median(by_figure["cpu_s"])
+            )
+    return found
+
+
+def clips_of(rows: Sequence[Row]) -> list[str]:
+    """The clips of the rows, in their order."""
+    return list(dict.fromkeys(row["clip"] for row in rows))
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """The table of docs/method.md: a row per departure, and `paper` and `fast` themselves below."""
+    clips = clips_of(rows)
+    gains = {clip: gains_of(rows, clip) for clip in clips}
+    header = ["departure", *(f"{clip}: {each}" for clip in clips for each in ("dB", "right eye, dB", "s"))]
+    cells = []
+    for departure in DEPARTURES:
+        line = [departure.name]
+        for clip in clips:
+            gain = gains[clip].get(departure.name)
+            right = None if gain is None else gain.right_db
+            line += ["–", "–", "–"] if gain is None else [f"{gain.left_db:+.2f}", "–", f"{gain.cpu_s:+.0f}"]
+            line[-2] = "–" if right is None else f"{right:+.2f}"
+        cells.append(line)
+    length = next(row["iterations"] for row in rows if row["run"] == "fast")
+    for name in ("fast", "paper"):
+        line = [f"`{name}` after {length} iterations"]
+        for clip in clips:
+            own = [row for row in rows if (row["run"], row["clip"]) == (name, clip)]
+            for figure, digits in (("psnr_tissue_db", 2), ("psnr_right_db", 2), ("cpu_s", 0)):
+                known = [float(row[figure]) for row in own if row[figure]]
+                line.append(f"{median(known):.{digits}f}" if known else "–")
+        cells.append(line)
+    return table(header, cells) + origin([dict(row) for row in rows])
+
+
+def with_gains(source: str, rows: Sequence[Row]) -> str:
+    """The text of fast.py with a line "Gain" above every departure that has rows, and none above the others."""
+    gains = {clip: gains_of(rows, clip) for clip in clips_of(rows)}
+    text = re.sub(r"    # Gain: .*\n", "", source)
+
+    def line(found: re.Match[str]) -> str:
+        measured = [f"{clip} {gains[clip][found[1]]}" for clip in gains if found[1] in gains[clip]]
+        return f"    # Gain: {'; '.join(measured)}.\n{found[0]}" if measured else found[0]
+
+    return re.sub(r'    Departure\(\s*"([^"]+)"', line, text)
+
+
+def with_table(page: str, rows: Sequence[Row]) -> str:
+    """The text of docs/method.md with the table of the rows between its markers."""
+    before, _, rest = page.partition(BEGIN)
+    return f"{before}{BEGIN}\n{table_of(rows)}\n{END}{rest.partition(END)[2]}"
+
+
+def write_all(rows: Sequence[Row]) -> None:
+    """The table of docs/method.md, its picture, and the lines of fast.py; prints those that changed."""
+    METHOD.write_text(with_gains(METHOD.read_text(), rows))
+    PAGE.write_text(with_table(PAGE.read_text(), rows))
+    draw(rows, PICTURE)
+    for clip in clips_of(rows):
+        for name, gain in gains_of(rows, clip).items():
+            print(f"{clip}: {name}: {gain}")
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Bars of every departure's gain in dB on each clip, in the order of fast.py."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    clips = clips_of(rows)
+    gains = {clip: gains_of(rows, clip) for clip in clips}
+    names = [each.name for each in DEPARTURES if any(each.name in gains[clip] for clip in clips)]
+    colours = ("#0072B2", "#E69F00", "#009E73")
+    with matplotlib.rc_context(SETTINGS | {"axes.grid.axis": "x"}):
+        figure = Figure(figsize=(7.0, 0.36 * len(names) + 1.1), layout="constrained")
+        axes = figure.subplots()
+        height = 0.8 / len(clips)
+        for place, clip in enumerate(clips):
+            shown = [(line, gains[clip][name].left_db) for line, name in enumerate(names) if name in gains[clip]]
+            at = [line + (place - (len(clips) - 1) / 2) * height for line, _ in shown]
+            axes.barh(at, [gain_db for _, gain_db in shown], height, color=colours[place % 3], label=clip)
+        axes.axvline(0, color=GREY, linewidth=0.8)
+        axes.set_yticks(range(len(names)), names)
+        axes.invert_yaxis()
+        axes.set_xlabel("gain of the departure on held-out frames, dB (left eye)")
+        axes.legend(loc="lower right", frameon=True, edgecolor=FAINT)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    main()
