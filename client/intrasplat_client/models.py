@@ -624,18 +624,7 @@ class GivenOptions(TypedDict, total=False):
     """axes of poses_bounds.npy"""
     holdout: Annotated[str, Field(max_length=8000, pattern="^(every8|blocks8|none|\\d{1,6}(,\\d{1,6})*)$")] | list[int]
     """frames to measure quality on, never to train on: every8, blocks8, none, or frame numbers such as 1,9,17"""
-    preset: Literal[
-        "instant",
-        "fast",
-        "quality",
-        "small",
-        "paper",
-        "paper-released",
-        "paper-wide",
-        "pfs",
-        "hexplane",
-        "without_mapf",
-    ]
+    preset: Literal["instant", "fast", "quality", "small", "paper"]
     """instant, fast, quality and small are ours; paper is the method as published"""
     eyes: Literal["left", "both"]
     """the eyes of a stereo clip that our presets train on; with left, the right eye only judges"""

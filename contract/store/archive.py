@@ -21,9 +21,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar
+from typing import Annotated, Any, BinaryIO, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 from contract.intake.limits import ClipLimits
 from contract.intake.nesting import nesting
@@ -31,7 +31,18 @@ from contract.intake.zips import UNREADABLE, open_zip
 from contract.runtime.version import version
 from contract.store.zipped import zip_parts
 from contract.wire.errors import InputError, LimitError, SceneError
-from contract.wire.names import CURVE, JOB_ID_PATTERN, MANIFEST, MASKS, RECORDED, REPORT, SCENE, THUMBNAIL, PresetName
+from contract.wire.names import (
+    CURVE,
+    JOB_ID_PATTERN,
+    LABORATORY_PRESETS,
+    MANIFEST,
+    MASKS,
+    RECORDED,
+    REPORT,
+    SCENE,
+    THUMBNAIL,
+    PresetName,
+)
 from contract.wire.report import Report, VersionText
 
 FIELD = "scene"
@@ -76,6 +87,13 @@ class ArchiveHead(BaseModel):
     files: dict[str, ArchivedFile]
 
 
+def _offered(preset: object) -> object:
+    """The preset. ValueError if it is one of the laboratory's."""
+    if preset in LABORATORY_PRESETS:
+        raise ValueError(f"{preset} is a variant of the laboratory, and services take in no scene of it")
+    return preset
+
+
 class ManifestHead(BaseModel):
     """What the service needs of a scene's manifest; the worker reads all of it."""
 
@@ -83,7 +101,7 @@ class ManifestHead(BaseModel):
 
     format: Literal["intrasplat-scene"]
     version: int
-    preset: PresetName
+    preset: Annotated[PresetName, BeforeValidator(_offered)]
 
 
 @dataclass(frozen=True)

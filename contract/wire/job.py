@@ -7,12 +7,12 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from contract.wire.codes import known_code
 from contract.wire.errors import ErrorCode
 from contract.wire.labels import Labels
-from contract.wire.names import JOB_ID_PATTERN
+from contract.wire.names import JOB_ID_PATTERN, LABORATORY_PRESETS
 from contract.wire.options import JobOptions
 from contract.wire.report import Imported
 
@@ -96,6 +96,16 @@ class JobError(BaseModel):
     remedy: str | None = None
 
 
+def _offered(options: object) -> object:
+    """A stored record's options, with `paper` in place of a variant of it that this version does not offer.
+
+    So the jobs and scenes of an older version can still be listed and deleted.
+    """
+    if isinstance(options, dict) and options.get("preset") in LABORATORY_PRESETS:
+        return {**options, "preset": "paper"}
+    return options
+
+
 class JobRecord(BaseModel):
     """All that is known of a job; the queue holds it, and it alone is the truth about the state. Times are UNIX s."""
 
@@ -103,7 +113,7 @@ class JobRecord(BaseModel):
 
     job_id: str = Field(pattern=JOB_ID_PATTERN)
     state: JobState = JobState.QUEUED
-    options: JobOptions = JobOptions()
+    options: Annotated[JobOptions, BeforeValidator(_offered)] = JobOptions()
     labels: Labels = Labels()
     files: JobFiles
     tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)

@@ -9,11 +9,12 @@ from typing import Literal
 JOB_ID_PATTERN = r"^[0-9a-f]{32}$"
 """Job ids are made by the service, never by a caller, so they are safe as file names and key parts."""
 
-PresetName = Literal[
-    "instant", "fast", "quality", "small", "paper", "paper-released", "paper-wide", "pfs", "hexplane", "without_mapf"
-]
-"""instant, fast, quality and small are ours; paper is the published method as published; the others are compared with
-it (worker/train/presets.py)."""
+PresetName = Literal["instant", "fast", "quality", "small", "paper"]
+"""instant, fast, quality and small are ours; paper is the published method as published (worker/methods)."""
+
+LABORATORY_PRESETS = ("paper-released", "paper-wide", "pfs", "hexplane", "without_mapf")
+"""Variants of paper that versions before 0.3 took in requests. Only the laboratory trains them now
+(worker/evaluate/variants)."""
 
 BUDGETS_S: Mapping[PresetName, float] = {"instant": 5.5, "fast": 60.0, "quality": 240.0, "small": 30.0}
 """Seconds of training of our presets, where nothing else is asked for."""

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -16,11 +15,10 @@ import pytest
 import torch
 
 from contract.runtime.exits import ExitCode
-from contract.wire.names import CURVE, RECORDED, REPORT, PresetName
+from contract.wire.names import CURVE, RECORDED, REPORT
 from contract.wire.notices import NoticeCode
 from contract.wire.report import Report
 from worker.__main__ import main
-from worker.methods.registry import PRESETS
 from worker.scene.resume_file import RESUME_FILE, load_resume
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 10
@@ -240,7 +238,3 @@ def test_consume_without_a_queue_says_what_to_do(
     monkeypatch.delenv("REDIS_URL", raising=False)
     assert main(["consume"]) == ExitCode.UNAVAILABLE
     assert "intrasplat up" in capsys.readouterr().err
-
-
-def test_the_contract_names_the_presets_that_there_are() -> None:
-    assert set(get_args(PresetName)) == set(PRESETS)

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from contract.wire.errors import Cancelled, InputError, SceneError, TrainingDiverged, UnavailableError
-from contract.wire.names import KEPT, MANIFEST, RECORDED, REPORT, RESUME
+from contract.wire.names import KEPT, LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME
 from contract.wire.notices import NoticeCode
 from contract.wire.options import ReconstructionOptions, parse_options
 from contract.wire.rendering import RecordedMasks
@@ -109,6 +109,8 @@ def run(clip: Path, out: Path, hooks: TrainingHooks | None = None, **options: An
 
 def request(clip: Path, **options: Any) -> ReconstructionRequest:
     options = {"iterations": ITERATIONS, **options}
+    if options.get("preset") in LABORATORY_PRESETS:
+        options["preset"] = PRESETS[options["preset"]]
     if isinstance(options.get("preset"), Preset):
         options["own_preset"] = options.pop("preset")
     fields = {field.name for field in dataclasses.fields(ReconstructionRequest)}

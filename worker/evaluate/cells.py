@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from contract.wire.errors import InputError
-from contract.wire.names import Eyes
+from contract.wire.names import LABORATORY_PRESETS, Eyes
 from contract.wire.options import ReconstructionOptions, parse_options
 from worker.evaluate.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS
 from worker.methods.method import Preset
@@ -109,19 +109,24 @@ def plan(
 
 def options_of(cell: Cell) -> ReconstructionOptions:
     """The options of the cell's reconstruction. The preset is named only if the series changes none of its values; a
-    rival gets the frames of the published method, whatever its budget.
+    rival and a variant of `paper` get the frames of the published method, whatever their budget.
 
     Raises:
         InputError: no reconstruction takes one of them.
     """
     preset = {}
-    if is_rival_system(cell.series):
+    if is_rival_system(cell.series) or cell.series in LABORATORY_PRESETS:
         preset = {"preset": PUBLISHED}
     elif not is_changed(cell.series):
         preset = {"preset": preset_of(cell.series).name}
     length = {"budget_s": cell.budget_s, "iterations": cell.iterations}
     chosen = {"holdout": cell.holdout, "seed": cell.seed, EYES: eyes_of(cell.series)}
     return parse_options(ReconstructionOptions, {**chosen, **length, **preset})
+
+
+def own_preset_of(series: str) -> Preset | None:
+    """The preset that trains in place of the one in options_of; None if that one trains. Raises as preset_of."""
+    return preset_of(series) if is_changed(series) or series in LABORATORY_PRESETS else None
 
 
 def preset_of(series: str) -> Preset:

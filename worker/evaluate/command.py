@@ -23,6 +23,7 @@ from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Results, adding_alone, write_rows
 from worker.evaluate.sources import PHANTOM_SPELLING, source_of
 from worker.evaluate.summary import SUMMARY_FIELDS, Sooner, capacities, groups_of, orderings, sooner
+from worker.evaluate.variants import register_variants
 from worker.machine.hooks import Progress
 from worker.raster.backend import choose_device
 from worker.train.hooks import TrainingHooks
@@ -85,6 +86,7 @@ def run_cli(options: argparse.Namespace) -> int:
             this machine lacks; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
+    register_variants()
     out: Path = options.out
     if options.redraw == bool(options.clips):
         remedy = "Name one or more clips, or say --redraw alone."

@@ -24,7 +24,7 @@ from contract.runtime.exits import flag_of
 from contract.wire.errors import InputError
 from contract.wire.names import CURVE, REPORT, DeviceName
 from contract.wire.report import Report
-from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_changed, is_rival_system, options_of, preset_of
+from worker.evaluate.cells import BOTH_EYES, Cell, eyes_of, is_rival_system, options_of, own_preset_of
 from worker.evaluate.right_eye import right_eye_ranks
 from worker.evaluate.rivals import RAY_BY_RAY, RIVAL_SYSTEMS, scored_step_px
 from worker.evaluate.rivals.run import Length, Make, RivalCandidate, every_core, run_rival
@@ -116,7 +116,7 @@ class Bench:
         request = ReconstructionRequest(
             clip=opened.clip,
             options=options_of(cell),
-            own_preset=preset_of(cell.series) if is_changed(cell.series) else None,
+            own_preset=own_preset_of(cell.series),
             device=self.device,
             accepted_at_s=time.time() - sum(opened.seconds.values()),
         )

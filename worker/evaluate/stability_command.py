@@ -18,6 +18,7 @@ from worker.evaluate.conditions import CONDITIONS, SEVERITIES
 from worker.evaluate.rivals import RIVAL_SYSTEMS
 from worker.evaluate.rows import Row, adding_alone, read_rows
 from worker.evaluate.stability import STABILITY, Grid, StabilityBench, StabilityCell, plan
+from worker.evaluate.variants import register_variants
 from worker.train.hooks import TrainingHooks
 
 DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
@@ -62,6 +63,7 @@ def run_cli(options: argparse.Namespace) -> int:
         UnavailableError: this machine lacks something; what was measured until then is kept.
         Cancelled: a signal came; what was measured until then is kept.
     """
+    register_variants()
     out: Path = options.out
     if not options.redraw:
         width, height = options.size

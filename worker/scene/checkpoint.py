@@ -23,7 +23,7 @@ from contract.store.durable import FOR_ALL, replace_file
 from contract.wire.errors import SceneError
 from contract.wire.names import MANIFEST, SCENE
 from worker.input.camera import Intrinsics
-from worker.model.deformation import Deformation, restore
+from worker.model.deformation import MOTIONS, Deformation, restore
 from worker.model.gaussians import Gaussians
 from worker.scene.compact import unpack
 from worker.scene.files import dtype_name, parse_tensors, read_file
@@ -90,6 +90,7 @@ def load_scene(directory: Path) -> Scene:
             range.
     """
     manifest = _read_manifest(directory / MANIFEST_FILE)
+    _check_motion(manifest.get("deformation"), directory)
     try:
         data = {name: _read_checked(directory / _plain(name), expected) for name, expected in manifest["files"].items()}
         tensors = parse_tensors(data[SCENE_FILE], directory / SCENE_FILE)
@@ -114,6 +115,16 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             "Reconstruct the clip again, or use the version of intrasplat that wrote the scene."
         )
     return manifest
+
+
+def _check_motion(kind: object, directory: Path) -> None:
+    """Raise SceneError if no motion of this kind is registered."""
+    if isinstance(kind, str) and kind not in MOTIONS:
+        raise SceneError(
+            f"The scene in {directory} has the motion {kind!r}; this program knows {', '.join(MOTIONS)}. A motion of "
+            "the laboratory is known after register_variants() of worker.evaluate.variants, any other after "
+            "register_motion() of worker.model.deformation."
+        )
 
 
 def _read_checked(path: Path, expected: dict[str, Any]) -> bytes:

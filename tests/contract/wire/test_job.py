@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,8 @@ from contract.wire.job import (
     JobView,
     sources_of,
 )
-from contract.wire.options import JobOptions
+from contract.wire.names import LABORATORY_PRESETS
+from contract.wire.options import JobOptions, parse_options
 
 PROGRESS = JobProgress(stage="train", fraction=0.25, iteration=50, iterations=200, psnr_db=31.237, seconds_left=42.4)
 
@@ -134,3 +136,15 @@ def test_a_log_file_gets_one_line_a_stage() -> None:
         for stage in ("stereo", "stereo", "train", "train"):
             bar.show(JobProgress(stage=stage, fraction=0.5))
     assert log.getvalue() == "stereo\ntrain\n"
+
+
+@pytest.mark.parametrize("preset", LABORATORY_PRESETS)
+def test_a_variant_of_paper_is_not_offered_but_a_job_that_asked_for_one_is_still_read(preset: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_options(JobOptions, {"preset": preset})
+    assert refused.value.field == "options.preset"
+    record = JobRecord(job_id="0" * 32, files=JobFiles(clip="clip.mp4"), created_at_s=1.0)
+    stored = json.loads(record.model_dump_json())
+    stored["options"] |= {"preset": preset, "seed": 7}
+    read = JobRecord.model_validate_json(json.dumps(stored))
+    assert (read.options.preset, read.options.seed) == ("paper", 7)

@@ -7,6 +7,8 @@ import hashlib
 import json
 import math
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +105,28 @@ def test_one_flipped_bit_is_found(tmp_path: Path, place: int) -> None:
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("kind", ["fdm-quartic", "pfs", "hexplane"])
+def test_a_scene_of_a_variant_is_refused_with_the_laboratory_that_knows_it(tmp_path: Path, kind: str) -> None:
+    save_scene(tmp_path, random_scene(kind))
+    program = f"""
+from pathlib import Path
+from contract.wire.errors import SceneError
+from worker.scene.checkpoint import load_scene
+try:
+    load_scene(Path({str(tmp_path)!r}))
+except SceneError as error:
+    print(error)
+from worker.evaluate.variants import register_variants
+register_variants()
+print(load_scene(Path({str(tmp_path)!r})).deformation.kind)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
+    refused, loaded = done.stdout.splitlines()
+    assert kind in refused
+    assert "register_variants() of worker.evaluate.variants" in refused
+    assert loaded == kind
+
+
 @pytest.mark.parametrize("missing", [SCENE_FILE, MANIFEST_FILE])
 def test_a_missing_file_is_named(tmp_path: Path, missing: str) -> None:
     save_scene(tmp_path, random_scene())
@@ -117,7 +141,7 @@ def test_a_missing_file_is_named(tmp_path: Path, missing: str) -> None:
         ({"version": 99}, "version 99"),
         ({"version": 1}, "has format version 1; this program reads version 2. Reconstruct the clip again"),
         ({"format": "other"}, "not the manifest of a scene"),
-        ({"deformation": "wavelets"}, "wavelets"),
+        ({"deformation": "wavelets"}, "motion 'wavelets'.*register_motion"),
         ({"deformation": "fdm-gaussian"}, "must share one shape"),
         ({"deformation": "pfs"}, "do not make a pfs"),
         ({"tensors": {}}, "gaussians.mean"),

@@ -145,6 +145,8 @@ def with_header(header: bytes) -> Callable[[Files], Files]:
 STILL = np.eye(4).tolist()
 SPOILT: dict[str, tuple[Callable[[Files], Files], str]] = {
     "another version": (with_manifest(version=99), "format version 99"),
+    "an unknown motion": (with_manifest(deformation="wavelets"), "motion 'wavelets'"),
+    "a variant": (with_manifest(preset="hexplane"), "hexplane is a variant of the laboratory"),
     "another coding": (with_manifest(coding="zip"), "coding"),
     "more Gaussians": (with_manifest(gaussians=51), "Gaussians"),
     "no tensors listed": (with_manifest(tensors={}), "not those its manifest lists"),

@@ -33,7 +33,6 @@ _DEPARTURES = (
     Departure("hexplane", {"deformation": HexPlane.kind, "bases": 0, "start_width": None}),
     Departure("without_mapf", {"fusion": FusionSettings(mode="reference_only")}),
 )
-VARIANT_NAMES = tuple(each.name for each in _DEPARTURES)
 
 
 def register_variants() -> Mapping[str, Preset]:

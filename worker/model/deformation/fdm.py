@@ -37,7 +37,7 @@ class FlexibleDeformation(Deformation):
 
     has_kernels: ClassVar[bool] = True
     quartic: ClassVar[bool]
-    """Which of the two forms of b_j it is, for the kernels."""
+    """Which form of b_j the kernels compute; the quartic one is that of the released code (docs/deformation.md)."""
 
     def __post_init__(self) -> None:
         shapes = {tuple(each.shape) for each in self.parameters().values()}

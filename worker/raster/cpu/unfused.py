@@ -1,4 +1,4 @@
-"""The motion of a deformation without kernels of its own (`hexplane`): torch moves the Gaussians and differentiates.
+"""The motion of a deformation without kernels of its own: torch moves the Gaussians and differentiates.
 
 The rest of a step is that of every motion, so two deformations compared with each other differ in nothing else. Only
 the time of a step is not comparable: tables of speed must say so.
