@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from typing import get_args
 
 import pytest
 
 from contract.wire.errors import InputError
+from contract.wire.names import LABORATORY_PRESETS, PresetName
+from tests.worker.methods.literals import LITERALS
 from worker.methods.method import Preset
-from worker.methods.registry import PRESETS, preset_named
+from worker.methods.registry import PRESETS, preset_named, register_presets
 from worker.model.optimize import Rate
 
-VARIANTS = {
+VARIANTS = {  # and what they change of `paper`
     "paper-released": {"deformation"},
     "paper-wide": {"start_width"},
     "pfs": {"deformation", "start_width"},
@@ -20,12 +25,27 @@ VARIANTS = {
 }
 
 
+OFFERED = get_args(PresetName)
+
+
 def differing(one: Preset, other: Preset) -> set[str]:
     names = {field.name for field in dataclasses.fields(Preset)} - {"name"}
     return {name for name in names if getattr(one, name) != getattr(other, name)}
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("literal", LITERALS, ids=lambda preset: preset.name)
+def test_a_preset_has_the_numbers_it_had_before_it_was_made_of_departures(literal: Preset) -> None:
+    assert PRESETS[literal.name] == literal
+    assert repr(PRESETS[literal.name]) == repr(literal), "a stopped run is resumed by the text of its preset"
+
+
+def test_the_contract_offers_these_presets_and_the_laboratory_adds_its_variants() -> None:
+    assert tuple(literal.name for literal in LITERALS) == OFFERED
+    assert tuple(PRESETS) == (*OFFERED, *LABORATORY_PRESETS)
+    assert tuple(VARIANTS) == LABORATORY_PRESETS
+
+
+@pytest.mark.parametrize("name", OFFERED)
 def test_a_preset_is_found_under_its_own_name(name: str) -> None:
     assert preset_named(name).name == name
 
@@ -38,7 +58,7 @@ def test_an_unknown_preset_is_refused_with_those_there_are() -> None:
     assert all(name in refused.value.remedy for name in PRESETS)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", [*OFFERED, *VARIANTS])
 def test_a_preset_has_a_length_of_its_own(name: str) -> None:
     preset = PRESETS[name]
     assert (preset.iterations is None) != (preset.budget_s is None)
@@ -115,3 +135,28 @@ def test_presets_cannot_be_changed_by_accident() -> None:
         PRESETS["fast"].bases = 3  # type: ignore[misc]
     with pytest.raises(TypeError):
         PRESETS["mine"] = PRESETS["fast"]  # type: ignore[index]
+
+
+def test_a_preset_is_registered_once_and_again_but_no_other_under_its_name() -> None:
+    before = dict(PRESETS)
+    register_presets(PRESETS["fast"], PRESETS["hexplane"])
+    with pytest.raises(ValueError, match="another preset 'fast'"):
+        register_presets(dataclasses.replace(PRESETS["fast"], opacity=0.5))
+    assert before == PRESETS
+
+
+def test_a_process_knows_the_variants_only_after_they_are_registered() -> None:
+    program = """
+from worker.methods.registry import PRESETS
+from worker.model.deformation import MOTIONS
+print(*PRESETS, *MOTIONS)
+from worker.evaluate.variants import register_variants
+print(len(PRESETS), len(MOTIONS))
+register_variants()
+print(*PRESETS, *MOTIONS)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
+    before, imported, after = (line.split() for line in done.stdout.splitlines())
+    assert before == [*OFFERED, "fdm-gaussian", "shared"]
+    assert imported == [str(len(OFFERED)), "2"], "nothing happens at import"
+    assert after == [*OFFERED, *LABORATORY_PRESETS, "fdm-gaussian", "shared", "fdm-quartic", "pfs", "hexplane"]
