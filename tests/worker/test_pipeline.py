@@ -140,7 +140,7 @@ def stopping_after(iterations: int) -> TrainingHooks:
     return TrainingHooks(lambda progress: stages.add(progress.stage), should_stop)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", [*PRESETS, *LABORATORY_PRESETS])
 def test_every_preset_makes_a_scene_that_renders(name: str, whole: Whole) -> None:
     report, out = whole(name)
     assert files(out) == SCENE_FILES

@@ -15,6 +15,7 @@ from worker.evaluate.cells import (
     capacity_grid,
     expected_beside,
     options_of,
+    own_preset_of,
     plan,
     preset_of,
 )
@@ -134,3 +135,13 @@ def test_a_comparison_is_to_have_the_table_where_a_system_of_it_was_measured_and
     both = expected_beside({"quality", "lerplane"})
     assert set(both) == {*DEFAULT_SERIES, *TABLE_1}
     assert len(both) == len(set(both))
+
+
+def test_a_variant_of_paper_is_trained_as_a_preset_of_the_caller_on_the_frames_of_paper() -> None:
+    variant = Cell("clip", "hexplane", "every8", 0, budget_s=60.0)
+    assert options_of(variant).preset == "paper"
+    assert own_preset_of("hexplane") is PRESETS["hexplane"]
+    assert own_preset_of("fast") is None
+    changed = own_preset_of("fast:bases=9")
+    assert changed is not None
+    assert changed.bases == 9

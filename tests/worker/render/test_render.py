@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from contract.wire.names import LABORATORY_PRESETS
 from contract.wire.notices import Notice, NoticeCode
 from tests.helpers import assert_close
 from tests.worker.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view
@@ -215,7 +216,7 @@ def test_a_view_of_nothing_is_empty_and_says_so(scene: Scene) -> None:
     assert NoticeCode.UNSEEN in [warning.code for warning in frame.warnings]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", [*PRESETS, *LABORATORY_PRESETS])
 def test_a_stored_scene_renders_as_the_model_did(preset: str, tmp_path: Path) -> None:
     run, scene = made(preset)
     save_scene(tmp_path, scene)

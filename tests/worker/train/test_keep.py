@@ -13,6 +13,7 @@ from contract.wire.errors import Cancelled, InputError
 from contract.wire.names import KEPT, PREPARED
 from contract.wire.options import ReconstructionOptions
 from worker.machine.hooks import Progress
+from worker.methods.registry import PRESETS
 from worker.phantom import PhantomSettings, make_phantom, write_stereo_video
 from worker.pipeline import make
 from worker.scene.checkpoint import load_scene
@@ -34,9 +35,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def request_of(clip: Path, preset: str = "fast", iterations: int = ITERATIONS) -> ReconstructionRequest:
-    options = ReconstructionOptions.model_validate({"preset": preset, "iterations": iterations})
     return ReconstructionRequest(
-        clip / "stereo.webm", options, calibration=clip / "calibration.json", masks=clip / "masks.zip"
+        clip / "stereo.webm",
+        ReconstructionOptions(iterations=iterations),
+        calibration=clip / "calibration.json",
+        masks=clip / "masks.zip",
+        own_preset=PRESETS[preset],
     )
 
 
@@ -95,7 +99,7 @@ def test_a_run_killed_at_any_time_goes_on_to_the_bits_of_an_unstopped_one(
 def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.train.presets.USUAL_BASES", 1)  # what a long clip has more of
+    monkeypatch.setattr("worker.methods.method.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(keep, "PERIOD_S", 0.0)
     monkeypatch.setattr(keep, "MAX_SHARE", 1e9)
     monkeypatch.setattr("worker.train.aside.LARGE_BYTES", 1 << 12)

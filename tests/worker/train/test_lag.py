@@ -138,7 +138,7 @@ def test_warming_up_leaves_a_model_as_it_was(name: str) -> None:
         assert torch.equal(values, before[key]), key
 
 
-@pytest.mark.parametrize("name", [name for name in PRESETS if name != "hexplane"])
+@pytest.mark.parametrize("name", [*PRESETS, "paper-released", "pfs"])
 def test_what_is_stored_of_a_model_holds_its_gaussians_and_no_padding(name: str) -> None:
     """So that a run stored on one device goes on on another, whose kernels pad otherwise."""
     model = prepared(phantom_clip(), name)[0].model
