@@ -4,7 +4,7 @@
 
 A row per run goes to docs/results/departures.csv as soon as it is measured; runs that have a row are not repeated, so
 an interrupted command goes on, and a file that is moved away is measured anew. Then the table and the picture of
-docs/method.md and the lines "Gain" of worker/methods/fast.py are written from the rows.
+docs/method.md and the lines "Gain" of worker/methods/fast.py are written from the rows; --redraw does only that.
 
 The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
 of preparing and training, all cores together, without scoring. Early stopping alone is measured in runs of
@@ -26,7 +26,7 @@ from statistics import median
 
 import torch
 
-from benchmarks.pages.markdown import origin, table
+from benchmarks.pages.markdown import number, origin, table
 from contract.wire.errors import InputError
 from contract.wire.options import ReconstructionOptions
 from worker.evaluate.rows import commit, machine
@@ -64,21 +64,26 @@ FIELDS = (
     *KEY, "psnr_tissue_db", "psnr_right_db", "cpu_s", "seconds", "gaussians", "bases", "load_1min", "machine", "commit",
 )  # fmt: skip
 
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#CC79A7", "#D55E00")
+BAR = 0.36
+"""The height of a bar; two stand beside each other."""
+
 Row = Mapping[str, str]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clips", nargs="+", default=["phantom:pull", "d4d_endonerf", "d4d_stereo"])
+    parser.add_argument("--clips", nargs="+", default=["phantom:pull", "d4d_endonerf:320x256", "d4d_stereo"])
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--only", nargs="*", choices=[each.name for each in DEPARTURES], help="these departures alone")
-    parser.add_argument("--csv", type=Path, default=CSV)
+    parser.add_argument("--csv", type=Path, default=CSV, help="other files change neither the page nor fast.py")
+    parser.add_argument("--redraw", action="store_true", help="measure nothing; write the page from the rows")
     options = parser.parse_args()
     os.environ.setdefault("INTRASPLAT_DATA", str(REPOSITORY.parent / "shared" / "data"))
     torch.set_num_threads(1)  # as in a reconstruction: the kernels have threads of their own
     names = options.only or [each.name for each in DEPARTURES]
-    for argument in options.clips:
+    for argument in [] if options.redraw else options.clips:
         try:
             source = source_of(argument)
         except InputError as error:
@@ -190,9 +195,19 @@ class Gain:
     right_db: float | None
     cpu_s: float
 
+    @property
+    def by_figure(self) -> Mapping[str, float | None]:
+        """The gains by the names of the rows' columns."""
+        return {"psnr_tissue_db": self.left_db, "psnr_right_db": self.right_db, "cpu_s": self.cpu_s}
+
     def __str__(self) -> str:
-        right = "" if self.right_db is None else f" (right eye {self.right_db:+.2f})"
-        return f"{self.left_db:+.2f} dB{right}, {self.cpu_s:+.0f} s"
+        right = "" if self.right_db is None else f" (right eye {signed(self.right_db, 2)})"
+        return f"{signed(self.left_db, 2)} dB{right}, {signed(self.cpu_s, 0)} s"
+
+
+def signed(value: float, digits: int) -> str:
+    """The value with its sign and so many digits."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}"  # adding 0.0 turns -0.0 into 0.0
 
 
 def gains_of(rows: Sequence[Row], clip: str) -> dict[str, Gain]:
@@ -226,27 +241,33 @@ def clips_of(rows: Sequence[Row]) -> list[str]:
 
 def table_of(rows: Sequence[Row]) -> str:
     """The table of docs/method.md: a row per departure, and `paper` and `fast` themselves below."""
-    clips = clips_of(rows)
-    gains = {clip: gains_of(rows, clip) for clip in clips}
-    header = ["departure", *(f"{clip}: {each}" for clip in clips for each in ("dB", "right eye, dB", "s"))]
+    columns = [
+        (clip, figure, unit, digits)
+        for clip in clips_of(rows)
+        for figure, unit, digits in (
+            ("psnr_tissue_db", "dB", 2),
+            ("psnr_right_db", "right eye, dB", 2),
+            ("cpu_s", "s", 0),
+        )
+        if any(row[figure] for row in rows if row["clip"] == clip)
+    ]
+    gains = {clip: gains_of(rows, clip) for clip in clips_of(rows)}
     cells = []
     for departure in DEPARTURES:
         line = [departure.name]
-        for clip in clips:
+        for clip, figure, _, digits in columns:
             gain = gains[clip].get(departure.name)
-            right = None if gain is None else gain.right_db
-            line += ["–", "–", "–"] if gain is None else [f"{gain.left_db:+.2f}", "–", f"{gain.cpu_s:+.0f}"]
-            line[-2] = "–" if right is None else f"{right:+.2f}"
+            value = None if gain is None else gain.by_figure[figure]
+            line.append("–" if value is None else signed(value, digits))
         cells.append(line)
     length = next(row["iterations"] for row in rows if row["run"] == "fast")
     for name in ("fast", "paper"):
         line = [f"`{name}` after {length} iterations"]
-        for clip in clips:
-            own = [row for row in rows if (row["run"], row["clip"]) == (name, clip)]
-            for figure, digits in (("psnr_tissue_db", 2), ("psnr_right_db", 2), ("cpu_s", 0)):
-                known = [float(row[figure]) for row in own if row[figure]]
-                line.append(f"{median(known):.{digits}f}" if known else "–")
+        for clip, figure, _, digits in columns:
+            own = [float(row[figure]) for row in rows if (row["run"], row["clip"]) == (name, clip) and row[figure]]
+            line.append(number(median(own) if own else None, digits))
         cells.append(line)
+    header = ["departure", *(f"{clip}: {unit}" for clip, _, unit, _ in columns)]
     return table(header, cells) + origin([dict(row) for row in rows])
 
 
@@ -279,26 +300,30 @@ def write_all(rows: Sequence[Row]) -> None:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Bars of every departure's gain in dB on each clip, in the order of fast.py."""
+    """Bars of every departure's gain in dB on each clip and eye, in the order of fast.py."""
     import matplotlib
     from matplotlib.figure import Figure
 
-    clips = clips_of(rows)
-    gains = {clip: gains_of(rows, clip) for clip in clips}
-    names = [each.name for each in DEPARTURES if any(each.name in gains[clip] for clip in clips)]
-    colours = ("#0072B2", "#E69F00", "#009E73")
+    bars: dict[str, dict[str, float]] = {}  # the gains in dB by departure, of each clip and eye
+    for clip in clips_of(rows):
+        for name, gain in gains_of(rows, clip).items():
+            bars.setdefault(clip, {})[name] = gain.left_db
+            if gain.right_db is not None:
+                bars.setdefault(f"{clip}, right eye", {})[name] = gain.right_db
+    names = [each.name for each in DEPARTURES if any(each.name in gains for gains in bars.values())]
     with matplotlib.rc_context(SETTINGS | {"axes.grid.axis": "x"}):
-        figure = Figure(figsize=(7.0, 0.36 * len(names) + 1.1), layout="constrained")
+        figure = Figure(figsize=(7.0, 0.3 * len(names) + 0.9), layout="constrained")
         axes = figure.subplots()
-        height = 0.8 / len(clips)
-        for place, clip in enumerate(clips):
-            shown = [(line, gains[clip][name].left_db) for line, name in enumerate(names) if name in gains[clip]]
-            at = [line + (place - (len(clips) - 1) / 2) * height for line, _ in shown]
-            axes.barh(at, [gain_db for _, gain_db in shown], height, color=colours[place % 3], label=clip)
+        for (label, gains), colour in zip(bars.items(), COLOURS, strict=False):
+            for line, name in enumerate(names):
+                beside = [other for other in bars if name in bars[other]]
+                if label in beside:
+                    at = line + (beside.index(label) - (len(beside) - 1) / 2) * BAR
+                    axes.barh(at, gains[name], BAR, color=colour, label=label if name == next(iter(gains)) else None)
         axes.axvline(0, color=GREY, linewidth=0.8)
         axes.set_yticks(range(len(names)), names)
-        axes.invert_yaxis()
-        axes.set_xlabel("gain of the departure on held-out frames, dB (left eye)")
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.set_xlabel("gain of the departure on held-out frames, dB")
         axes.legend(loc="lower right", frameon=True, edgecolor=FAINT)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=PNG_DPI, metadata={"Software": None})

@@ -3,7 +3,7 @@
     python -m benchmarks.pages
 
 Reads docs/results/{runs,curves}.csv, capacity/ and table1/ (of `intrasplat evaluate`), stability.csv (of `intrasplat
-stability`), {post,two-eyes,stereo_truth,confidence,ablation,raster,service,memory,long,poses,keyframes,masks}.csv,
+stability`), {post,two-eyes,stereo_truth,confidence,raster,service,memory,long,poses,keyframes,masks}.csv,
 off-axis.jpg, stereo.txt (the output of bm_stereo.py) and soak.txt (of bm_soak.py); what is missing is left out.
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from statistics import median
 
 from benchmarks.pages.evaluation import sections, write_readme
 from benchmarks.pages.gpu import gpu_sections
@@ -34,14 +33,6 @@ written by `python -m benchmarks.pages`. `d4d-a` is a real da Vinci recording (9
 rest), `surgt_raw` another of 10 raw frames, neither part of the project; the rest is synthetic. `psnr_tissue` is the
 honest score, `psnr_paper` what papers print ([conventions](../conventions.md)). The machines are shared and noisy: rows
 of runs have their load. A section holds for the commits it names; later ones may train or splat differently.
-"""
-_ABLATION = """
-## What each part of fast is worth
-
-`python benchmarks/bm_ablation.py --iterations 300 --csv docs/results/ablation.csv` ([ablation.csv](ablation.csv)):
-held-out psnr_tissue in dB after the same number of iterations, one part changed at a time. The synthetic clips are
-320x256, where the finest grid has 20 k points, so rows that name fewer points than `fast` equal its own there. More
-points gain where the picture is larger, and cost time and bytes in proportion. Runs as short as these are one cycle.
 """
 _RASTER = """
 ## Splatting on the CPU
@@ -119,8 +110,6 @@ def main() -> None:
     parts += [*confidence_sections(RESULTS), *measure_sections(RESULTS), *stability_sections(RESULTS)]
     if rows := _read(STABILITY):
         parts.append(origin(rows))
-    if rows := _latest(_read("ablation.csv"), "change", "clip", "holdout", "seed"):
-        parts += [_ABLATION, _ablation_table(rows), origin(rows)]
     if rows := _read("raster.csv"):
         parts += [_RASTER, _raster_table(rows)]
     if (RESULTS / "raster-scene.txt").exists():
@@ -150,27 +139,6 @@ def _read(name: str) -> list[Row]:
         return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _latest(rows: list[Row], *key: str) -> list[Row]:
-    """Of rows that were appended, the last of each key, so that no median mixes what two commits came to."""
-    return list({tuple(row[name] for name in key): row for row in rows}.values())
-
-
-def _ablation_table(rows: list[Row]) -> str:
-    columns = list(dict.fromkeys((row["clip"], row["holdout"]) for row in rows))
-    cells = []
-    for change in dict.fromkeys(row["change"] for row in rows):
-        scores = []
-        for clip, holdout in columns:
-            found = [
-                float(row["psnr_tissue_db"])
-                for row in rows
-                if (row["change"], row["clip"], row["holdout"]) == (change, clip, holdout)
-            ]
-            scores.append(f"{median(found):.2f}" if found else "–")
-        cells.append([change, *scores])
-    return table(["", *(f"{clip}, {holdout}" for clip, holdout in columns)], cells)
 
 
 def _raster_table(rows: list[Row]) -> str:

@@ -30,42 +30,54 @@ DEPARTURES = (
     #
     # A grid on the first frame; tissue that is hidden there comes from later frames (worker/fusion/fill.py). The paper
     # draws a tenth of the pixels at random.
+    # Gain: phantom-pull +1.01 dB, +3 s; d4d-a-320x256 +7.17 dB, +3 s.
     Departure(
         "grid of points",
         {"fusion": FusionSettings(mode="fill"), "points_per_image": MANY_POINTS, "points_by_budget": True},
     ),
     # The grid leaves no gaps, so nothing has to be split, and a step costs the same from first to last.
+    # Gain: phantom-pull +0.16 dB, +1 s; d4d-a-320x256 +0.86 dB, -1 s.
     Departure("no densification", {"densify": None}),
     #
     # Motion
     #
     # All Gaussians share the centres and widths of their bases (model/deformation/shared.py): a third of the numbers,
     # linear in them, so that tracks can start them.
+    # Gain: phantom-pull +2.61 dB, -7 s; d4d-a-320x256 +2.68 dB, -7 s.
     Departure("shared bases", {"deformation": SharedBasis.kind, "start_width": None}),
     # As many bases as the motion of the tracks needs, not 17 (worker/motion/capacity.py).
+    # Gain: phantom-pull +0.15 dB, +4 s; d4d-a-320x256 +0.30 dB, +1 s.
     Departure("bases by the scene", {"bases": None}, needs=("shared bases",)),
     # Optical flow gives every Gaussian its motion before the first step, by linear least squares
     # (worker/motion/tracks.py); the paper starts at rest.
+    # Gain: phantom-pull +1.94 dB, +7 s; d4d-a-320x256 +1.04 dB, +6 s.
     Departure("tracks", {"tracks": True}, needs=("shared bases",)),
     # The colour moves on the same bases, because the lamp moves with the camera and wet tissue glitters.
+    # Gain: phantom-pull +0.51 dB, +1 s; d4d-a-320x256 +0.67 dB, +0 s.
     Departure("moving colour", rates={"motion_colour": Rate(5e-2, 5e-3)}, needs=("shared bases",)),
     #
     # Start
     #
     # Opaque Gaussians of half the size show the first frame before the first step.
+    # Gain: phantom-pull +1.35 dB, -2 s; d4d-a-320x256 +4.77 dB, -3 s.
     Departure("opaque and small at the start", {"opacity": 0.9, "spread": 0.5}),
     # One colour for all directions: an endoscope sees tissue from too few directions to tell harmonics.
+    # Gain: phantom-pull +0.00 dB, +2 s; d4d-a-320x256 +0.00 dB, +1 s.
     Departure("no harmonics", {"sh_degree": 0, "sh_every": 0}, rates={"sh_rest": Rate(0.0)}),
     #
     # Steps
     #
     # Every frame once before any comes again, so that successive steps see frames from all over the clip.
+    # Gain: phantom-pull +0.14 dB, +2 s; d4d-a-320x256 +0.03 dB, +1 s.
     Departure("epochs", {"order": "epochs"}),
     # A step draws both eyes of its frame, from one motion (docs/decisions/030).
+    # Gain: d4d-a-stereo -0.89 dB (right eye +7.50), +42 s.
     Departure("both eyes", {"both_eyes": True}),
     # One number of each Gaussian says how much brighter the right eye sees it (docs/decisions/032).
+    # Gain: d4d-a-stereo +2.05 dB (right eye +2.29), +0 s.
     Departure("gloss", rates={"gloss": Rate(2e-2, 5e-3), "motion_gloss": Rate(2e-2, 2e-3)}, needs=("both eyes",)),
     # Motion learns up to thirty times faster: the published rates are made for 3000 steps (docs/decisions/005).
+    # Gain: phantom-pull +1.37 dB, +2 s; d4d-a-320x256 +2.29 dB, +1 s.
     Departure(
         "faster motion",
         rates={
@@ -75,6 +87,7 @@ DEPARTURES = (
         },
     ),
     # Colour and shape learn four to ten times faster, and all rates fall (docs/decisions/015).
+    # Gain: phantom-pull +0.08 dB, +3 s; d4d-a-320x256 +0.06 dB, +0 s.
     Departure(
         "faster colour and shape",
         rates={
@@ -86,18 +99,23 @@ DEPARTURES = (
         },
     ),
     # Adam forgets sooner (0.9 and 0.999 in the paper): what it remembers is about other frames (docs/decisions/015).
+    # Gain: phantom-pull +0.11 dB, +2 s; d4d-a-320x256 +0.51 dB, +0 s.
     Departure("short moments of Adam", rates={"beta1": 0.3, "beta2": 0.95}),
     # The slope of L1 does not fall with the error; Huber's loss lets steps shrink near the end (docs/decisions/015).
+    # Gain: phantom-pull +0.55 dB, +3 s; d4d-a-320x256 +0.77 dB, +0 s.
     Departure("Huber loss of colour", loss={"colour_huber_delta": 0.1}),
     # Depth is divided by alpha, so that a half-transparent surface is not taken for a near one (model/loss.py).
+    # Gain: phantom-pull -0.01 dB, +2 s; d4d-a-320x256 +0.41 dB, +0 s.
     Departure("mean depth", loss={"normalised_depth": True}),
     #
     # Schedule and end
     #
     # Rates rise again when the iterations have doubled, and the last models of each cycle are averaged
     # (worker/train/schedule.py), so that training may end after any cycle. An average needs Gaussians of one number.
+    # Gain: phantom-pull -0.08 dB, +3 s; d4d-a-320x256 -0.17 dB, +0 s.
     Departure("warm restarts and averages", {"warm_restarts": True}, needs=("no densification",)),
     # A run with a budget ends when doubling its iterations gained less on validation frames (docs/decisions/017).
+    # Gain: phantom-pull -0.15 dB, -19 s; d4d-a-320x256 -0.08 dB, +2 s.
     Departure("early stopping", {"min_gain_db": 0.25}, needs=("warm restarts and averages",)),
     # Seconds end a run, not iterations.
     Departure("budget in seconds", {"iterations": None, "budget_s": BUDGETS_S["fast"]}),
