@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict, Field
 
+MAX_RENDER_PIXELS = 8192 * 8192
+"""Largest picture that the library and the command line draw; a service has a limit of its own."""
 MAX_JUDGED_PIXELS = 1 << 21
 """A picture smaller than the recording is drawn in the recording's pixels, but at most so many (1920 x 1080)."""
 

@@ -27,7 +27,7 @@ from intrasplat.formats import EXPORT_FORMATS, check_export
 from intrasplat.machine.hooks import Progress, ignore, never
 from intrasplat.names import KEPT, MANIFEST, REPORT
 from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
-from intrasplat.picture import IntrinsicsOverride
+from intrasplat.picture import MAX_RENDER_PIXELS, IntrinsicsOverride
 from intrasplat.pipeline import reconstruct as run_pipeline
 from intrasplat.pose import MatrixPose, OrbitPose, parse_pose
 from intrasplat.recording import Clip, FilePath
@@ -42,8 +42,6 @@ from intrasplat.train.request import ReconstructionRequest
 from intrasplat.view.camera import camera_of, pose_of
 from intrasplat.view.frame import View
 from intrasplat.view.render import render_frame
-
-MAX_RENDER_PIXELS = 8192 * 8192
 
 
 class Scene:

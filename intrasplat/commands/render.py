@@ -13,7 +13,7 @@ from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
 from intrasplat.names import MANIFEST
-from intrasplat.picture import Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -22,7 +22,6 @@ SUFFIX_FORMATS = {
     ".webp": ImageFormat.WEBP,
     ".npy": ImageFormat.NPY,
 }
-MAX_RENDER_PIXELS = 8192 * 8192
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
