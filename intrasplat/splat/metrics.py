@@ -136,8 +136,8 @@ def _squared(
     first: Image, second: Image, chosen: NDArray[np.bool_], as_compared: Callable[[Image], NDArray[np.float32]]
 ) -> float:
     """The squared differences of two images [H, W, 3] at the chosen pixels, added up; NaN where one of them is NaN."""
-    room = np.empty(chosen.size + MASK_OVERREAD, np.uint8)
-    mask = room[: chosen.size].reshape(chosen.shape)
+    buffer = np.empty(chosen.size + MASK_OVERREAD, np.uint8)
+    mask = buffer[: chosen.size].reshape(chosen.shape)
     np.copyto(mask, chosen)
     pairs = ((as_compared(first[..., place]), as_compared(second[..., place])) for place in range(3))
     return float(sum(cv2.norm(*pair, cv2.NORM_L2SQR, mask) for pair in pairs))

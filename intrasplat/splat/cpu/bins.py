@@ -10,14 +10,14 @@ tiles. A slot is one (splat, tile) pair with its range of rows.
 Rows [top, end) inside the tile are exact for the ellipse within the tile's columns. The low 2 x ROW_BITS bits of
 slot_info and entries are (top, end - 1), the others the tile or the splat. Packing halves memory and sorting time.
 
-A block is BLOCK_TILES tiles of one band, blended one after the other by one thread. A splat has a home, an accumulator
-of GRADIENT floats, for each block that it may touch, to which each of its tiles adds its gradients. So homes are few
-and stay in the cache, there are no atomics, and the order of addition does not depend on the threads.
+A block is BLOCK_TILES tiles of one band, blended one after the other by one thread. For each block that it may touch, a
+splat has an accumulator of GRADIENT floats, to which each of its tiles adds its gradients. So accumulators are few and
+stay in the cache, there are no atomics, and the order of addition does not depend on the threads.
 
-    homes [N, 4]   first home, number of homes, offset, step. The home of splat g in column block_x of the blocks of a
-                   band is number homes[g, 2] + homes[g, 3] * band + block_x
+    accumulators [N, 4]   number of the first, how many, offset, step. The accumulator of splat g in column block_x of
+                          the blocks of a band is number accumulators[g, 2] + accumulators[g, 3] * band + block_x
 
-Each thread has its own region of the slots and of the homes, so one pass over the splats is enough.
+Each thread has its own region of the slots and of the accumulators, so one pass over the splats is enough.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TILE_ROWS = 1 << ROW_BITS
 """Rows of a tile. 8 x 64 pixels x 5 planes of float32 are 10 kB: they and the tile's alphas stay in L1 and L2."""
 BLOCK_TILES = 16
 GRADIENT = 12
-"""Floats of a home: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
+"""Floats of an accumulator: dL/d(r, g, b, z), the moments 1, x, y, xx, xy, yy of dL/dpower, two spare."""
 EXTENT = 6
 """Numbers that project computes of a splat's ellipse a dx^2 + 2 b dx dy + c dy^2 = r: its half-width in pixels, dx of
 its lowest point, -b / c, r / c, (ac - b^2) / c^2, and its half-height."""
@@ -55,48 +55,50 @@ def _rows(extent, g, x, y, column, bounds):  # type: ignore[no-untyped-def]
 
     bounds [2 * LANES]: top, then end. The lower branch -b / c dx + sqrt(r / c - (ac - b^2) / c^2 dx^2) is concave in
     dx, so its maximum over a column's pixel centres is at the ellipse's extreme point clamped to them. The upper branch
-    is its mirror image. lean = -b / c, height2 = r / c, fall = (ac - b^2) / c^2.
+    is its mirror image. slope = -b / c, height2 = r / c, fall = (ac - b^2) / c^2.
     """
     zero, width, extreme = splat(_ZERO), splat(extent[g, 0]), splat(extent[g, 1])
-    lean, height2, fall = splat(extent[g, 2]), splat(extent[g, 3]), splat(extent[g, 4])
+    slope, height2, fall = splat(extent[g, 2]), splat(extent[g, 3]), splat(extent[g, 4])
     first_dx = (iota() + splat(np.float32(column))) * splat(_WIDTH) + splat(_HALF - x)
     low, high = maximum(first_dx, zero - width), minimum(first_dx + splat(_WIDTH - np.float32(1)), width)
     at = minimum(maximum(extreme, low), high)
-    bottom = lean * at + sqrt(maximum(zero, height2 - fall * at * at))
+    bottom = slope * at + sqrt(maximum(zero, height2 - fall * at * at))
     at = minimum(maximum(zero - extreme, low), high)
-    top = lean * at - sqrt(maximum(zero, height2 - fall * at * at))
+    top = slope * at - sqrt(maximum(zero, height2 - fall * at * at))
     store(bounds, 0, ceil(top + splat(y - _HALF - ROUNDING)))
     store(bounds, LANES, floor(bottom + splat(y + _HALF + ROUNDING)))
 
 
 @kernel(inline="always")
-def _number_homes(homes, g, home, first, last, highest, lowest):  # type: ignore[no-untyped-def]
-    """Number the homes of splat g from `home` on, for tile columns first to last and bands highest to lowest; returns
-    the next free number."""
+def _number_accumulators(accumulators, g, accumulator, first, last, highest, lowest):  # type: ignore[no-untyped-def]
+    """Number the accumulators of splat g from `accumulator` on; returns the next free number.
+
+    The splat touches the tile columns first to last of the bands highest to lowest.
+    """
     first_block, last_block = first // BLOCK_TILES, last // BLOCK_TILES
     step = last_block - first_block + 1
-    homes[g, 1] = step * (lowest - highest + 1)
-    homes[g, 2], homes[g, 3] = home - step * highest - first_block, step
-    return home + homes[g, 1]
+    accumulators[g, 1] = step * (lowest - highest + 1)
+    accumulators[g, 2], accumulators[g, 3] = accumulator - step * highest - first_block, step
+    return accumulator + accumulators[g, 1]
 
 
 @kernel
 def fill_slots(  # type: ignore[no-untyped-def]
-    thread, threads, splats, radius2, extent, height, tiles_x, home_capacity,
-    slot_start, slot_count, slot_info, homes, region_end,
+    thread, threads, splats, radius2, extent, height, tiles_x, accumulator_capacity,
+    slot_start, slot_count, slot_info, accumulators, region_end,
 ):  # fmt: skip
-    """Write the slots of the thread's share of splats into its region, an equal share of slot_info; assign their homes.
+    """Write the slots of the thread's share of splats into its region, an equal share of slot_info.
 
-    home_capacity: homes of all threads. region_end [threads, 2]: where the thread's slots and homes end. Slots beyond
-    the region are counted but not written.
+    Number the splats' accumulators too. accumulator_capacity: accumulators of all threads. region_end [threads, 2]: the
+    end of the thread's slots and of its accumulators. Slots beyond the region are counted but not written.
     """
     region = slot_info.shape[0] // threads
     slot, full = thread * region, (thread + 1) * region
-    home = home_capacity // threads * thread
+    accumulator = accumulator_capacity // threads * thread
     count, last_row = splats.shape[0], np.float32(height - 1)
     bounds = np.empty(2 * LANES, np.float32)
     for g in range(count * thread // threads, count * (thread + 1) // threads):
-        slot_start[g], slot_count[g], homes[g, 0], homes[g, 1] = slot, 0, home, 0
+        slot_start[g], slot_count[g], accumulators[g, 0], accumulators[g, 1] = slot, 0, accumulator, 0
         if not radius2[g] >= _ZERO:
             continue
         x, y, reach_x, reach_y = splats[g, 0], splats[g, 1], extent[g, 0], extent[g, 5]
@@ -120,8 +122,8 @@ def fill_slots(  # type: ignore[no-untyped-def]
                 slot += 1
         slot_count[g] = slot - slot_start[g]
         if slot_count[g] > 0:
-            home = _number_homes(homes, g, home, first, last, highest, lowest)
-    region_end[thread, 0], region_end[thread, 1] = slot, home
+            accumulator = _number_accumulators(accumulators, g, accumulator, first, last, highest, lowest)
+    region_end[thread, 0], region_end[thread, 1] = slot, accumulator
 
 
 @kernel

@@ -7,7 +7,7 @@ Symbols, for one pixel and its splats i = 0, 1, ... nearest first:
     s_i     = g_C . c_i + g_Z z_i + g_A, with g the loss gradient at this pixel
     dL/dalpha_i = T_i (s_i - B_i),  B_{i-1} = alpha_i s_i + (1 - alpha_i) B_i,  B_last = 0
 so going back to front needs no division, and dL/dpower_i = w_i (s_i - B_i). The forward pass stores alpha and w of
-every row it visits in ``trail``, for the backward pass. The loss needs only the pixel's own colour, so there is no
+every row it visits in ``tape``, for the backward pass. The loss needs only the pixel's own colour, so there is no
 gradient image. Down a column of pixels power2 is quadratic. So alpha is multiplied by a ratio from row to row, and the
 ratio by a constant: two products instead of an exponential. Derivations: docs/rasterizer.md.
 
@@ -15,8 +15,8 @@ A tile takes four steps. _gather copies its entries (bins.py) into consecutive r
 computes the loss, and _backward visits the records in reverse. A record is RECORD floats: alpha and ratio of its first
 row (one per lane), then BEND (the ratio's factor per row), COLOUR (r, g, b, z), PLACE (dx of the first lane, dy of the
 first row) and VALUE (splat number 11 in project.py).
-spans[i] is first row, end row and home (bins.py) of record i. The arrays of a tile lie in ``planes``, PLANE floats
-apart: T (later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only if no gradient is computed.
+spans[i] is first row, end row and accumulator (bins.py) of record i. The arrays of a tile lie in ``planes``, PLANE
+floats apart: T (later B - g_A), R G B Z (later g_R g_G g_B g_Z) and the value, blended only if no gradient is computed.
 """
 
 from __future__ import annotations
@@ -71,20 +71,20 @@ _CHECK_EVERY = 32  # records between two tests of whether the whole tile is opaq
 
 @kernel
 def blend(  # type: ignore[no-untyped-def]
-    thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, homes,
-    records, spans, trail, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
+    thread, threads, next_block, mode, width, height, tiles_x, splats, tile_start, entries, accumulators,
+    records, spans, tape, planes, sums, statistics, target, weight, inverse_depth, loss_settings, image,
 ):  # fmt: skip
     """Composite every tile. Each thread takes the next block; the result does not depend on which thread takes it.
 
-    next_block int64 [1]: 0 at the start. records, spans, trail, planes [threads, ...]: scratch (see above).
-    sums [homes * GRADIENT] (bins.py): added to in modes LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
+    next_block int64 [1]: 0 at the start. records, spans, tape, planes [threads, ...]: scratch (see above).
+    sums [accumulators * GRADIENT] (bins.py): added to in LOSS and COTANGENT. statistics [tiles, STATISTICS]: LOSS.
     target, weight, inverse_depth, loss_settings: LOSS, see _loss; stride = tiles_x * LANES.
     image [6, H, stride] flattened: R G B Z A and the blended value, written in RENDER; the first five are read as
     cotangents in COTANGENT.
     """
     blocks_x, stride, keep = -(-tiles_x // BLOCK_TILES), tiles_x * LANES, mode != RENDER
     blocks, size = (tile_start.shape[0] - 1) // tiles_x * blocks_x, height * stride
-    records, spans, trail, planes = records[thread], spans[thread], trail[thread], planes[thread]
+    records, spans, tape, planes = records[thread], spans[thread], tape[thread], planes[thread]
     block = claim(next_block)
     while block < blocks:
         band, block_x = block // blocks_x, block % blocks_x
@@ -94,11 +94,11 @@ def blend(  # type: ignore[no-untyped-def]
             tile, column0 = band * tiles_x + column, column * LANES
             origin = row0 * stride + column0
             count = _gather(
-                tile_start[tile], tile_start[tile + 1], row0, column0, band, block_x, splats, entries, homes,
+                tile_start[tile], tile_start[tile + 1], row0, column0, band, block_x, splats, entries, accumulators,
                 records, spans,
             )  # fmt: skip
             _clear(planes, column0, width, rows)
-            visited = _forward(count, rows, keep, records, spans, trail, planes)
+            visited = _forward(count, rows, keep, records, spans, tape, planes)
             if mode == RENDER:
                 _write(planes, image, origin, stride, size, rows)
             elif mode == LOSS:
@@ -108,13 +108,13 @@ def blend(  # type: ignore[no-untyped-def]
             else:
                 _read_cotangents(planes, image, origin, stride, size, rows)
             if keep:
-                _backward(visited, records, spans, trail, planes, sums)
+                _backward(visited, records, spans, tape, planes, sums)
         block = claim(next_block)
 
 
 @kernel
 def _gather(  # type: ignore[no-untyped-def]
-    first, end, row0, column0, band, block_x, splats, entries, homes, records, spans
+    first, end, row0, column0, band, block_x, splats, entries, accumulators, records, spans
 ):
     """Write the entries [first, end) of a tile as records; return how many records.
 
@@ -132,22 +132,22 @@ def _gather(  # type: ignore[no-untyped-def]
         k_xx, k_xy, k_yy = splats[g, 2], splats[g, 3], splats[g, 4]
         dx = lanes + splat(x)
         along = fma(dx, splat(k_xx) * dx, splat(splats[g, 5]))
-        lean = splat(k_xy) * dx  # power2 = along + lean dy + k_yy dy^2
+        linear = splat(k_xy) * dx  # power2 = along + linear dy + k_yy dy^2
         dy, end_dy = y + np.float32(top), y + np.float32(bottom - 1)
-        head = fma(lean, splat(dy), along) + splat(k_yy * dy * dy)
-        foot = fma(lean, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
+        head = fma(linear, splat(dy), along) + splat(k_yy * dy * dy)
+        foot = fma(linear, splat(end_dy), along) + splat(k_yy * end_dy * end_dy)
         stretch = MAX_ROWS if all_less(splat(_DEEP), minimum(head, foot)) else 1
-        home = homes[g, 2] + homes[g, 3] * band + block_x  # the splat's accumulator in this block (bins.py)
+        accumulator = accumulators[g, 2] + accumulators[g, 3] * band + block_x  # of the splat in this block (bins.py)
         while top < bottom:
             dy = y + np.float32(top)
-            store(records, at, exp2(fma(lean, splat(dy), along) + splat(k_yy * dy * dy)))
-            store(records, at + LANES, exp2(lean + splat(k_yy * (dy + dy + _ONE))))
+            store(records, at, exp2(fma(linear, splat(dy), along) + splat(k_yy * dy * dy)))
+            store(records, at + LANES, exp2(linear + splat(k_yy * (dy + dy + _ONE))))
             records[at + BEND] = splats[g, 10]
             records[at + COLOUR], records[at + COLOUR + 1] = splats[g, 6], splats[g, 7]
             records[at + COLOUR + 2], records[at + COLOUR + 3] = splats[g, 8], splats[g, 9]
             records[at + PLACE], records[at + PLACE + 1] = x, dy
             records[at + VALUE] = splats[g, 11]
-            spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), home
+            spans[count, 0], spans[count, 1], spans[count, 2] = top, min(top + stretch, bottom), accumulator
             top += stretch
             at += RECORD
             count += 1
@@ -167,7 +167,7 @@ def _clear(planes, column0, width, rows):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[no-untyped-def]
+def _forward(count, rows, keep, records, spans, tape, planes):  # type: ignore[no-untyped-def]
     """Blend the records into planes; return how many were blended before the tile was opaque."""
     zero, cut, cap, stop = splat(_ZERO), splat(_CUT), splat(_CAP), splat(_STOP)
     at = 0
@@ -191,8 +191,8 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
             store(planes, p + 3 * PLANE, fma(weight, blue, load(planes, p + 3 * PLANE)))
             store(planes, p + 4 * PLANE, fma(weight, depth, load(planes, p + 4 * PLANE)))
             if keep:
-                store(trail, at, alpha)
-                store(trail, at + LANES, weight)
+                store(tape, at, alpha)
+                store(tape, at + LANES, weight)
                 at += 2 * LANES
             else:
                 store(planes, p + 5 * PLANE, fma(weight, value, load(planes, p + 5 * PLANE)))
@@ -207,8 +207,8 @@ def _forward(count, rows, keep, records, spans, trail, planes):  # type: ignore[
 
 
 @kernel
-def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-untyped-def]
-    """Add the gradients of the first count records to their homes, back to front.
+def _backward(count, records, spans, tape, planes, sums):  # type: ignore[no-untyped-def]
+    """Add the gradients of the first count records to their accumulators, back to front.
 
     planes: B - g_A, then g_R g_G g_B g_Z. One long function, so that ten running sums stay in registers.
     """
@@ -229,7 +229,7 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
         trace = at
         for row in range(top, bottom):
             p = row * LANES
-            alpha, weight = load(trail, trace), load(trail, trace + LANES)
+            alpha, weight = load(tape, trace), load(tape, trace + LANES)
             trace += 2 * LANES
             g_red, g_green = load(planes, p + PLANE), load(planes, p + 2 * PLANE)
             g_blue, g_depth = load(planes, p + 3 * PLANE), load(planes, p + 4 * PLANE)
@@ -251,10 +251,10 @@ def _backward(count, records, spans, trail, planes, sums):  # type: ignore[no-un
             continue  # the record before is of the same splat
         dx = lanes + spread(records, record + PLACE)
         moment_x = moment * dx
-        home = np.int64(spans[i, 2]) * GRADIENT
-        add_sums(sums, home, v_red, v_green, v_blue, v_depth)
-        add_sums(sums, home + 4, moment, moment_x, moment_y, moment_x * dx)
-        add_sums(sums, home + 8, moment_y * dx, moment_yy, zero, zero)
+        accumulator = np.int64(spans[i, 2]) * GRADIENT
+        add_sums(sums, accumulator, v_red, v_green, v_blue, v_depth)
+        add_sums(sums, accumulator + 4, moment, moment_x, moment_y, moment_x * dx)
+        add_sums(sums, accumulator + 8, moment_y * dx, moment_yy, zero, zero)
         v_red, v_green, v_blue, v_depth = zero, zero, zero, zero
         moment, moment_y, moment_yy = zero, zero, zero
 

@@ -91,7 +91,7 @@ class CpuModel:
         self.colour = np.zeros((3, columns), np.float32)
         self._v_state = np.zeros((moments, ROWS, columns), np.float32)
         self._v_rest = np.zeros(self.sh_rest.shape, np.float32)
-        total = Gradients.room(self._v_state[0])
+        total = Gradients.zeros(self._v_state[0])
         self._gradients = [replace(total, state=v_state) for v_state in self._v_state]  # they differ only in the state
         self._seen = np.zeros(columns, np.bool_)
 

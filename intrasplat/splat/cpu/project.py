@@ -168,7 +168,7 @@ def _low_pass(camera, mean, inverse_z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _held(ratio, low, high):  # type: ignore[no-untyped-def]
+def _clamped(ratio, low, high):  # type: ignore[no-untyped-def]
     """ratio clamped to [low, high]."""
     return minimum(maximum(ratio, low), high)
 
@@ -242,7 +242,7 @@ def project(  # type: ignore[no-untyped-def]
         scale = (_exp(s0), _exp(s1), _exp(s2))
         # A = J W (2 x 3), then K = A R S (2 x 3), cov2d = K K^T + the low-pass.
         inverse_z = 1.0 / z
-        u, v = _held(x * inverse_z, low_u, high_u), _held(y * inverse_z, low_v, high_v)
+        u, v = _clamped(x * inverse_z, low_u, high_u), _clamped(y * inverse_z, low_v, high_v)
         j0, j1 = fx * inverse_z, fy * inverse_z
         k0 = _each(_through(_sum(j0, w[0], zero - j0 * u, w[2]), r), scale)
         k1 = _each(_through(_sum(j1, w[1], zero - j1 * v, w[2]), r), scale)
@@ -272,14 +272,14 @@ def _more(total, a, visible):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_homes(first, homes, sums, totals):  # type: ignore[no-untyped-def]
-    """The blend's gradients of LANES Gaussians, summed over their homes, into totals [LANES * GRADIENT]."""
+def _add_accumulators(first, accumulators, sums, totals):  # type: ignore[no-untyped-def]
+    """The blend's gradients of LANES Gaussians, summed over their accumulators, into totals [LANES * GRADIENT]."""
     for lane in range(LANES):
         head = tail = splat(np.float32(0.0))
-        start = np.int64(homes[first + lane, 0])
-        for home in range(start, start + homes[first + lane, 1]):
-            head = head + load(sums, home * GRADIENT)
-            tail = tail + load(sums, home * GRADIENT + GRADIENT - LANES)
+        start = np.int64(accumulators[first + lane, 0])
+        for accumulator in range(start, start + accumulators[first + lane, 1]):
+            head = head + load(sums, accumulator * GRADIENT)
+            tail = tail + load(sums, accumulator * GRADIENT + GRADIENT - LANES)
         store(totals, lane * GRADIENT + GRADIENT - LANES, tail)
         store(totals, lane * GRADIENT, head)
 
@@ -294,14 +294,14 @@ def _put(row, i, value, adds):  # type: ignore[no-untyped-def]
 
 @kernel
 def project_backward(  # type: ignore[no-untyped-def]
-    thread, threads, camera, state, opacity_logit, radius2, homes, sums, adds, adds_state,
+    thread, threads, camera, state, opacity_logit, radius2, accumulators, sums, adds, adds_state,
     v_state, v_opacity_logit, v_colour, v_mean2d_norm, v_pose,
 ):  # fmt: skip
-    """Sum the blend's gradients of each Gaussian over its homes (bins.py), and compute those of its parameters.
+    """Sum the blend's gradients of each Gaussian over its accumulators (bins.py), and compute those of its parameters.
 
-    sums [homes * GRADIENT]. Every v_* row is written (zeros for culled Gaussians). adds_state adds to v_state; adds
-    adds to v_opacity_logit, and v_mean2d_norm becomes the larger of old and new. v_mean2d_norm [N]: |dL/dmean2d| in
-    normalised device coordinates (x times W / 2, y times H / 2), the unit in which densification thresholds are
+    sums [accumulators * GRADIENT]. Every v_* row is written (zeros for culled Gaussians). adds_state adds to v_state;
+    adds adds to v_opacity_logit, and v_mean2d_norm becomes the larger of old and new. v_mean2d_norm [N]: |dL/dmean2d|
+    in normalised device coordinates (x times W / 2, y times H / 2), the unit in which densification thresholds are
     published. v_pose [threads, 12]: the thread's share of dL/d camera_from_world.
 
     With G = dL/dconic: dL/dcov2d = -conic G conic; dL/dSigma = A^T dL/dcov2d A.
@@ -317,7 +317,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     vectors = state.shape[1] // LANES
     for k in range(vectors * thread // threads, vectors * (thread + 1) // threads):
         i = k * LANES
-        _add_homes(i, homes, sums, totals)
+        _add_accumulators(i, accumulators, sums, totals)
         visible = load(radius2, i)
         store(v_colour[0], i, load_strided(totals, 0, GRADIENT))
         store(v_colour[1], i, load_strided(totals, 1, GRADIENT))
@@ -336,7 +336,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         scale = (_exp(s0), _exp(s1), _exp(s2))
         variance = _each(scale, scale)
         ratio_x, ratio_y = x * inverse_z, y * inverse_z
-        u, v = _held(ratio_x, low_u, high_u), _held(ratio_y, low_v, high_v)
+        u, v = _clamped(ratio_x, low_u, high_u), _clamped(ratio_y, low_v, high_v)
         j0, j1 = fx * inverse_z, fy * inverse_z
         a0, a1 = _sum(j0, w[0], zero - j0 * u, w[2]), _sum(j1, w[1], zero - j1 * v, w[2])
         b0, b1 = _through(a0, r), _through(a1, r)

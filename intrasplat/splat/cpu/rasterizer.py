@@ -47,7 +47,7 @@ class Gradients:
     pose: NDArray[np.float64]  # [threads, 12], to be summed
 
     @classmethod
-    def room(cls, state: Floats) -> Gradients:
+    def zeros(cls, state: Floats) -> Gradients:
         """Gradients of zeros for N Gaussians that use `state` [ROWS, N] as their array of the state."""
         count = state.shape[1]
         logit, norm = np.zeros((2, count), np.float32)
@@ -65,7 +65,7 @@ class Rasterizer:
         self.image = np.zeros(6 * height * self.stride, np.float32)
         self.statistics = np.zeros((self.tiles, STATISTICS), np.float32)
         self._planes = _aligned(self.threads, PLANES * PLANE)
-        self._trail, self._records = _aligned(self.threads, 0), _aligned(self.threads, 0)
+        self._tape, self._records = _aligned(self.threads, 0), _aligned(self.threads, 0)
         self._spans = np.zeros((self.threads, 0, 3), np.int32)
         self._tile_start = np.zeros(self.tiles + 1, np.int64)
         self._region_end = np.zeros((self.threads, 2), np.int64)
@@ -82,15 +82,15 @@ class Rasterizer:
         self.slot_start = np.zeros(count, np.int32)
         self._slot_count = np.zeros(count, np.int32)
         self._extent = np.zeros((count, bins.EXTENT), np.float32)
-        self._homes = np.zeros((count, 4), np.int32)
+        self._accumulators = np.zeros((count, 4), np.int32)
         self._order = np.zeros((2, count), np.int32)
         self._keys = np.zeros((2, count), np.uint32)
-        self.gradients = Gradients.room(np.zeros((ROWS, count), np.float32))
+        self.gradients = Gradients.zeros(np.zeros((ROWS, count), np.float32))
 
-    def _allocate_slots(self, slots: int, homes: int) -> None:
-        """Allocate so many slots and homes per thread."""
+    def _allocate_slots(self, slots: int, accumulators: int) -> None:
+        """Allocate so many slots and accumulators per thread."""
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
-        self._sums = np.zeros(self.threads * homes * bins.GRADIENT, np.float32)
+        self._sums = np.zeros(self.threads * accumulators * bins.GRADIENT, np.float32)
 
     def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
         """Project and list each tile's splats. camera: camera_vector; state [>= 10, N], colour [3, N]."""
@@ -109,7 +109,7 @@ class Rasterizer:
         )  # fmt: skip
 
     def sort(self) -> None:
-        """Second half of project: the slots and homes of every splat, and the entries of every tile, nearest first."""
+        """Second half of project: every splat's slots and accumulators, and every tile's entries, nearest first."""
         if not self._filled():
             self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
@@ -124,17 +124,17 @@ class Rasterizer:
         """Write the slots; False if a thread's region is too small for them."""
         run(
             bins.fill_slots, self.splats, self.radius2, self._extent, self.height, self.tiles_x,
-            len(self._sums) // bins.GRADIENT, self.slot_start, self._slot_count, self._slot_info, self._homes,
+            len(self._sums) // bins.GRADIENT, self.slot_start, self._slot_count, self._slot_info, self._accumulators,
             self._region_end,
         )  # fmt: skip
         return bool((self._needed() <= self._regions()).all())
 
     def _regions(self) -> NDArray[np.int64]:
-        """Capacity of a thread's region: slots and homes."""
+        """Capacity of a thread's region: slots and accumulators."""
         return np.array([len(self._slot_info), len(self._sums) // bins.GRADIENT]) // self.threads
 
     def _needed(self) -> NDArray[np.int64]:
-        """The most slots, and the most homes, that a thread needs."""
+        """The most slots, and the most accumulators, that a thread needs."""
         return np.asarray((self._region_end - self._regions() * np.arange(self.threads)[:, None]).max(0))
 
     def _reserve(self) -> None:
@@ -144,10 +144,10 @@ class Rasterizer:
             most = most * 5 // 4
             self._spans = np.zeros((self.threads, most, 3), np.int32)
             self._records = _aligned(self.threads, most * RECORD)
-            self._trail = _aligned(self.threads, most * 2 * LANES)
+            self._tape = _aligned(self.threads, most * 2 * LANES)
 
-    def _empty_homes(self) -> None:
-        """Set the homes to 0."""
+    def _clear_accumulators(self) -> None:
+        """Set the accumulators to 0."""
         _, region = self._regions()
         for thread, (_, end) in enumerate(self._region_end):
             self._sums[thread * region * bins.GRADIENT : end * bins.GRADIENT] = 0
@@ -158,13 +158,13 @@ class Rasterizer:
         """Run the kernel in one of its modes (blend.py). bands: first and end of the rows of tiles; None: all."""
         self._reserve()
         if mode != RENDER:
-            self._empty_homes()
+            self._clear_accumulators()
         first, end = bands or (0, self.tiles_y)
         self._next_block[0] = first * -(-self.tiles_x // bins.BLOCK_TILES)
         run(
             blend, self._next_block, mode, self.width, self.height, self.tiles_x, self.splats,
-            self._tile_start[: end * self.tiles_x + 1], self._entries, self._homes, self._records, self._spans,
-            self._trail, self._planes, self._sums, self.statistics, target.rgb, target.weight, target.inverse_depth,
+            self._tile_start[: end * self.tiles_x + 1], self._entries, self._accumulators, self._records, self._spans,
+            self._tape, self._planes, self._sums, self.statistics, target.rgb, target.weight, target.inverse_depth,
             loss_settings, image,
         )  # fmt: skip
 
@@ -215,11 +215,11 @@ class Rasterizer:
         return self.carry_back()
 
     def carry_back(self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False) -> Gradients:
-        """Gradients of the Gaussians' parameters from those in the homes, which blend has summed."""
+        """Gradients of the Gaussians' parameters from those in the accumulators, which blend has summed."""
         out = out or self.gradients
         run(
             project.project_backward, self._camera, self._state, self._opacity_logit, self.radius2,
-            self._homes, self._sums, adds, adds_state,
+            self._accumulators, self._sums, adds, adds_state,
             out.state, out.opacity_logit, out.colour, out.mean2d_norm, out.pose,
         )  # fmt: skip
         return out

@@ -54,21 +54,21 @@ def rows_of(mean_y, reach, rows, TILE_H: tl.constexpr):  # type: ignore[no-untyp
 
 @triton.jit
 def columns_of(  # type: ignore[no-untyped-def]
-    mean_x, mean_y, reach, turn, lean, square, fall, row, width, height, TILE_W: tl.constexpr, TILE_H: tl.constexpr
+    mean_x, mean_y, reach, extreme, slope, square, fall, row, width, height, TILE_W: tl.constexpr, TILE_H: tl.constexpr
 ):
     """First tile and number of tiles in a row of tiles that the splat's ellipse touches.
 
-    The right branch lean dy + sqrt(square - fall dy^2) is concave in dy, so its maximum over the row's pixel centres is
-    at the ellipse's own extreme point clamped to them; the left one is its mirror image. Two kernels call this and must
-    get bit-identical results, so multiply-adds are fused explicitly, not by the compiler.
+    The right branch slope dy + sqrt(square - fall dy^2) is concave in dy, so its maximum over the row's pixel centres
+    is at the ellipse's own extreme point clamped to them; the left one is its mirror image. Two kernels call this and
+    must get bit-identical results, so multiply-adds are fused explicitly, not by the compiler.
     """
     top = (row * TILE_H).to(tl.float32) + 0.5 - mean_y
     bottom = tl.minimum(row * TILE_H + (TILE_H - 1), height - 1).to(tl.float32) + 0.5 - mean_y
     low, high = tl.maximum(top, -reach), tl.minimum(bottom, reach)
-    dy = tl.minimum(tl.maximum(turn, low), high)
-    right = tl.fma(lean, dy, tl.sqrt(tl.maximum(tl.fma(-fall * dy, dy, square), 0.0)))
-    dy = tl.minimum(tl.maximum(-turn, low), high)
-    left = tl.fma(lean, dy, -tl.sqrt(tl.maximum(tl.fma(-fall * dy, dy, square), 0.0)))
+    dy = tl.minimum(tl.maximum(extreme, low), high)
+    right = tl.fma(slope, dy, tl.sqrt(tl.maximum(tl.fma(-fall * dy, dy, square), 0.0)))
+    dy = tl.minimum(tl.maximum(-extreme, low), high)
+    left = tl.fma(slope, dy, -tl.sqrt(tl.maximum(tl.fma(-fall * dy, dy, square), 0.0)))
     last_pixel = (width - 1) * 1.0
     first = tl.minimum(tl.maximum(tl.ceil(mean_x + left - (0.5 + _SLACK)), 0.0), last_pixel + 1.0)
     last = tl.minimum(tl.maximum(tl.floor(mean_x + right - 0.5 + _SLACK), -1.0), last_pixel)
@@ -79,7 +79,7 @@ def columns_of(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def count_tiles(  # type: ignore[no-untyped-def]
-    mean_x, mean_y, reach, turn, lean, square, fall, drawn, width, height, rows,
+    mean_x, mean_y, reach, extreme, slope, square, fall, drawn, width, height, rows,
     TILE_W: tl.constexpr, TILE_H: tl.constexpr,
 ):  # fmt: skip
     """The number of tiles that each splat touches; 0 if it is not drawn."""
@@ -88,7 +88,7 @@ def count_tiles(  # type: ignore[no-untyped-def]
     total = tl.zeros_like(row)
     while tl.max(last - row) >= 0:
         _, count = columns_of(
-            mean_x, mean_y, reach, turn, lean, square, fall, row, width, height, TILE_W, TILE_H
+            mean_x, mean_y, reach, extreme, slope, square, fall, row, width, height, TILE_W, TILE_H
         )  # fmt: skip
         total += tl.where(row <= last, count, 0)
         row += 1
@@ -130,15 +130,15 @@ def fill_slots(  # type: ignore[no-untyped-def]
 
     at = extent + splat * _EXTENT
     mean_x, mean_y = tl.load(at, mask=used, other=0.0), tl.load(at + 1, mask=used, other=0.0)
-    reach, turn = tl.load(at + 2, mask=used, other=0.0), tl.load(at + 3, mask=used, other=0.0)
-    lean = tl.load(at + 4, mask=used, other=0.0)
+    reach, extreme = tl.load(at + 2, mask=used, other=0.0), tl.load(at + 3, mask=used, other=0.0)
+    slope = tl.load(at + 4, mask=used, other=0.0)
     square, fall = tl.load(at + 5, mask=used, other=0.0), tl.load(at + 6, mask=used, other=0.0)
     row, last = rows_of(mean_y, reach, rows, TILE_H)
     tile = tl.full((BLOCK,), -1, tl.int32)
     looking = (used & (row <= last)).to(tl.int32)
     while tl.max(looking) > 0:
         first, wide = columns_of(
-            mean_x, mean_y, reach, turn, lean, square, fall, row, width, height, TILE_W, TILE_H
+            mean_x, mean_y, reach, extreme, slope, square, fall, row, width, height, TILE_W, TILE_H
         )  # fmt: skip
         tile = tl.where((looking > 0) & (ahead < wide), row * tiles_x + first + ahead, tile)
         ahead -= wide

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from intrasplat.splat.step import TrainingFrame, image_size
 
-FIRST_ROOM = 32
+FIRST_CAPACITY = 32
 """Initial capacity in frames. It doubles when it is full; whatever stores addresses must then be created again."""
 
 
@@ -30,7 +30,7 @@ class FrameStore:
         self.inverse_depth = torch.zeros(0, height, width, device=device)
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """Capacity in frames. When it changes, all frames have other addresses."""
         return int(self.rgb.shape[0])
 
@@ -45,8 +45,8 @@ class FrameStore:
         width, height = image_size(frame.camera)
         if (width, height) != (self._width, self._height):
             raise ValueError(f"a frame of {width} x {height} pixels, the others have {self._width} x {self._height}")
-        if len(self._rows) == self.room:
-            more = max(FIRST_ROOM, self.room)
+        if len(self._rows) == self.capacity:
+            more = max(FIRST_CAPACITY, self.capacity)
             self.rgb, self.weight, self.inverse_depth = (
                 torch.cat([each, each.new_zeros(more, *each.shape[1:])])
                 for each in (self.rgb, self.weight, self.inverse_depth)

@@ -23,8 +23,8 @@ _EPS2D, _ENLARGED, _RECORDED = tl.constexpr(EPS2D), tl.constexpr(ENLARGED), tl.c
 @triton.jit
 def exp(x):  # type: ignore[no-untyped-def]
     """e^x of a float32, at most 2**20; NaN of NaN."""
-    held = tl.maximum(x, _MIN_EXPONENT, propagate_nan=tl.PropagateNan.ALL)
-    return tl.exp2(tl.minimum(held, _MAX_EXPONENT, propagate_nan=tl.PropagateNan.ALL) * _LOG2E)
+    clamped = tl.maximum(x, _MIN_EXPONENT, propagate_nan=tl.PropagateNan.ALL)
+    return tl.exp2(tl.minimum(clamped, _MAX_EXPONENT, propagate_nan=tl.PropagateNan.ALL) * _LOG2E)
 
 
 @triton.jit
@@ -102,13 +102,13 @@ def limits(camera, first: tl.constexpr):  # type: ignore[no-untyped-def]
 def image_row(camera, first: tl.constexpr, ratio, inverse_z):  # type: ignore[no-untyped-def]
     """A row of A = J W (2 x 3): its factor j = focal / z, the clamped ratio u, and j (W_row - u W_z)."""
     low, high = limits(camera, first)
-    held = tl.minimum(tl.maximum(ratio, low), high)
+    clamped = tl.minimum(tl.maximum(ratio, low), high)
     j = tl.load(camera + _FOCAL + first) * inverse_z
     row, away = camera + _POSE + 4 * first, camera + _POSE + 8
     return (
         j,
-        held,
-        j * (tl.load(row) - held * tl.load(away)),
-        j * (tl.load(row + 1) - held * tl.load(away + 1)),
-        j * (tl.load(row + 2) - held * tl.load(away + 2)),
+        clamped,
+        j * (tl.load(row) - clamped * tl.load(away)),
+        j * (tl.load(row + 1) - clamped * tl.load(away + 1)),
+        j * (tl.load(row + 2) - clamped * tl.load(away + 2)),
     )

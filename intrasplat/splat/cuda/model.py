@@ -118,12 +118,12 @@ class CudaModel:
             self._settle()
             self._training.launches.forget()
             self._training = self._training_view(len(frames))
-        room, slot = self._store.room, len(self._sent)
+        capacity, slot = self._store.capacity, len(self._sent)
         row, times = self._training.control.rows[slot], [frame.t for frame in frames]
         self._training.write_cameras(slot, [frame.camera for frame in frames])
         for k, frame in enumerate(frames):
             row["loss"][k], row["frame"][k] = frame.loss_settings(loss), self._store.row(frame)
-        if self._store.room != room:
+        if self._store.capacity != capacity:
             self._training.launches.forget()
         write_adam(row, slot, rates, iteration)
         self.motion.write_times(row, times)

@@ -104,11 +104,11 @@ def project(  # type: ignore[no-untyped-def]
     mean_x, mean_y = (j0 * x + tl.load(camera + _CX)).to(tl.float32), (j1 * y + tl.load(camera + _CY)).to(tl.float32)
     extent2 = tl.where(drawn, extent2, 0.0).to(tl.float64)
     reach = tl.sqrt(extent2 * cyy).to(tl.float32)
-    turn = (cxy * tl.sqrt(extent2 / cxx)).to(tl.float32)
-    lean = (cxy / cyy).to(tl.float32)
+    extreme = (cxy * tl.sqrt(extent2 / cxx)).to(tl.float32)
+    slope = (cxy / cyy).to(tl.float32)
     square, fall = (extent2 * det / cyy).to(tl.float32), (det / (cyy * cyy)).to(tl.float32)
     tiles = count_tiles(
-        mean_x, mean_y, reach, turn, lean, square, fall, drawn, width, height, tiles_y, TILE_W, TILE_H
+        mean_x, mean_y, reach, extreme, slope, square, fall, drawn, width, height, tiles_y, TILE_W, TILE_H
     )  # fmt: skip
     splat = f * N + n
     tl.store(count + splat, tiles, mask=there)
@@ -120,8 +120,8 @@ def project(  # type: ignore[no-untyped-def]
 
     at = extent + splat * (_EXTENT // 2)
     _store_pair(at, mean_x, mean_y, there)
-    _store_pair(at + 1, reach, turn, there)
-    _store_pair(at + 2, lean, square, there)
+    _store_pair(at + 1, reach, extreme, there)
+    _store_pair(at + 2, slope, square, there)
     _store_pair(at + 3, fall, fall, there)
     k_xx, k_xy = cyy * inverse_det * (-0.5 * _LOG2E), cxy * inverse_det * _LOG2E
     k_yy = cxx * inverse_det * (-0.5 * _LOG2E)

@@ -1,4 +1,4 @@
-"""Gradients are added up in homes (intrasplat/splat/cpu/bins.py): each addition once, for splats of any shape."""
+"""Gradients are summed in accumulators (intrasplat/splat/cpu/bins.py): each addition once, for splats of any shape."""
 
 from __future__ import annotations
 
