@@ -96,8 +96,8 @@ def _check_installation(settings: Settings) -> None:
 
 
 def _counts(jobs: Mapping[JobState, int]) -> str:
-    told = ", ".join(f"{number} {state}" for state, number in jobs.items() if number)
-    return f"{sum(jobs.values())} jobs" + (f" ({told})" if told else "")
+    counts = ", ".join(f"{number} {state}" for state, number in jobs.items() if number)
+    return f"{sum(jobs.values())} jobs" + (f" ({counts})" if counts else "")
 
 
 def _say_left_out(why: str, job_ids: Sequence[str]) -> None:

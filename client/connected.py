@@ -49,11 +49,11 @@ class _Waiting:
     """Prints once why a command waits."""
 
     def __init__(self) -> None:
-        self._is_told = False
+        self._is_reported = False
 
     def tell(self, failure: intrasplat_client.IntrasplatError, pause_s: float) -> None:
-        if not self._is_told:
-            self._is_told = True
+        if not self._is_reported:
+            self._is_reported = True
             again = f"Asking again for up to {DEFAULT_PATIENCE_S:g} s."
             print(f"intrasplat: {getattr(failure, 'problem', failure)} {again}", file=sys.stderr, flush=True)
 

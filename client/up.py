@@ -31,7 +31,7 @@ from contract.store.store import Store
 from intrasplat.errors import UnavailableError
 from intrasplat.files.disk import Disk
 from intrasplat.files.disk_errors import StoreFullError, disk_errors
-from intrasplat.machine.processes import told_to_end
+from intrasplat.machine.processes import shutdown_event
 from intrasplat_client import Client
 
 WATCH_PERIOD_S = 0.2
@@ -187,7 +187,7 @@ def run(settings: Settings, worker_count: int = 1, ready_timeout_s: float = 300.
             something, or the service does not become ready.
         StoreFullError: the disk is so full that nothing can start; the error names it.
     """
-    end = told_to_end()
+    end = shutdown_event()
     check_keys(settings)
     check_port(settings.host, settings.port)
     try:

@@ -109,9 +109,9 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
             doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
             masks, recorded = aside.submit(zipped_masks, setup.clip), aside.submit(recorded_frames, run)
             scene, quantized = finish(run)
-        frames, told = recorded.result()
+        frames, summary = recorded.result()
         beside = {name: each for name, each in {MASKS: masks.result(), RECORDED: frames}.items() if each is not None}
-        report = publish(out_dir, run, scene, quantized, doubts.result(), beside, told)
+        report = publish(out_dir, run, scene, quantized, doubts.result(), beside, summary)
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 

@@ -71,11 +71,11 @@ class DoneJobs:
         """
         find = functools.partial(self._queue.records, tenant)
         try:
-            told = self._questions.ask(lambda: find_page(search, tenant, find, JobState.DONE), LIST_PATIENCE_S)
+            page = self._questions.ask(lambda: find_page(search, tenant, find, JobState.DONE), LIST_PATIENCE_S)
         except UnavailableError:
             stored = find_among(self._stored_of(tenant))
             return find_page(search, tenant, lambda limit, before: self._labelled(stored(limit, before))), False
-        return told, True
+        return page, True
 
     def forget(self, job_id: str) -> None:
         """Remove a purged job from the cache."""

@@ -152,7 +152,7 @@ class Feeds:
             await asyncio.sleep(POLL_PERIOD_S)
         feed.end()
 
-    async def _look(self, feed: Feed, told: Forecast | None) -> Forecast | None:
+    async def _look(self, feed: Feed, sent: Forecast | None) -> Forecast | None:
         """Send a changed position in the queue, and a job without events. Returns the forecast that was sent last."""
         record = await run_in_threadpool(self._queue.get, feed.job_id)
         if record is None:
@@ -163,6 +163,6 @@ class Feeds:
                 feed.add(record)
             return None
         forecast = await run_in_threadpool(self._queue.forecast, feed.job_id)
-        if told is None or forecast.position != told.position:
+        if sent is None or forecast.position != sent.position:
             feed.add(record, forecast=forecast)
         return forecast

@@ -19,18 +19,18 @@ class HeadAsGet:
             await self._app(scope, receive, send)
             return
         asked: Scope = {**scope, "method": "GET"}
-        told = asyncio.Event()
+        streaming = asyncio.Event()
 
         async def send_head(message: Message) -> None:
             if message["type"] == "http.response.start":
                 await send(message)
                 await send({"type": "http.response.body", "body": b""})
-            elif not told.is_set() and message.get("more_body", False):
-                told.set()
+            elif not streaming.is_set() and message.get("more_body", False):
+                streaming.set()
                 await asyncio.sleep(0)
 
         answering = asyncio.ensure_future(self._app(asked, receive, send_head))
-        known = asyncio.ensure_future(told.wait())
+        known = asyncio.ensure_future(streaming.wait())
         try:
             await asyncio.wait({answering, known}, return_when=asyncio.FIRST_COMPLETED)
             if answering.done():

@@ -55,8 +55,8 @@ def list_scenes(services: Services, caller: AnyCaller, response: Response, searc
     While the queue is away they are those in the store, and the header `X-Intrasplat-Queue: away` says so.
     """
     caller.require(KeyScope.VIEW)
-    page, is_told = services.done.page_of(caller.tenant, search)
-    if not is_told:
+    page, is_from_queue = services.done.page_of(caller.tenant, search)
+    if not is_from_queue:
         response.headers["X-Intrasplat-Queue"] = "away"
     tell_next(response, page, caller.tenant)
     return [_summary(services, record) for record in page.records]

@@ -13,7 +13,7 @@ from intrasplat.commands.arguments import add_command
 from intrasplat.commands.exits import EXIT_CODES_HELP, ExitCode, end_by
 from intrasplat.errors import IntrasplatError, UnavailableError
 from intrasplat.machine.cores import keep_libraries_to_one_thread
-from intrasplat.machine.processes import told_to_end
+from intrasplat.machine.processes import shutdown_event
 
 SUMMARY = "claim jobs from the queue of REDIS_URL and serve renders, until a signal ends it"
 
@@ -52,7 +52,7 @@ def _consume(options: argparse.Namespace) -> int:
         raise UnavailableError("REDIS_URL is not set.", "Use `intrasplat up`, which starts a queue and a worker.")
     from worker.supervisor import run_supervisor
 
-    run_supervisor(settings, told_to_end(), renders_only=options.renders_only)
+    run_supervisor(settings, shutdown_event(), renders_only=options.renders_only)
     return ExitCode.OK
 
 

@@ -20,8 +20,8 @@ def attempt_span(record: JobRecord, worker: str) -> Iterator[Span]:
     parent = record.trace or traces.NEW
     if record.attempt == 1:
         traces.begin("wait in queue", parent, since_s=record.created_at_s, job_id=record.job_id).end()
-    told = traces.Attributes(job_id=record.job_id, attempt=record.attempt, worker=worker)
-    with traces.span("attempt", parent, kind=SpanKind.CONSUMER, **told) as span:
+    attributes = traces.Attributes(job_id=record.job_id, attempt=record.attempt, worker=worker)
+    with traces.span("attempt", parent, kind=SpanKind.CONSUMER, **attributes) as span:
         yield span
 
 

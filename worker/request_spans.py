@@ -21,8 +21,8 @@ def answer_span(turn: WaitingRequest) -> Iterator[None]:
 
 def shared_span(turn: WaitingRequest) -> None:
     """The span of a request that shares the answer to another, equal request."""
-    told = traces.Attributes(job_id=turn.request.scene_id, shared=True)
-    traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **told).end()
+    attributes = traces.Attributes(job_id=turn.request.scene_id, shared=True)
+    traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **attributes).end()
 
 
 def _came_s(turn: WaitingRequest) -> float:

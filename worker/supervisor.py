@@ -132,18 +132,18 @@ def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | Non
     end = threading.Event()
 
     def announce() -> None:
-        told: WorkerAddress | None = None
+        last: WorkerAddress | None = None
         next_s = 0.0
         while not end.wait(LOOK_PERIOD_S):
             now = address()
-            if now == told and (now is None or time.monotonic() < next_s):
+            if now == last and (now is None or time.monotonic() < next_s):
                 continue
             with contextlib.suppress(UnavailableError):
                 if now is None:
                     queue.withdraw(name)
                 else:
                     queue.announce(now)
-                told = now
+                last = now
             next_s = time.monotonic() + ANNOUNCE_PERIOD_S
 
     thread = threading.Thread(target=announce, name="announce", daemon=True)

@@ -232,12 +232,12 @@ class Views:
         detail = LEVELS[level]
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         drawn = thinned(scene, detail.gaussians)
-        told = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
+        attributes = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
         view = ViewRequest(
             drawn, request.t, pose, camera, self._device,
             highlights=highlights, is_coarse=level > 0, max_pixels=request.max_pixels,
         )  # fmt: skip
-        with traces.span("draw", **told):
+        with traces.span("draw", **attributes):
             frame = yield from frame_in_parts(view, with_confidence=request.layer is Layer.CONFIDENCE)
         range_mm = None
         if request.layer is Layer.DEPTH and request.format in FOR_EYES:
@@ -258,14 +258,14 @@ class Views:
         if request.pose is not None:
             raise InputError("eye", "an eye and a pose exclude each other.", "Leave out one of them.")
         if request.attempt is not None:
-            told = self._store.newest_report(request.scene_id, request.attempt).right_eye
+            registration = self._store.newest_report(request.scene_id, request.attempt).right_eye
         else:
             clip = self._snapshots.clip(request.scene_id)
-            told = None if clip is None else clip.registration
-        if told is None:
+            registration = None if clip is None else clip.registration
+        if registration is None:
             problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
             raise InputError("eye", problem, "Ask for eye=left.")
-        return right_eye(scene, shown_time(scene, request.t), told)
+        return right_eye(scene, shown_time(scene, request.t), registration)
 
     def _measured(self, scene: TrainedScene, request: MeasureRequest) -> Reply:
         """A Measurement as JSON. Its time does not predict that of renders."""

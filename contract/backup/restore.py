@@ -191,13 +191,13 @@ def _check_store(manifest: Manifest, settings: Settings) -> None:
 
 def _since(audits: Sequence[Path]) -> _Since:
     """The jobs whose purge has started or ended, and the revoked keys, according to these audit logs."""
-    told: dict[str, set[str]] = {AuditAction.PURGED: set(), AuditAction.KEY_REVOKED: set()}
+    ids_by_action: dict[str, set[str]] = {AuditAction.PURGED: set(), AuditAction.KEY_REVOKED: set()}
     for path in audits:
         for entry in _acts(path):
             about = entry.get("job_id") or entry.get("key_id")
-            if (action := entry["action"]) in told and about is not None:
-                told[action].add(about)
-    return _Since(frozenset(told[AuditAction.PURGED]), frozenset(told[AuditAction.KEY_REVOKED]))
+            if (action := entry["action"]) in ids_by_action and about is not None:
+                ids_by_action[action].add(about)
+    return _Since(frozenset(ids_by_action[AuditAction.PURGED]), frozenset(ids_by_action[AuditAction.KEY_REVOKED]))
 
 
 def _acts(audit: Path) -> Iterator[dict[str, str]]:

@@ -34,8 +34,8 @@ class RedisDeliveries:
 
     def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
         wait_ms = "" if wait_s is None else round(wait_s * 1000)
-        told = (delivery.event_id, loan.mark, _document(delivery), delivery.status.value, wait_ms, loan.tenant)
-        return bool(self._scripts.run("note", *told))
+        arguments = (delivery.event_id, loan.mark, _document(delivery), delivery.status.value, wait_ms, loan.tenant)
+        return bool(self._scripts.run("note", *arguments))
 
     def send_again(self, record: JobRecord) -> None:
         delivery = Delivery.of(record)
@@ -55,8 +55,8 @@ class RedisDeliveries:
                 batch.mget([f"{self._prefix}trying:{each.event_id}" for each in found])
                 due, trying = batch.execute()
         next_s = [None if is_tried else at_s for at_s, is_tried in zip(due, trying, strict=True)]
-        told = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
-        return sorted(told, key=lambda each: each.ended_at_s)
+        views = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
+        return sorted(views, key=lambda each: each.ended_at_s)
 
     def _kept(self, job_id: str) -> str:
         return f"{self._prefix}deliveries:{job_id}"

@@ -50,12 +50,12 @@ class Sentinels(Sentinel):
 def primary_of(where: QueueUrl, options: dict[str, Any]) -> Any:
     """A client of the primary. Sentinels use the URL's TLS settings, `sentinel_username` and `sentinel_password`."""
     untyped: Any = redis
-    told = untyped.connection.parse_url(where.url)
+    url_options = untyped.connection.parse_url(where.url)
     for name in ("host", "port"):
-        told.pop(name, None)
-    if told.pop("connection_class", None) is redis.SSLConnection:
-        told["ssl"] = True
-    given = options | told
+        url_options.pop(name, None)
+    if url_options.pop("connection_class", None) is redis.SSLConnection:
+        url_options["ssl"] = True
+    given = options | url_options
     asking = {name: value for name, value in given.items() if name.startswith(("ssl", "socket_"))}
     asking |= {"retry": Retry(NoBackoff(), 0), "protocol": options["protocol"]}  # the next Sentinel is asked instead
     for name in ("username", "password"):

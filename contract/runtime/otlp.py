@@ -28,10 +28,10 @@ class Recorder:
     """A tracer and the sender of its spans. The standard OTEL_ variables set destination, interval and sampling."""
 
     def __init__(self, process: str, instance: str | None = None, exporter: SpanExporter | None = None) -> None:
-        told = {"service.name": os.environ.get("OTEL_SERVICE_NAME") or f"intrasplat-{process}"}
-        told |= {"service.version": version()} | ({"service.instance.id": instance} if instance else {})
+        attributes = {"service.name": os.environ.get("OTEL_SERVICE_NAME") or f"intrasplat-{process}"}
+        attributes |= {"service.version": version()} | ({"service.instance.id": instance} if instance else {})
         self.sender = Sender(exporter or OTLPSpanExporter())
-        provider = TracerProvider(resource=Resource.create(told), shutdown_on_exit=False)
+        provider = TracerProvider(resource=Resource.create(attributes), shutdown_on_exit=False)
         provider.add_span_processor(self.sender)
         self.tracer = provider.get_tracer("intrasplat", version())
         logging.getLogger("opentelemetry").setLevel(logging.CRITICAL)  # Sender logs a failure once itself

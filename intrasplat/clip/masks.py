@@ -118,15 +118,15 @@ def no_masks(*, ignored: bool = False) -> Notice:
 def tissue_from_masks(
     masks: MaskFrames,
     shape: tuple[int, int, int],
-    told: MaskPolarity,
+    polarity: MaskPolarity,
     by_layout: tuple[str, BrightClass] | None = None,
     *,
     both_eyes: bool = False,
 ) -> TissueMasks:
     """The tissue pixels from masks. The masks are decoded only if their number and size fit `shape` (T, H, W).
 
-    The caller determines what white means (`told`), else the layout (its name and meaning of white), else the look: the
-    tool is the class that touches the border in most frames and covers less than 40 % of the area.
+    The caller determines what white means (`polarity`), else the layout (its name and meaning of white), else the look:
+    the tool is the class that touches the border in most frames and covers less than 40 % of the area.
     both_eyes: the tissue of the right eye, too, if the masks show it.
     InputError if the masks do not fit, contradict the layout, mark nothing, leave no tissue, or look ambiguous.
     """
@@ -135,7 +135,7 @@ def tissue_from_masks(
     if both_eyes and masks.right is not None:
         _check_shape((masks.right.frame_count, masks.right.height, masks.right.width), shape, "right")
     white, right = _white_of_eyes(masks, packing, both_eyes=both_eyes)
-    bright, reason = _bright_class(white, told, by_layout)
+    bright, reason = _bright_class(white, polarity, by_layout)
     if bright == "tool":
         for eye in (white, right):
             if eye is not None:
@@ -192,11 +192,11 @@ def _white(frames: ImageSequence | VideoFile) -> NDArray[np.bool_]:
 
 
 def _bright_class(
-    white: NDArray[np.bool_], told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+    white: NDArray[np.bool_], polarity: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> tuple[BrightClass, str]:
     """What white means, and the reason as text."""
-    if told != "auto":
-        return told, "as told"
+    if polarity != "auto":
+        return polarity, "as specified"
     if white.all() or not white.any():
         colour = "white" if white.any() else "black"
         raise InputError(

@@ -68,7 +68,7 @@ class LeftOut:
         """All skipped frames, rising."""
         return tuple(sorted({*self.nothing_new, *self.no_time}))
 
-    def told(self, frame_count: int) -> tuple[Notice, ...]:
+    def notices(self, frame_count: int) -> tuple[Notice, ...]:
         """The notices about them for the report."""
         found = []
         if self.nothing_new:
@@ -134,7 +134,7 @@ def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
         return clip
     found = left_out(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
     assumptions = tuple(each for each in clip.assumptions if each.code not in LEFT_OUT_CODES)
-    return replace(clip, left_out=found.frames, assumptions=(*assumptions, *found.told(clip.frame_count)))
+    return replace(clip, left_out=found.frames, assumptions=(*assumptions, *found.notices(clip.frame_count)))
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:

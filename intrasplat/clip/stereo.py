@@ -71,14 +71,14 @@ def eye_images_clip(tree: FileTree, images: tuple[str, ...], title: str) -> Ster
 
 
 def with_masks(
-    clip: StereoClip, given: MaskFrames, told: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+    clip: StereoClip, given: MaskFrames, polarity: MaskPolarity, by_layout: tuple[str, BrightClass] | None
 ) -> StereoClip:
     """The clip with its tissue pixels, also the right eye's if the masks show it (see tissue_from_masks).
 
     Without masks of the right eye, stereo warps the left eye's by their depth (intrasplat/stereo/right_eye.py).
     """
     shape = (clip.frame_count, clip.height, clip.width)
-    masks = tissue_from_masks(given, shape, told, by_layout, both_eyes=True)
+    masks = tissue_from_masks(given, shape, polarity, by_layout, both_eyes=True)
     source = "the left eye's, moved by depth" if masks.right is None else "as given"
     right = Notice.info(NoticeCode.MASKS, f"masks of the right eye: {source}")
     return replace(

@@ -52,7 +52,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         shutil.rmtree(folder, ignore_errors=True)
         raise
     flush(folder)
-    told = {
+    manifest = {
         "version": VERSION,
         "identity": identity,
         "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
@@ -65,7 +65,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         "warnings": [notice.model_dump() for notice in clip.warnings],
         "measurements": clip.measurements,
     }
-    replace_file(folder / MANIFEST, json.dumps(told).encode())
+    replace_file(folder / MANIFEST, json.dumps(manifest).encode())
 
 
 def load_clip(folder: Path, identity: str) -> DepthClip | None:
@@ -74,22 +74,22 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
     Do not write to the arrays. The files may be removed at once: the mappings last as long as the arrays.
     """
     try:
-        told = json.loads((folder / MANIFEST).read_bytes())
-        if (told["version"], told["identity"]) != (VERSION, identity):
+        manifest = json.loads((folder / MANIFEST).read_bytes())
+        if (manifest["version"], manifest["identity"]) != (VERSION, identity):
             return None
-        eyes = [_eye(folder, name, each) for name, each in zip(EYES, told["intrinsics"], strict=False)]
+        eyes = [_eye(folder, name, each) for name, each in zip(EYES, manifest["intrinsics"], strict=False)]
         return DepthClip(
             **eyes[0],
             frame_times_s=np.load(folder / f"{TIMES}.npy"),
             right=Eye(**eyes[1]) if len(eyes) > 1 else None,
-            registration=told["registration"] and RightEye.model_validate(told["registration"]),
-            masks=told["masks"] and Masks.model_validate(told["masks"]),
-            rectification=told["rectification"] and Rectification.parsed(told["rectification"]),
-            poses=told["poses"] and CameraPoses.model_validate(told["poses"]),
-            left_out=tuple(told["left_out"]),
-            assumptions=tuple(Notice.model_validate(each) for each in told["assumptions"]),
-            warnings=tuple(Notice.model_validate(each) for each in told["warnings"]),
-            measurements=told["measurements"],
+            registration=manifest["registration"] and RightEye.model_validate(manifest["registration"]),
+            masks=manifest["masks"] and Masks.model_validate(manifest["masks"]),
+            rectification=manifest["rectification"] and Rectification.parsed(manifest["rectification"]),
+            poses=manifest["poses"] and CameraPoses.model_validate(manifest["poses"]),
+            left_out=tuple(manifest["left_out"]),
+            assumptions=tuple(Notice.model_validate(each) for each in manifest["assumptions"]),
+            warnings=tuple(Notice.model_validate(each) for each in manifest["warnings"]),
+            measurements=manifest["measurements"],
         )
     except (OSError, EOFError, ValueError, KeyError, TypeError):  # no clip, or files of another program
         return None

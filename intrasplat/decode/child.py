@@ -48,8 +48,8 @@ def serve(work_of: Callable[[], Work]) -> None:
 
 def _described(error: Exception) -> dict[str, Any]:
     if isinstance(error, InputError):
-        told = {"field": error.field, "problem": error.problem, "remedy": error.remedy}
-        return told | {"kind": "limit" if isinstance(error, LimitError) else "input"}
+        description = {"field": error.field, "problem": error.problem, "remedy": error.remedy}
+        return description | {"kind": "limit" if isinstance(error, LimitError) else "input"}
     if isinstance(error, MemoryError):
         return {"kind": "memory"}
     places = "".join(traceback.format_tb(error.__traceback__))

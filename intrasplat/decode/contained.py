@@ -168,21 +168,21 @@ class Decoder:
         """Process a line, or None if none arrived for a while."""
         if line is None:
             return
-        told = json.loads(line) if line != END else {}
-        if line == END or "result" in told or "error" in told:
-            self.result = self._ended(dict(told))
-        elif "opened" in told:
-            self.opened = self.opened or dict(told["opened"])
+        message = json.loads(line) if line != END else {}
+        if line == END or "result" in message or "error" in message:
+            self.result = self._ended(dict(message))
+        elif "opened" in message:
+            self.opened = self.opened or dict(message["opened"])
         else:
-            self._note(told)
+            self._note(message)
 
-    def _note(self, told: dict[str, Any]) -> None:
-        self._field = "calibration" if told.get("field") == "calibration" else "clip"
-        if int(told["pictures"]) > self._pictures:
-            self._pictures, self._advanced_s = int(told["pictures"]), time.monotonic()
-        self.frames = max(self.frames, int(told["frames"]))
+    def _note(self, message: dict[str, Any]) -> None:
+        self._field = "calibration" if message.get("field") == "calibration" else "clip"
+        if int(message["pictures"]) > self._pictures:
+            self._pictures, self._advanced_s = int(message["pictures"]), time.monotonic()
+        self.frames = max(self.frames, int(message["frames"]))
         if self.opened is None:
-            self._on_report(min(1.0, max(0.0, float(told["share"]))))
+            self._on_report(min(1.0, max(0.0, float(message["share"]))))
 
     def _check(self) -> None:
         if self.result is not None:

@@ -155,35 +155,35 @@ def _reached(path: str) -> list[str]:
 
 
 def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | DepthClip:
-    told, folder = decoder.opened or decoder.result or {}, decoder.folder
-    frames, height, width = (int(each) for each in told["size"])
+    described, folder = decoder.opened or decoder.result or {}, decoder.folder
+    frames, height, width = (int(each) for each in described["size"])
     size = (frames, height, width)
     if min(size) < 1 or frames * height * width > allowance.file_bytes:
         raise ValueError(f"a clip of {size}")
     frame_times_s = ArrayFile(folder, "frame_times_s", size).whole()
     if not np.isfinite(frame_times_s).all():
         raise ValueError("frame times that are not finite")
-    assumptions = (*_notices(told["assumptions"]), _protection(told["granted"], allowance))
-    warnings = _notices(told["warnings"])
+    assumptions = (*_notices(described["assumptions"]), _protection(described["granted"], allowance))
+    warnings = _notices(described["warnings"])
     if decoder.opened is None:
         whole = DepthClip(
             rgb=map_array(folder, "rgb", size),
             tissue=_tissue(folder, "tissue", size),
             depth_mm=_checked_depth(map_array(folder, "depth_mm", size)),
             depth_confidence=map_array(folder, "depth_confidence", size),
-            intrinsics=Intrinsics.parsed(told["intrinsics"]),
+            intrinsics=Intrinsics.parsed(described["intrinsics"]),
             world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
             frame_times_s=frame_times_s,
-            masks=told["masks"] and Masks.model_validate(told["masks"]),
+            masks=described["masks"] and Masks.model_validate(described["masks"]),
             assumptions=assumptions,
             warnings=warnings,
         )
         decoder.close()
         return whole
-    tissue, tissue_right = (_tissue(folder, name, size) if name in told["masked"] else None for name in MASKS)
+    tissue, tissue_right = (_tissue(folder, name, size) if name in described["masked"] else None for name in MASKS)
     pairs = _ArrivingPairs(decoder, size)
     clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right)
-    return StereoRecording(clip, _calibration(told["calibration"]), decoder.close)
+    return StereoRecording(clip, _calibration(described["calibration"]), decoder.close)
 
 
 def _tissue(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[np.bool_]:
@@ -194,8 +194,8 @@ def _tissue(folder: Path, name: str, size: tuple[int, int, int]) -> NDArray[np.b
     return tissue
 
 
-def _notices(told: Any) -> tuple[Notice, ...]:
-    return tuple(Notice.model_validate(each) for each in told)
+def _notices(described: Any) -> tuple[Notice, ...]:
+    return tuple(Notice.model_validate(each) for each in described)
 
 
 def _protection(granted: list[str], allowance: Allowance) -> Notice:

@@ -59,7 +59,7 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
     options = ClipOptions.model_construct(**request["options"])  # checked by the parent; may name a user's layout
     clip = open_clip(**paths, options=options, limits=limits)
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
-    told = {
+    description = {
         "size": [clip.frame_count, height, width],
         "assumptions": [each.model_dump() for each in clip.assumptions],
         "warnings": [each.model_dump() for each in clip.warnings],
@@ -67,14 +67,14 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
         masks = clip.masks and clip.masks.model_dump()
-        return told | {"intrinsics": clip.intrinsics.numbers(), "masks": masks}
+        return description | {"intrinsics": clip.intrinsics.numbers(), "masks": masks}
     reports.reading("calibration")
     path = given_calibration or find_calibration(paths["path"], folder, limits)
     calibration = _calibration(path, clip)
     reports.reading("clip")
     masked = [name for name in MASKS if getattr(clip, name) is not None]
     write_arrays(folder, [("frame_times_s", clip.frame_times_s), *((name, getattr(clip, name)) for name in masked)])
-    reports.opened(told | {"masked": masked, "calibration": calibration})
+    reports.opened(description | {"masked": masked, "calibration": calibration})
     write_arrays(folder, _stereo_frames(clip, reports))
     return {}
 

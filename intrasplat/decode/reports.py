@@ -38,10 +38,10 @@ class Reports:
             self.field = field
             self._report()
 
-    def opened(self, told: dict[str, Any]) -> None:
+    def opened(self, description: dict[str, Any]) -> None:
         """Report the clip before its first frame."""
         with self._lock:
-            self._send({"opened": told | {"granted": self._granted}})
+            self._send({"opened": description | {"granted": self._granted}})
 
     def end(self, result: dict[str, Any]) -> None:
         """Send the last line: the result."""
@@ -54,8 +54,8 @@ class Reports:
             self._send({"error": error})
 
     def _report(self) -> None:
-        told = {"pictures": self._pictures, "frames": self.frames, "share": self.share, "field": self.field}
-        self._send(told)
+        progress = {"pictures": self._pictures, "frames": self.frames, "share": self.share, "field": self.field}
+        self._send(progress)
 
     def _send(self, line: dict[str, Any]) -> None:
         self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")

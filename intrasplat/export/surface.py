@@ -84,11 +84,11 @@ def surface(target: ExportTarget) -> Generator[bytes, None, Mesh]:
         yield b""
     points_mm = np.concatenate([view.points_mm() for view in views])
     volume = yield from _fused(views, points_mm)
-    told = volume.weight > 0
-    if not (told.any() and volume.distance[told].min() < 0 < volume.distance[told].max()):
+    observed = volume.weight > 0
+    if not (observed.any() and volume.distance[observed].min() < 0 < volume.distance[observed].max()):
         raise _nothing()
     yield b""
-    vertices, faces, _, _ = marching_cubes(volume.distance, 0.0, mask=_whole_cubes(told))
+    vertices, faces, _, _ = marching_cubes(volume.distance, 0.0, mask=_whole_cubes(observed))
     if not len(faces):
         raise _nothing()
     yield b""
@@ -179,17 +179,17 @@ def _fuse(
     pixel = np.where(inside, row * camera.width + column, 0)
     depth_mm = view.depth_mm.ravel()[pixel]
     before_mm = depth_mm - ahead
-    told = inside & (depth_mm > 0) & (before_mm > -truncation_mm)
+    observed = inside & (depth_mm > 0) & (before_mm > -truncation_mm)
     share = np.minimum(before_mm / np.float32(truncation_mm), np.float32(1))
-    distance += np.where(told, share, np.float32(0))
-    weight += told
+    distance += np.where(observed, share, np.float32(0))
+    weight += observed
     for channel in range(3):
-        colour[channel] += np.where(told, view.rgb[..., channel].ravel()[pixel], np.uint8(0))
+        colour[channel] += np.where(observed, view.rgb[..., channel].ravel()[pixel], np.uint8(0))
 
 
-def _whole_cubes(told: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _whole_cubes(observed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """[X, Y, Z] whether all corners of the cube that ends at a voxel are known: scikit-image reads the last corner."""
-    whole = told.copy()
+    whole = observed.copy()
     for axis in range(3):
         first, rest = (np.moveaxis(whole, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
         rest &= first.copy()

@@ -41,14 +41,14 @@ def with_instruments_found(
     finder = Finder.of((clip.rgb[i] for i in looked_at(measured)), segmenter)
     tissue = mapped_zeros(clip.tissue.shape, np.bool_)
     wanted = clip.used
-    told = np.zeros((clip.frame_count, 3))
+    evidence = np.zeros((clip.frame_count, 3))
 
     def find(i: int) -> float:
         if hooks.should_stop():
             raise Cancelled("stopped while finding instruments")
         found: FoundMask = finder(clip.rgb[i], lambda coarse: nearness_of(coarse, clip.depth_mm[i]))
         tissue[i] = clip.tissue[i] & ~found.tool
-        told[i] = found.seen, found.clear, found.missed
+        evidence[i] = found.seen, found.clear, found.missed
         masked = 1 - float(tissue[i].mean())
         let_go(tissue[i])
         clip.let_go(i)
@@ -61,10 +61,10 @@ def with_instruments_found(
             shares.append(masked)
             hooks.report_stage(STAGE, len(shares) / len(wanted))
     share = float(np.mean(shares))
-    masks, assumption, doubts = finder.told(share, told[list(wanted)])
+    masks, assumption, warnings = finder.report(share, evidence[list(wanted)])
     kept = (each for each in clip.assumptions if each.code is not NoticeCode.MASKS)
     return replace(
-        clip, tissue=tissue, masks=masks, assumptions=(*kept, assumption), warnings=(*clip.warnings, *doubts)
+        clip, tissue=tissue, masks=masks, assumptions=(*kept, assumption), warnings=(*clip.warnings, *warnings)
     )
 
 

@@ -44,7 +44,7 @@ class Finder:
         picture = Looked.at(rgb)
         return find_instruments(picture, nearness(picture.coarse), self.look)
 
-    def told(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:
+    def report(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:
         """The report's entry on masks, the assumption, and warnings.
 
         Args:
@@ -54,23 +54,23 @@ class Finder:
         seen, clear, missed = found.mean(axis=0)
         sure = float(clear / seen) if seen > 0 else 1.0
         how = "found by colour and depth" if self.segmenter is None else "found by this installation's segmenter"
-        told = Masks(source="found" if self.segmenter is None else "segmenter", share=share, sure=sure)
+        masks = Masks(source="found" if self.segmenter is None else "segmenter", share=share, sure=sure)
         text = f"masks: none given; instruments were {how} in {share:.1%} of the picture"
         warnings = []
         if sure < MIN_SURE or seen - clear > MAX_UNSURE:
-            doubt = (
-                f"No masks were given, and of what looks like instruments only {sure:.0%} is told clearly from tissue: "
-                "some may be modelled as tissue, or tissue left out. Give masks."
+            problem = (
+                f"No masks were given, and only {sure:.0%} of what looks like instruments is clearly distinct from "
+                "tissue: some may be modelled as tissue, or tissue left out. Give masks."
             )
-            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
+            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, problem))
         elif missed > MAX_MISSED:
-            doubt = (
+            problem = (
                 f"No masks were given, and {missed:.1%} of the picture may be instruments that were not found: they "
                 "lie on the tissue or are wholly inside the picture. Whatever is not masked is modelled as tissue: if "
                 "they are instruments, give masks."
             )
-            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, doubt))
-        return told, Notice.info(NoticeCode.MASKS, text), tuple(warnings)
+            warnings.append(Notice.warning(NoticeCode.MASKS_UNSURE, problem))
+        return masks, Notice.info(NoticeCode.MASKS, text), tuple(warnings)
 
 
 def looked_at(frames: Sequence[int]) -> Sequence[int]:

@@ -15,7 +15,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
 
 
-def told_to_end() -> threading.Event:
+def shutdown_event() -> threading.Event:
     """An event that the next SIGINT or SIGTERM sets. Call it from the main thread."""
     end = threading.Event()
     signals: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -34,10 +34,10 @@ def told_to_end() -> threading.Event:
 
 @contextmanager
 def heeding_signals() -> Iterator[threading.Event]:
-    """Context manager around told_to_end(); afterwards the previous signal handlers are restored."""
+    """Context manager around shutdown_event(); afterwards the previous signal handlers are restored."""
     before = {number: signal.getsignal(number) for number in _ENDING}
     try:
-        yield told_to_end()
+        yield shutdown_event()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -125,7 +125,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     known = sorted({*used, *others})
     for i in clip.left_out:
         path[i] = between(known, path[known], i)
-    return _told(path, used, fit, gauge, half_mm, frames, unsure)
+    return _found_path(path, used, fit, gauge, half_mm, frames, unsure)
 
 
 def _unknown(count: int) -> FoundPath:
@@ -170,7 +170,7 @@ def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index:
     return pose, share
 
 
-def _told(
+def _found_path(
     path: Reals, used: Sequence[int], fit: Fit, gauge: Gauged, half_mm: float, frames: Frames, unsure: Sequence[int]
 ) -> FoundPath:
     mine = path[list(used)]

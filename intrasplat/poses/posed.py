@@ -131,20 +131,22 @@ def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) 
         f"rigid parts within {found.rigid_fit_mm:.2f} mm, and is good to {found.sigma_mm:.1f} mm and "
         f"{found.sigma_deg:.1f} degrees"
     )
-    told = _told(clip, "estimated", found)
+    entry = _report_entry(clip, "estimated", found)
     clip = placed(clip, found.world_from_camera)
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
-    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+    return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
 
 
 def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings: Notice) -> DepthClip:
-    told = CameraPoses(source="fixed")
+    entry = CameraPoses(source="fixed")
     if found is not None:
-        told = _told(clip, "fixed", found).model_copy(update={"path_mm": None, "extent_mm": None, "extent_deg": None})
+        entry = _report_entry(clip, "fixed", found).model_copy(
+            update={"path_mm": None, "extent_mm": None, "extent_deg": None}
+        )
     if not (clip.world_from_camera == np.eye(4)).all():
         clip = placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
-    return replace(clip, poses=told, assumptions=notices, warnings=(*clip.warnings, *warnings))
+    return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
 
 
 def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
@@ -156,7 +158,7 @@ def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip
     return replace(clip, world_from_camera=world_from_camera, right=right)
 
 
-def _told(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
+def _report_entry(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
     """A path's entry in the report."""
     frame_s = float(np.median(np.diff(clip.frame_times_s)))
     return CameraPoses(

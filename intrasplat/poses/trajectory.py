@@ -74,13 +74,15 @@ def read_tum(path: Path) -> tuple[Reals, Reals]:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError("--against", f"{path} cannot be read as a TUM file ({error}).", remedy) from error
-    told = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    if not told:
+    numbered = [
+        (number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
+    ]
+    if not numbered:
         raise InputError("--against", f"{path} holds no pose.", remedy)
-    for number, words in told:
+    for number, words in numbered:
         if len(words) != 8 or not all(_is_number(word) for word in words):
             raise InputError("--against", f"line {number} of {path} does not hold 8 finite numbers.", remedy)
-    rows = np.array([words for _, words in told], np.float64)
+    rows = np.array([words for _, words in numbered], np.float64)
     lengths = np.linalg.norm(rows[:, 4:], axis=1)
     if not np.allclose(lengths, 1, atol=0.01):
         raise InputError("--against", f"{path} holds quaternions that are not of length 1.", remedy)

@@ -119,18 +119,18 @@ def estimate_depth(
     _check_depth(sure_share)
     share = 1 - pixels / (len(wanted) * clip.tissue[0].size)
     masks, assumptions = Masks(source="given", share=share), clip.assumptions
-    doubts: tuple[Notice, ...] = ()
+    mask_warnings: tuple[Notice, ...] = ()
     if finder is not None:
-        masks, told, doubts = finder.told(share, work.sure[wanted])
-        assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), told)
+        masks, assumption, mask_warnings = finder.report(share, work.sure[wanted])
+        assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), assumption)
     return replace(
         work.matched,
         left_out=unused.frames,
         masks=masks,
         rectification=clip.rectification,
-        assumptions=(*assumptions, _scale_assumption(clip), *unused.told(clip.frame_count)),
+        assumptions=(*assumptions, _scale_assumption(clip), *unused.notices(clip.frame_count)),
         warnings=clip.warnings
-        + doubts
+        + mask_warnings
         + registration.notices
         + _warnings(sure_share)
         + _range_warnings(outside, depth_range_mm),

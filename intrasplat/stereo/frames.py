@@ -99,7 +99,7 @@ class FrameWork:
             world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
             frame_times_s=clip.frame_times_s,
             right=right,
-            registration=registration.told,
+            registration=registration.report_entry,
         )
         return cls(clip, plan, registration, matched, right, label, finder)
 

@@ -152,7 +152,7 @@ class Registration:
         return self.colours.corrected(right) if self.recolours else right
 
     @property
-    def told(self) -> RightEye:
+    def report_entry(self) -> RightEye:
         """The report's entry on the right eye."""
         turn, camera, colours = self.turn, self.camera, self.colours if self.recolours else Colours()
         return RightEye(

@@ -29,7 +29,7 @@ CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600, 
 UNSCORED_S = 2.0
 """Seconds at the start without a score, which would delay the user by a third of a second and say little so early."""
 REPORT_EVERY_S = 0.25
-TOLD_AFTER_S = 1.0
+REMAINING_AFTER_S = 1.0
 """Seconds of training after which the remaining time is reported. The run's state is written to disk during the first
 steps, so they do not show how long the others take."""
 
@@ -82,7 +82,7 @@ def train(
         TrainingDiverged: the loss or a parameter is not finite, or no Gaussian is visible.
     """
     marks = [mark for mark in CURVE_SECONDS if mark > clock.elapsed_s + UNSCORED_S]
-    reported, began, begun_at = -math.inf, clock.elapsed_s, run.iteration
+    reported, began, first = -math.inf, clock.elapsed_s, run.iteration
     hooks.on_progress(run.progress("train", run.iteration / run.iterations))
     while run.iteration < run.iterations:
         if hooks.should_stop():
@@ -97,7 +97,7 @@ def train(
         if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
             reported = now
             made_s = now - began
-            left_s = made_s / (iteration - begun_at) * (run.iterations - iteration) if made_s > TOLD_AFTER_S else None
+            left_s = made_s / (iteration - first) * (run.iterations - iteration) if made_s > REMAINING_AFTER_S else None
             hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
     check_sums(run.model.wait(), run.iteration)
     _check_finite(run)

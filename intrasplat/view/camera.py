@@ -43,10 +43,10 @@ def endoscope_pose(scene: TrainedScene, t: float) -> NDArray[np.float64]:
     return pose
 
 
-def right_eye(scene: TrainedScene, t: float, told: RightEye) -> tuple[NDArray[np.float64], Intrinsics]:
-    """world_from_camera [4, 4] (mm) and lens of the right eye at model time t. told: what the scene's report says."""
-    lens = dataclasses.replace(scene.intrinsics, fx=told.fx_px, fy=told.fy_px, cx=told.cx_px, cy=told.cy_px)
-    return endoscope_pose(scene, t) @ np.array(told.left_from_right).reshape(4, 4), lens
+def right_eye(scene: TrainedScene, t: float, eye: RightEye) -> tuple[NDArray[np.float64], Intrinsics]:
+    """world_from_camera [4, 4] (mm) and lens of the right eye at model time t. eye: what the scene's report says."""
+    lens = dataclasses.replace(scene.intrinsics, fx=eye.fx_px, fy=eye.fy_px, cx=eye.cx_px, cy=eye.cy_px)
+    return endoscope_pose(scene, t) @ np.array(eye.left_from_right).reshape(4, 4), lens
 
 
 def view_camera(

@@ -35,15 +35,15 @@ def measured(
     """
     shown, outside = held_in_clip(scene, t)
     places = places_at(scene, shown, world_from_camera, camera, points, device)
-    told = tuple(
+    measured = tuple(
         _point(number, point, place, camera) for number, (point, place) in enumerate(zip(points, places, strict=True))
     )
     distance = None
-    if len(places) == 2 and all(each.refusal is None for each in told):
+    if len(places) == 2 and all(each.refusal is None for each in measured):
         distance = _distance(scene, distances(scene, shown, places[0], places[1], device))
     warnings: tuple[Notice, ...] = (*outside, *scene.pose_warnings)
     range_mm = renderer_of(scene, device).depth_range.before(world_from_camera)
-    return Measurement(t=shown, points=told, distance=distance, depth_range_mm=range_mm, warnings=warnings)
+    return Measurement(t=shown, points=measured, distance=distance, depth_range_mm=range_mm, warnings=warnings)
 
 
 def _point(number: int, point: Point, place: MeasuredPlace, camera: Intrinsics) -> MeasuredPoint:
@@ -73,7 +73,7 @@ def _refusal(field: str, place: MeasuredPlace) -> Refusal | None:
 
 
 def _distance(scene: TrainedScene, found: Distances) -> MeasuredDistance:
-    def told(values: NDArray[np.float64]) -> tuple[float | None, ...]:
+    def rounded(values: NDArray[np.float64]) -> tuple[float | None, ...]:
         return tuple(
             round(float(value), DIGITS) if known else None for value, known in zip(values, found.known, strict=True)
         )
@@ -83,8 +83,8 @@ def _distance(scene: TrainedScene, found: Distances) -> MeasuredDistance:
         uncertainty_mm=round(EXPANDED * found.now_uncertainty_mm, DIGITS),
         t=tuple(frame / scene.frame_count for frame in range(scene.frame_count)),
         time_s=tuple(scene.frame_times_s.tolist()),
-        distances_mm=told(found.distances_mm),
-        uncertainties_mm=told(EXPANDED * found.uncertainties_mm),
+        distances_mm=rounded(found.distances_mm),
+        uncertainties_mm=rounded(EXPANDED * found.uncertainties_mm),
         first_mm=tuple(_rounded(each) for each in found.paths_mm[0]),
         second_mm=tuple(_rounded(each) for each in found.paths_mm[1]),
     )

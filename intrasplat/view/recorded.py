@@ -65,7 +65,7 @@ def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Record
         for path, png in masks.items() if is_masked else ():
             archive.writestr(zipfile.ZipInfo(path), png)
     height, width = size
-    told = Recorded(
+    summary = Recorded(
         frames=tuple(frames),
         eyes=tuple(eyes),
         width=width,
@@ -73,7 +73,7 @@ def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Record
         masks=is_masked,
         size_bytes=content.tell(),
     )
-    return content.getvalue(), told
+    return content.getvalue(), summary
 
 
 def live_frame(

@@ -41,13 +41,13 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = f"""
 import functools, sys
 from contract.runtime.logs import configure
-from intrasplat.machine.processes import told_to_end
+from intrasplat.machine.processes import shutdown_event
 from contract.runtime.settings import Settings
 from worker import supervisor
 supervisor.RedisQueue = functools.partial(supervisor.RedisQueue, lease_s={LEASE_S})
 settings = Settings.from_environment()
 configure(settings, settings.worker_name)
-supervisor.run_supervisor(settings, told_to_end(), [sys.executable, {str(STANDIN)!r}])
+supervisor.run_supervisor(settings, shutdown_event(), [sys.executable, {str(STANDIN)!r}])
 """
 """A worker as `python -m worker consume` makes one, with shorter leases and a child that needs no torch."""
 

@@ -68,7 +68,7 @@ def test_the_class_on_the_border_with_the_smaller_area_is_the_tool(studio, frame
 def test_what_was_told_wins_over_the_look(studio, frames: Path) -> None:
     clip = open_with(frames, masks=studio.masks("masks", studio.tool()), mask_polarity="tissue")
     np.testing.assert_array_equal(clip.tissue, studio.tool())
-    assert "masks: white is tissue (as told)" in texts(clip.assumptions)
+    assert "masks: white is tissue (as specified)" in texts(clip.assumptions)
 
 
 def test_a_small_class_that_touches_no_border_asks_for_the_polarity(studio, frames: Path) -> None:

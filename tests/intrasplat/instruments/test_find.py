@@ -146,7 +146,7 @@ def test_tissue_and_masked_instruments_are_not_counted_as_missed() -> None:
     ],
 )
 def test_what_was_missed_or_is_unsure_is_told(clear: float, missed: float, codes: list[NoticeCode]) -> None:
-    _, _, doubts = Finder(TissueLook(0.3)).told(0.1, np.array([[0.1, clear, missed], [0.1, clear, missed]]))
+    _, _, doubts = Finder(TissueLook(0.3)).report(0.1, np.array([[0.1, clear, missed], [0.1, clear, missed]]))
     assert [each.code for each in doubts] == codes
 
 

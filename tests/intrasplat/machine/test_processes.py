@@ -12,8 +12,8 @@ from intrasplat.machine.processes import heeding_signals
 
 PROGRAM = """
 import os, signal, sys, time
-from intrasplat.machine.processes import told_to_end
-end = told_to_end()
+from intrasplat.machine.processes import shutdown_event
+end = shutdown_event()
 with end._cond:  # as end.wait() does for a moment
     os.kill(os.getpid(), int(sys.argv[1]))
     time.sleep(0.05)
