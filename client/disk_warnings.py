@@ -10,7 +10,7 @@ from intrasplat.files.disk import FULL_REMEDY, Disk
 LOOK_PERIOD_S = 1.0
 
 
-class RoomWatch:
+class DiskWatch:
     """Checks the data directory's disk every LOOK_PERIOD_S. say: prints a message of the launcher."""
 
     def __init__(self, disk: Disk, min_free_bytes: int, say: Callable[[str], None]) -> None:

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from client.disk_warnings import RoomWatch
+from client.disk_warnings import DiskWatch
 from client.page import DASHBOARD
 from contract.access.keys import check_keys
 from contract.queue.embedded import EmbeddedServer, ServerEnd
@@ -61,7 +61,7 @@ class Installation:
         self._lock = FolderLock(data_dir / "run" / UP_LOCK)
         self._queue = EmbeddedServer(data_dir) if settings.redis_url is None else None
         self._queue_at_s = 0.0
-        self.room = RoomWatch(Disk(data_dir), settings.min_free_bytes, say)
+        self.disk = DiskWatch(Disk(data_dir), settings.min_free_bytes, say)
         redis_url = settings.redis_url if self._queue is None else self._queue.url
         self.settings = settings.model_copy(
             update={"data_dir": data_dir, "redis_url": redis_url, "dashboard_dir": DASHBOARD}
@@ -113,14 +113,14 @@ class Installation:
 
     def watch(self) -> None:
         """Restart the processes that have ended; call it often. Raises UnavailableError if a child cannot run here."""
-        self.room.look()
+        self.disk.look()
         self._watch_queue()
         for child in (self.service, *self.workers):
             try:
                 ended = child.watch()
             except UnavailableError as lack:
-                self.room.look(now=True)
-                if self.room.is_full:  # the child could not write to disk that what it lacks may come back
+                self.disk.look(now=True)
+                if self.disk.is_full:  # the child could not write to disk that what it lacks may come back
                     continue
                 raise UnavailableError(f"The {child.name} cannot work here: {lack.problem}", lack.remedy) from lack
             if ended is not None:
@@ -135,10 +135,10 @@ class Installation:
             if end is None:
                 return
         except StoreFullError:
-            self.room.look(now=True)
+            self.disk.look(now=True)
         else:
-            self.room.look(now=True)
-            if not self.room.is_full:
+            self.disk.look(now=True)
+            if not self.disk.is_full:
                 say(f"the queue's server {QUEUE_ENDS[end]} and was started again; nothing it had accepted is lost")
         self._queue_at_s = time.monotonic() + QUEUE_PERIOD_S
 
@@ -150,7 +150,7 @@ class Installation:
         deadline_s = time.monotonic() + timeout_s
         asked_s = 0.0
         with Client(self.url) as client:
-            while time.monotonic() < deadline_s and not is_ended() and not self.room.is_short:
+            while time.monotonic() < deadline_s and not is_ended() and not self.disk.is_short:
                 self.watch()
                 if time.monotonic() > asked_s + READY_PERIOD_S:
                     asked_s = time.monotonic()
@@ -202,11 +202,11 @@ def _run(settings: Settings, worker_count: int, ready_timeout_s: float, end: thr
         if not installation.wait_until_ready(end.is_set, ready_timeout_s):
             if end.is_set():
                 return
-            if not installation.room.is_short:
+            if not installation.disk.is_short:
                 raise UnavailableError(
                     "The worker did not become ready.", "Its messages are above; try `intrasplat doctor`."
                 )
-        state = "read-only" if installation.room.is_short else "ready"
+        state = "read-only" if installation.disk.is_short else "ready"
         say(f"{state}: {installation.url}/   data: {installation.settings.data_dir}   end with Ctrl-C")
         while not end.wait(WATCH_PERIOD_S):
             installation.watch()

@@ -14,7 +14,7 @@ from contract.runtime.settings import Settings
 from contract.store.store import Store
 from intrasplat.errors import LimitError
 from service.partial import promised_bytes
-from service.problems import LENGTH_REMEDY, Problem, no_room_for, room_remedy
+from service.problems import LENGTH_REMEDY, Problem, disk_full_for_upload, space_remedy
 from service.upload import LIMIT_REMEDY
 
 MIN_BYTES = 4096
@@ -69,17 +69,17 @@ class Intake:
         if declared_bytes > self._settings.max_upload_bytes:
             problem = f"{declared_bytes} bytes are more than the {self._settings.max_upload_bytes} of an upload."
             raise LimitError(part, problem, LIMIT_REMEDY)
-        room_bytes = self.room_bytes()
-        if declared_bytes > room_bytes:
-            raise no_room_for(declared_bytes, room_bytes, self._settings.min_free_bytes)
+        available_bytes = self.available_bytes()
+        if declared_bytes > available_bytes:
+            raise disk_full_for_upload(declared_bytes, available_bytes, self._settings.min_free_bytes)
         own_bytes = self._kept_bytes(tenant)
-        allowed_bytes = self._settings.tenant_share * (room_bytes + own_bytes)
+        allowed_bytes = self._settings.tenant_share * (available_bytes + own_bytes)
         if own_bytes and own_bytes + declared_bytes > allowed_bytes:
             detail = f"Your uploads have been promised {own_bytes} bytes that have not come, and {declared_bytes} more "
             detail += f"are beyond the {allowed_bytes:.0f} of one tenant."
             raise Problem(429, detail, field="uploads", remedy="Send them, or give some up: DELETE /uploads/{id}.")
 
-    def has_room(self) -> bool:
+    def has_free_space(self) -> bool:
         """Whether the disk has more than the minimum free space; otherwise no clip is accepted."""
         return self.missing_bytes() <= 0
 
@@ -87,11 +87,11 @@ class Intake:
         """How many more bytes must be free before clips are accepted."""
         return self._settings.min_free_bytes - self._store.free_bytes()
 
-    def room_remedy(self) -> str:
+    def space_remedy(self) -> str:
         """The remedy for a full disk, with the number of missing bytes."""
-        return room_remedy(self.missing_bytes(), self._settings.min_free_bytes)
+        return space_remedy(self.missing_bytes(), self._settings.min_free_bytes)
 
-    def room_bytes(self) -> int:
+    def available_bytes(self) -> int:
         """Bytes that may be written now: free space less the minimum and what is reserved for uploads."""
         return self._store.free_bytes() - self._settings.min_free_bytes - self._kept_bytes()
 

@@ -14,13 +14,13 @@ from starlette.websockets import WebSocketState
 
 from contract.queue.interface import QueueFullError
 from intrasplat.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
-from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
 """Default Retry-After of 423, 429 and 503."""
 API_REMEDY = "The API is described at /openapi.json."
-ROOM_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
+SPACE_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"
 LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
 SCENES_REMEDY = "GET /scenes lists what there is."
@@ -126,15 +126,15 @@ def problem_of(error: Exception) -> Problem | None:
         case QueueFullError():
             return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
         case StoreFullError():
-            return no_room(error.problem, error.remedy)
+            return disk_full(error.problem, error.remedy)
         case UnavailableError():
             return Problem(503, error.problem, remedy=error.remedy)
         case RequestValidationError():
             return _problem_of_validation(error)
         case HTTPException():
             return _problem_of_http_exception(error)
-        case OSError() if error.errno in NO_ROOM:
-            return no_room("The data directory's disk is full.")
+        case OSError() if error.errno in DISK_FULL_ERRNOS:
+            return disk_full("The data directory's disk is full.")
         case _:
             return None
 
@@ -144,18 +144,18 @@ def fault() -> Problem:
     return Problem(500, "Something went wrong in the service; its log has the details.", remedy=FAULT_REMEDY)
 
 
-def no_room(detail: str, remedy: str = ROOM_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:
+def disk_full(detail: str, remedy: str = SPACE_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:
     """The answer when the disk is full; its member `code` is "store_full"."""
     return Problem(status, detail, field=field, remedy=remedy, extensions={"code": ErrorCode.STORE_FULL.value})
 
 
-def no_room_for(upload_bytes: int, room_bytes: int, min_free_bytes: int) -> Problem:
-    """The answer to an upload of upload_bytes when only room_bytes may be written."""
-    detail = f"The disk has room for {max(room_bytes, 0)} bytes of an upload, and {upload_bytes} are needed."
-    return no_room(detail, room_remedy(upload_bytes - room_bytes, min_free_bytes))
+def disk_full_for_upload(upload_bytes: int, available_bytes: int, min_free_bytes: int) -> Problem:
+    """The answer to an upload of upload_bytes when only available_bytes may be written."""
+    detail = f"The disk has room for {max(available_bytes, 0)} bytes of an upload, and {upload_bytes} are needed."
+    return disk_full(detail, space_remedy(upload_bytes - available_bytes, min_free_bytes))
 
 
-def room_remedy(missing_bytes: int | None, min_free_bytes: int) -> str:
+def space_remedy(missing_bytes: int | None, min_free_bytes: int) -> str:
     """The remedy for a disk with too little free space. missing_bytes None: not shown to the caller."""
     amount = "space" if missing_bytes is None else f"{missing_bytes} bytes"
     return f"Free {amount}, such as by DELETE /scenes/{{id}}: {min_free_bytes} must stay free ({MIN_FREE})."

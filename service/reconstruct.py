@@ -36,7 +36,7 @@ from service.callbacks import check_callback
 from service.deps import AnyCaller, Deps, Services
 from service.intake import declared_length
 from service.partial import Partial, find_partial
-from service.problems import RETRY_AFTER_S, Problem, no_room
+from service.problems import RETRY_AFTER_S, Problem, disk_full
 from service.retention import check_retention
 from service.reuse import add_files_of, earlier_job, first_job
 from service.upload import CLIP_FORM, LIMIT_REMEDY, PARTS, Form, Received, UploadLimits, receive_upload
@@ -123,8 +123,8 @@ async def receive_form(
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
-            room_bytes = services.intake.room_bytes() + place.kept_bytes
-            limits = UploadLimits(settings.max_upload_bytes, room_bytes, settings.min_free_bytes)
+            available_bytes = services.intake.available_bytes() + place.kept_bytes
+            limits = UploadLimits(settings.max_upload_bytes, available_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
             with traces.span("receive"):
                 body = services.intake.body(request, place)
@@ -172,9 +172,9 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     received.callback_url = submission.callback_url
     received.names = {part: partial.path.name for part, partial in partials.items()}
     received.check_clip()  # before anything is read
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as locks:
         for partial in partials.values():
-            held.enter_context(_held(partial))
+            locks.enter_context(_locked(partial))
         return _make_job_of(services, caller, partials, received, key)
 
 
@@ -186,8 +186,8 @@ def _make_job_of(
     Raises:
         Problem: 507: the disk is full; the uploads stay.
     """
-    if not services.intake.has_room():
-        raise no_room("The disk has too little room; the uploads are kept.", services.intake.room_remedy())
+    if not services.intake.has_free_space():
+        raise disk_full("The disk has too little room; the uploads are kept.", services.intake.space_remedy())
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:
@@ -209,7 +209,7 @@ def _make_job_of(
     return record
 
 
-def _held(partial: Partial) -> RawIOBase:
+def _locked(partial: Partial) -> RawIOBase:
     """The upload's file, locked: no other request writes to it or creates a job from it meanwhile."""
     try:
         return partial.open()

@@ -99,7 +99,7 @@ class Server(uvicorn.Server):
             server_header=False,
             timeout_keep_alive=KEEP_ALIVE_S,
             timeout_graceful_shutdown=GRACE_S,
-            limit_concurrency=room_for_connections(),
+            limit_concurrency=max_connections(),
             backlog=BACKLOG,
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ws_max_size=MAX_MESSAGE_BYTES,
@@ -118,7 +118,7 @@ class Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def room_for_connections() -> int:
+def max_connections() -> int:
     """How many connections the limit of open files allows. Raises that limit if permitted."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_CONNECTIONS + SPARE_FILES

@@ -17,7 +17,7 @@ from intrasplat.picture import ImageFormat, Layer
 from intrasplat.version import version
 from service.bodies import TEXT
 from service.deps import AnyCaller, EarlyCaller, Services
-from service.problems import Problem, no_room, room_remedy
+from service.problems import Problem, disk_full, space_remedy
 from service.renderer import WORKER_REMEDY
 from service.upload import SUFFIXES
 
@@ -59,8 +59,8 @@ async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
     # Check for a full disk first, because it may stop the queue too.
     missing_bytes = await run_in_threadpool(services.intake.missing_bytes)
     if missing_bytes > 0:
-        remedy = room_remedy(None if caller is None else missing_bytes, services.settings.min_free_bytes)
-        raise no_room("The disk has too little room.", remedy, status=503, field="disk")
+        remedy = space_remedy(None if caller is None else missing_bytes, services.settings.min_free_bytes)
+        raise disk_full("The disk has too little room.", remedy, status=503, field="disk")
     try:
         workers = await run_in_threadpool(services.questions.ask, services.queue.workers, QUEUE_PATIENCE_S)
     except UnavailableError as error:

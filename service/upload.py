@@ -19,7 +19,7 @@ from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, Labels, parse_labe
 from contract.wire.webhooks import CALLBACK_PART
 from intrasplat.errors import InputError, LimitError
 from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
-from service.problems import Problem, no_room_for
+from service.problems import Problem, disk_full_for_upload
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
 SUFFIXES = {
@@ -86,7 +86,7 @@ class UploadLimits:
     """Limits of an upload: total bytes, and bytes until the disk has less than min_free_bytes left."""
 
     upload_bytes: int
-    room_bytes: int
+    available_bytes: int
     min_free_bytes: int
 
 
@@ -219,9 +219,9 @@ class _Receiver:
         if self._received.total_bytes > self._limits.upload_bytes:
             problem = f"the upload is larger than {self._limits.upload_bytes} bytes."
             raise LimitError(self._form.main_part, problem, LIMIT_REMEDY)
-        if self._received.total_bytes > self._limits.room_bytes:
+        if self._received.total_bytes > self._limits.available_bytes:
             limits = self._limits
-            raise no_room_for(self._received.total_bytes, limits.room_bytes, limits.min_free_bytes)
+            raise disk_full_for_upload(self._received.total_bytes, limits.available_bytes, limits.min_free_bytes)
         self._parser.write(chunk)
 
     def finish(self) -> Received:

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from contract.wire.rendering import RenderRequest
 from worker.reply import Reply
 
-MAX_KEPT_BYTES = 32 * 2**20
+MAX_CACHE_BYTES = 32 * 2**20
 
 
-class KeptReplies:
+class ReplyCache:
     """The most recently used replies by request, of at most max_bytes in all."""
 
-    def __init__(self, max_bytes: int = MAX_KEPT_BYTES) -> None:
+    def __init__(self, max_bytes: int = MAX_CACHE_BYTES) -> None:
         self._max_bytes = max_bytes
         self._bytes = 0
         self._replies: OrderedDict[RenderRequest, Reply] = OrderedDict()
@@ -34,7 +34,7 @@ class KeptReplies:
         """Store a reply; drop the least recently used ones to make space."""
         self.drop(lambda each: each == request)
         if len(reply.body) <= self._max_bytes // 4:
-            self._replies[request] = dataclasses.replace(reply, is_kept=True)
+            self._replies[request] = dataclasses.replace(reply, is_untimed=True)
             self._bytes += len(reply.body)
         while self._bytes > self._max_bytes:
             self._bytes -= len(self._replies.popitem(last=False)[1].body)

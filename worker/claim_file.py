@@ -16,7 +16,7 @@ from intrasplat.errors import UnavailableError
 logger = logging.getLogger("intrasplat.worker")
 
 
-class HeldClaim:
+class ClaimFile:
     """The claim file of one worker. It only saves time: if it cannot be used, the lease expires instead."""
 
     def __init__(self, path: Path) -> None:

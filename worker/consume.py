@@ -27,8 +27,8 @@ from contract.wire.job import JobProgress, JobRecord, JobState
 from intrasplat.errors import ErrorCode, IntrasplatError, UnavailableError
 from intrasplat.files.disk_errors import StoreFullError
 from worker.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
-from worker.claim_file import HeldClaim
-from worker.disk_space import Room
+from worker.claim_file import ClaimFile
+from worker.disk_space import FreeSpace
 from worker.hang import HangDetector
 from worker.heartbeat import Heartbeat
 from worker.job_errors import describe
@@ -76,7 +76,7 @@ class Consumer:
         end: threading.Event,
         min_free_bytes: int = 0,
     ) -> None:
-        self._room = Room(store, min_free_bytes)
+        self._free_space = FreeSpace(store, min_free_bytes)
         self._queue = queue
         self._store = store
         self._keeper = keeper
@@ -84,7 +84,7 @@ class Consumer:
         self._owner = owner
         self._end = end
         self._left = LeftScores(queue, store, name, end)
-        self.held = HeldClaim(store.run_dir / f"{name}.claim")
+        self.claim_file = ClaimFile(store.run_dir / f"{name}.claim")
         self.job_id: str | None = None
 
     def run(self, claim_timeout_s: float = CLAIM_TIMEOUT_S) -> None:
@@ -95,7 +95,7 @@ class Consumer:
         """
         away = short = False
         while (child := self._keeper.child(self._end)) is not None:
-            was_short, short = short, self._room.is_short()
+            was_short, short = short, self._free_space.is_short()
             if short != was_short:
                 logger.warning("jobs wait for room on the disk" if short else "the disk has room for jobs again")
             if short:
@@ -112,9 +112,9 @@ class Consumer:
             away = False
             if record is not None:
                 self.job_id = record.job_id
-                self.held.note(Claim(record.job_id, record.attempt, self._owner))
-                scores = run_job(self._queue, self._store, child, record, self._name, self._end, self._room)
-                self.held.forget()
+                self.claim_file.note(Claim(record.job_id, record.attempt, self._owner))
+                scores = run_job(self._queue, self._store, child, record, self._name, self._end, self._free_space)
+                self.claim_file.forget()
                 self.job_id = None
                 if scores is not None:
                     # Also while a job waits: scoring the scene later takes several times as long.
@@ -124,7 +124,13 @@ class Consumer:
 
 
 def run_job(
-    queue: Queue, store: Store, child: DeviceChild, record: JobRecord, name: str, end: threading.Event, room: Room
+    queue: Queue,
+    store: Store,
+    child: DeviceChild,
+    record: JobRecord,
+    name: str,
+    end: threading.Event,
+    free_space: FreeSpace,
 ) -> AwaitedScores | None:
     """Run one claimed job to its end; hand it back if `end` is set first. name: the worker's name.
 
@@ -133,10 +139,10 @@ def run_job(
     assert record.owner is not None
     claim = Claim(record.job_id, record.attempt, record.owner)
     log, started_s = _log_of(claim), time.monotonic()
-    room.begins()
+    free_space.begins()
     with attempt_span(record, name) as span, Heartbeat(queue, claim) as heart:
         log.info("an attempt starts")
-        job = _Job(queue, store, claim, heart, name, end, room)
+        job = _Job(queue, store, claim, heart, name, end, free_space)
         try:
             outcome = job.settle(job.work(child, record))
         except IntrasplatError as error:  # the store failed before the child got the job, or after it finished
@@ -174,9 +180,9 @@ class _Job:
         heart: Heartbeat,
         name: str,
         end: threading.Event,
-        room: Room,
+        free_space: FreeSpace,
     ) -> None:
-        self._room = room
+        self._free_space = free_space
         self._queue = queue
         self._store = store
         self._claim = claim
@@ -259,13 +265,13 @@ class _Job:
         """The same result, except that a job that a full disk ended is handed back without a counted death."""
         is_full = isinstance(result, Failed) and result.error.code is ErrorCode.STORE_FULL
         died = isinstance(result, Died) and not result.excused
-        if is_full or (died and self._room.is_short()):
-            if self._room.ran_out(self._claim.job_id):
+        if is_full or (died and self._free_space.is_short()):
+            if self._free_space.ran_out(self._claim.job_id):
                 return Died("found the disk full", excused=True)
             if isinstance(result, Failed):
-                return result.model_copy(update={"error": self._room.full_error()})
+                return result.model_copy(update={"error": self._free_space.full_error()})
         elif isinstance(result, Finished | Failed):
-            self._room.sufficed(self._claim.job_id)
+            self._free_space.sufficed(self._claim.job_id)
         return result
 
     def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:

@@ -116,9 +116,9 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
     logger.info("the kernels that every job needs are compiled after %.1f s", time.monotonic() - started_s)
     views = Views(store, snapshots, settings.hot_bytes, device)
 
-    def report_held_scenes() -> None:
+    def report_cached_scenes() -> None:
         views.forget_purged()
-        channel.send_if_new(Holding(scenes=views.held))
+        channel.send_if_new(Holding(scenes=views.cached))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     scheduler = Scheduler(
@@ -129,7 +129,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
         spent_s=cpu_time_s,  # includes waiting for a GPU: this thread polls it
         max_wait_s=settings.render_timeout_s * MAX_WAIT_SHARE,
     )
-    server = RequestServer(endpoint, scheduler, between=report_held_scenes, render_secret=settings.render_secret)
+    server = RequestServer(endpoint, scheduler, between=report_cached_scenes, render_secret=settings.render_secret)
     with server:
         channel.send(Ready(endpoint=endpoint, device=str(device)))
         logger.info("the device process is ready on %s", device)

@@ -11,14 +11,14 @@ from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode, UnavailableError
 from intrasplat.files.disk import Disk
 
-MIN_ROOM_BYTES = 16 * 2**20
+SPARE_BYTES = 16 * 2**20
 MAX_SHORTAGES = 3
 """A job that finds the disk full so often, though it started with enough space, is too large for the disk and fails."""
 PAUSE_S = 60.0
 """Wait before the next job, unless space becomes free earlier: what fills the disk may be gone by then."""
 
 
-class Room:
+class FreeSpace:
     """The free space of a worker's data directory. min_free_bytes: what the service reserves for jobs it has accepted.
 
     A job may start while a quarter of that is free. After a job has found the disk full, the next one starts when the
@@ -28,8 +28,8 @@ class Room:
     def __init__(self, store: Store, min_free_bytes: int) -> None:
         self._store = store
         self._min_free_bytes = min_free_bytes
-        self._enough_bytes = max(min_free_bytes, MIN_ROOM_BYTES)
-        self._needed_bytes = self._least_bytes = max(min_free_bytes // 4, MIN_ROOM_BYTES)
+        self._enough_bytes = max(min_free_bytes, SPARE_BYTES)
+        self._needed_bytes = self._least_bytes = max(min_free_bytes // 4, SPARE_BYTES)
         self._began_bytes: float = 0
         self._shortages: Counter[str] = Counter()
         self._paused_until_s = -math.inf
@@ -37,7 +37,7 @@ class Room:
     def is_short(self) -> bool:
         """Whether no job may start now."""
         free_bytes = self._free_bytes()
-        pauses = time.monotonic() < self._paused_until_s and free_bytes <= self._began_bytes + MIN_ROOM_BYTES
+        pauses = time.monotonic() < self._paused_until_s and free_bytes <= self._began_bytes + SPARE_BYTES
         return pauses or free_bytes < self._needed_bytes or Disk(self._store.data_dir).is_full()
 
     def begins(self) -> None:

@@ -9,7 +9,7 @@ import logging
 
 from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode, InputError, IntrasplatError, UnavailableError
-from intrasplat.files.disk_errors import NO_ROOM
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS
 
 FAULT_REMEDY = "This is a fault of intrasplat: please report it with the worker's log."
 
@@ -24,7 +24,7 @@ def describe(error: Exception) -> JobError:
         return JobError(code=error.code, problem=error.problem, remedy=error.remedy)
     if isinstance(error, IntrasplatError):
         return JobError(code=error.code, problem=str(error), remedy="The worker's log has the details.")
-    if isinstance(error, OSError) and error.errno in NO_ROOM:
+    if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
         remedy = "Free space on its disk, and retry the job."
         return JobError(code=ErrorCode.STORE_FULL, problem="The worker's disk is full.", remedy=remedy)
     # Recognise torch.OutOfMemoryError by its name, because the supervisor does not load torch.

@@ -23,7 +23,7 @@ class Reply:
     unseen: share of a render's pixels that no training frame saw.
     gaussians, clip_size, camera, depth_range_mm: as in WorkerReply.
     level: level of detail at which it was rendered (intrasplat/view/coarse.py); 0 is full detail.
-    is_kept: the reply comes from the cache or is no render; its time is not used to predict that of renders.
+    is_untimed: the reply comes from the cache or is no render; its time is not used to predict that of renders.
     more: further parts of the export follow.
     """
 
@@ -36,7 +36,7 @@ class Reply:
     gaussians: int = 0
     clip_size: tuple[int, int] | None = None
     level: int = 0
-    is_kept: bool = False
+    is_untimed: bool = False
     more: bool = False
     depth_range_mm: tuple[float, float] | None = None
     camera: PictureCamera | None = None

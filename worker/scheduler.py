@@ -157,7 +157,7 @@ class Scheduler:
     def _end(self, task: _Task, outcome: Reply | Exception) -> Answered:
         self._remove(task)
         turn = task.turn
-        if isinstance(outcome, Reply) and not outcome.is_kept:
+        if isinstance(outcome, Reply) and not outcome.is_untimed:
             self._turns.learn(turn)
         turns = (turn, *self._turns.take_same(turn.request))
         self._pace.charge(max(0.0, len(turns) * MIN_CHARGE_S - turn.spent_s))

@@ -74,7 +74,7 @@ def run_supervisor(
             if renders_only:
                 keep_rendering(keeper, end)
             else:
-                consumer.held.give_back(queue)
+                consumer.claim_file.give_back(queue)
                 consumer.run()
     finally:
         keeper.stop()

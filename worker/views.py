@@ -48,7 +48,7 @@ from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
 from intrasplat.view.recorded import live_frame, stored_frame
 from intrasplat.view.render import ROUNDING, ViewRequest, frame_in_parts, renderer_of
-from worker.answer_cache import KeptReplies
+from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshot, Snapshots
@@ -59,7 +59,7 @@ buffers (measured: 100 MB for each scene of 32 MB, with 36,000 Gaussians and 17 
 
 MEDIA_TYPE_OF_BYTES, MEDIA_TYPE_OF_JSON = "application/octet-stream", "application/json"
 
-MAX_HELD_SCENES = 64
+MAX_CACHED_SCENES = 64
 """Most scenes in memory, however small: each announcement of the worker names all of them."""
 
 
@@ -70,7 +70,7 @@ LARGE_PIXELS = 1 << 19
 class Views:
     """Answers render and export requests from a store's scenes and a job's snapshots; for use in one thread.
 
-    `held` names the scenes in memory, with the last used one at the end; other threads may read it.
+    `cached` names the scenes in memory, with the last used one at the end; other threads may read it.
     """
 
     def __init__(
@@ -85,11 +85,11 @@ class Views:
         self._hot_bytes = hot_bytes
         self._device = device
         self._scenes: OrderedDict[tuple[str, int], TrainedScene] = OrderedDict()
-        self._kept = KeptReplies()
+        self._replies = ReplyCache()
         self._exports = OpenExports()
         self._snapshot: Snapshot | None = None  # the job's snapshot that was shown last
         self._job_id = ""
-        self.held: tuple[str, ...] = ()
+        self.cached: tuple[str, ...] = ()
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
         """As answer_in_parts, in one call."""
@@ -98,7 +98,7 @@ class Views:
     def answer_in_parts(self, request: SceneRequest, level: int = 0) -> Parts[Reply]:
         """The encoded image or file. Other answers may be computed between its parts.
 
-        Recorded frames and cameras have is_kept set: their time does not predict that of renders.
+        Recorded frames and cameras have is_untimed set: their time does not predict that of renders.
 
         level: index into LEVELS of detail, for renders as jpeg or webp. Other formats are exact.
 
@@ -123,22 +123,22 @@ class Views:
             scene = snapshot.scene
         if isinstance(request, CamerasRequest):
             return _cameras(scene, snapshot)
-        reply = self._kept.get(request)
+        reply = self._replies.get(request)
         level = level if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
             reply = yield from self._rendered(scene, request, snapshot, level)
             # Between the parts of a render, a scene may be purged or a newer snapshot shown.
-            is_held = (
+            is_current = (
                 (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
             )
-            if is_held:
-                self._kept.keep(request, reply)
+            if is_current:
+                self._replies.keep(request, reply)
         return reply
 
     def cost(self, request: SceneRequest) -> float:
         """The cost of the answer in pixels x Gaussians; 0 if it is cached at full detail."""
         if isinstance(request, RenderRequest):
-            kept = self._kept.get(request)
+            kept = self._replies.get(request)
             if kept is not None and kept.level == 0:
                 return 0.0
         if isinstance(request, RecordedRequest | CamerasRequest):
@@ -169,7 +169,7 @@ class Views:
             self._forget(key)
         self._exports.forget(lambda *key: not self._store.has_scene(*key))
         if self._snapshot is not None and self._snapshots.shown(self._job_id) is not self._snapshot:
-            self._kept.drop(lambda request: request.attempt is None)
+            self._replies.drop(lambda request: request.attempt is None)
             self._snapshot = None
 
     def _recorded(self, request: RecordedRequest) -> Reply:
@@ -180,14 +180,14 @@ class Views:
             path = self._store.scene_folder(request.scene_id, request.attempt) / RECORDED
             count = self._store.newest_report(request.scene_id, request.attempt).frame_count
             index, picture = stored_frame(path, count, *wanted)
-            return Reply(picture, media_type, index / count, is_kept=True)
+            return Reply(picture, media_type, index / count, is_untimed=True)
         clip, snapshot = self._snapshots.clip(request.scene_id), self._snapshots.shown(request.scene_id)
         if clip is None:
             raise NotYetError(f"The clip of job {request.scene_id} is not prepared yet.")
         index, picture = live_frame(clip, *wanted)
         iteration = 0 if snapshot is None else snapshot.iteration
         shown = index / clip.frame_count
-        return Reply(picture, media_type, shown, iteration=iteration, is_kept=True)
+        return Reply(picture, media_type, shown, iteration=iteration, is_untimed=True)
 
     def _trained(self, job_id: str) -> Snapshot:
         """The newest snapshot; may wait for training, without slowing it."""
@@ -195,7 +195,7 @@ class Views:
         if snapshot is None:
             raise NotYetError(f"Job {job_id} has nothing to show yet.")
         if snapshot is not self._snapshot:
-            self._kept.drop(lambda request: request.attempt is None)
+            self._replies.drop(lambda request: request.attempt is None)
             self._snapshot, self._job_id = snapshot, job_id
         return snapshot
 
@@ -214,9 +214,9 @@ class Views:
             with traces.span("load"):
                 self._scenes[key] = load_scene(folder)
         self._scenes.move_to_end(key)
-        while len(self._scenes) > MAX_HELD_SCENES or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
+        while len(self._scenes) > MAX_CACHED_SCENES or (len(self._scenes) > 1 and self._byte_count() > self._hot_bytes):
             self._forget(next(iter(self._scenes)))
-        self.held = tuple(name for name, _ in self._scenes)
+        self.cached = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
     def _rendered(
@@ -271,7 +271,7 @@ class Views:
         """A Measurement as JSON. Its time does not predict that of renders."""
         camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
         found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, self._device)
-        return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_kept=True)
+        return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_untimed=True)
 
     def _export(self, scene: TrainedScene, request: ExportRequest) -> Reply:
         """One part of an export. Its time does not predict that of renders."""
@@ -284,12 +284,12 @@ class Views:
             outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
             warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside), *warnings)
         media_type = MEDIA_TYPE_OF_BYTES if known is None else known.media_type
-        return Reply(content, media_type, shown, warnings, is_kept=True, more=more)
+        return Reply(content, media_type, shown, warnings, is_untimed=True, more=more)
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
-        self._kept.drop(lambda request: (request.scene_id, request.attempt) == key)
-        self.held = tuple(name for name, _ in self._scenes)
+        self._replies.drop(lambda request: (request.scene_id, request.attempt) == key)
+        self.cached = tuple(name for name, _ in self._scenes)
 
     def _byte_count(self) -> int:
         return COPIES * sum(scene.byte_count for scene in self._scenes.values())
@@ -338,7 +338,7 @@ def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:
         }
     )
     iteration = None if snapshot is None else snapshot.iteration
-    return Reply(cameras.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, 0.0, iteration=iteration, is_kept=True)
+    return Reply(cameras.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, 0.0, iteration=iteration, is_untimed=True)
 
 
 def shown_time(scene: TrainedScene, t: float) -> float:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from contract.runtime.locks import held
+from contract.runtime.locks import locked
 from intrasplat.files.disk_errors import StoreFullError, disk_errors
 from intrasplat.files.durable import flush
 
@@ -103,7 +103,7 @@ class AuditLog:
         line = entry.model_dump_json(exclude_none=True).encode() + b"\n"
         while True:
             try:
-                with disk_errors(), held(self._path, "the audit"):
+                with disk_errors(), locked(self._path, "the audit"):
                     return self._write(line)
             except StoreFullError:
                 if not self._shrink_reserve():

@@ -22,7 +22,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from contract.runtime.locks import held
+from contract.runtime.locks import locked
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from contract.wire.job import TENANT_PATTERN
 from intrasplat.errors import InputError, UnavailableError
@@ -307,7 +307,7 @@ class KeyFile:
         """Yield the present keys while this process holds the lock."""
         with disk_errors():
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with held(self._path.with_name("keys.lock"), "the keys"):
+            with locked(self._path.with_name("keys.lock"), "the keys"):
                 yield self.list()
 
     def _write(self, keys: tuple[ApiKey, ...]) -> None:

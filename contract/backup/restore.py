@@ -46,7 +46,7 @@ from contract.store.store import RESTORING, Store
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 from intrasplat.errors import InputError, UnavailableError
 from intrasplat.files.disk import Disk
-from intrasplat.files.disk_errors import NO_ROOM
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS
 from intrasplat.files.durable import flush
 
 NO_CONTENT = frozenset({"lost+found"})
@@ -324,7 +324,7 @@ def _writing(data_dir: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in NO_ROOM:
+        if error.errno in DISK_FULL_ERRNOS:
             problem = f"There is no room left on {Disk(data_dir).name}; nothing was restored."
             raise UnavailableError(problem, "Use a larger disk.") from error
         problem = f"{error.filename or data_dir} cannot be read or written ({os.strerror(error.errno or 0)})."

@@ -36,7 +36,7 @@ from contract.store.store import PURGING, UNSCORED
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 from intrasplat.errors import InputError, UnavailableError
 from intrasplat.files.disk import Disk
-from intrasplat.files.disk_errors import NO_ROOM
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS
 from intrasplat.files.durable import move_folder
 from intrasplat.version import version
 
@@ -203,7 +203,7 @@ def _writing(destination: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in NO_ROOM:
+        if error.errno in DISK_FULL_ERRNOS:
             problem = f"There is no room left on {Disk(destination).name}."
             remedy = "Free space there, or name a folder on a larger disk; nothing of this backup was kept."
         else:

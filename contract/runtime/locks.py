@@ -11,8 +11,8 @@ from pathlib import Path
 
 from intrasplat.errors import UnavailableError
 
-HELD_TIMEOUT_S = 5.0
-"""How long held() waits for the lock. Others hold it for milliseconds only."""
+LOCK_TIMEOUT_S = 5.0
+"""How long locked() waits for the lock. Others hold it for milliseconds only."""
 TRY_PERIOD_S = 0.005
 
 
@@ -44,18 +44,18 @@ class FolderLock:
 
 
 @contextmanager
-def held(path: Path, what: str) -> Iterator[None]:
+def locked(path: Path, what: str) -> Iterator[None]:
     """Hold the lock of this file during the context; no other process or thread has it meanwhile.
 
     Args:
         what: what is changed meanwhile, for the error message.
 
     Raises:
-        UnavailableError: another process or thread holds it for longer than HELD_TIMEOUT_S.
+        UnavailableError: another process or thread holds it for longer than LOCK_TIMEOUT_S.
         OSError: the file cannot be opened.
     """
     lock = FolderLock(path)
-    deadline_s = time.monotonic() + HELD_TIMEOUT_S
+    deadline_s = time.monotonic() + LOCK_TIMEOUT_S
     while not lock.take():
         if time.monotonic() > deadline_s:
             raise UnavailableError(f"Another process is changing {what}.", "Try again.")

@@ -35,7 +35,7 @@ from contract.store.shelf import (
     new_job_id,
 )
 from intrasplat.errors import SceneError, UnavailableError
-from intrasplat.files.disk_errors import NO_ROOM, disk_errors
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, disk_errors
 from intrasplat.names import MANIFEST
 from intrasplat.scene.results import listed_files
 
@@ -162,7 +162,7 @@ def _bucket_errors() -> Iterator[None]:
     try:
         yield
     except (OSError, botocore.BotoCoreError, botocore.ClientError) as error:
-        if isinstance(error, OSError) and error.errno in NO_ROOM:
+        if isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS:
             raise  # this machine's disk has no space for the copy
         problem = f"The bucket does not answer ({type(error).__name__})."
         raise UnavailableError(problem, BUCKET_REMEDY, may_return=True) from error

@@ -116,10 +116,10 @@ def find_repeats(rgb: NDArray[np.uint8], train: list[int], held_out: list[int]) 
     for index in (*train, *held_out):
         column_sums[index] = _column_sums(rgb[index])
         let_go(rgb[index])
-    held_sums = np.stack([column_sums[index] for index in held_out])
+    held_out_sums = np.stack([column_sums[index] for index in held_out])
     repeats = []
     for index in train:
-        bounds = np.abs(held_sums - column_sums[index]).sum(axis=1)
+        bounds = np.abs(held_out_sums - column_sums[index]).sum(axis=1)
         candidates = [held_out[k] for k in np.flatnonzero(bounds < limit)]
         if any(_closer_than(limit, rgb[index], rgb[other]) for other in candidates):
             repeats.append(index)

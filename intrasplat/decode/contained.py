@@ -210,7 +210,7 @@ class Decoder:
             return _result(answer or None, status, self._field, self._allowance)
         except InputError as error:
             if Disk(self.folder).is_full():  # whatever failed, the clip is tried again when there is space
-                raise _no_room() from error
+                raise _disk_full() from error
             raise
 
 
@@ -315,16 +315,16 @@ def _result(answer: dict[str, Any] | None, status: int, field: str, allowance: A
 def _fault(error: dict[str, Any], field: str, allowance: Allowance) -> dict[str, Any]:
     """Raise an InputError for an unexpected exception of the process, and log where it was raised."""
     if error["errno"] == errno.ENOSPC:
-        raise _no_room()
+        raise _disk_full()
     if error["errno"] == errno.EFBIG:
         raise _undecodable(field, f"its frames take more than {allowance.file_bytes} bytes")
     logger.error("a fault while a clip was decoded: %s\n%s", error["type"], error["where"])
     raise _undecodable(field, f"the decoder failed ({error['type']})")
 
 
-def _no_room() -> StoreFullError:
-    problem = "The disk is full: the clip's frames found no room."
-    return StoreFullError(problem, "Make room where the data directory lies.")
+def _disk_full() -> StoreFullError:
+    problem = "The disk is full: it has no space for the clip's frames."
+    return StoreFullError(problem, "Free space on the disk of the data directory.")
 
 
 def _undecodable(field: str, reason: str) -> InputError:

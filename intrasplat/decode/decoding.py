@@ -201,10 +201,10 @@ def _notices(described: Any) -> tuple[Notice, ...]:
 def _protection(granted: list[str], allowance: Allowance) -> Notice:
     """The notice on the protections that were active during decoding, and on those that the kernel did not grant."""
     amounts = {LIMITED_MEMORY: f" of {allowance.memory_bytes / 2**30:.1f} GiB"}
-    held = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
+    active = [each + amounts.get(each, "") for each in PROTECTIONS if each in granted]
     lacking = [each for each in PROTECTIONS if each not in granted]
     denied = f"; the kernel did not grant: {', '.join(lacking)}" if lacking else ""
-    text = f"decoding: in a process of its own ({', '.join(held) or 'not confined'}{denied})"
+    text = f"decoding: in a process of its own ({', '.join(active) or 'not confined'}{denied})"
     return Notice.info(NoticeCode.DECODING, text)
 
 

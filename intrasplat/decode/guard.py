@@ -108,9 +108,11 @@ def _drop_capabilities() -> None:
         return
     libc = ctypes.CDLL(None, use_errno=True)
     header = struct.pack("=Ii", _CAPABILITY_VERSION, 0)
-    held = ctypes.create_string_buffer(struct.calcsize("=6I"))  # effective, permitted, inheritable; then bits 32 up
-    if libc.capget(header, held) == 0:
-        kept = struct.unpack_from("=I", held, 4)[0] & _CAP_DAC_READ_SEARCH
+    capabilities = ctypes.create_string_buffer(
+        struct.calcsize("=6I")
+    )  # effective, permitted, inheritable; then bits 32 up
+    if libc.capget(header, capabilities) == 0:
+        kept = struct.unpack_from("=I", capabilities, 4)[0] & _CAP_DAC_READ_SEARCH
         libc.capset(header, struct.pack("=6I", kept, kept, 0, 0, 0, 0))
 
 

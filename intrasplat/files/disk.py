@@ -6,7 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 PROBE_BYTES = 64 * 2**10
 """A disk on which this much cannot be written is full, whatever its free bytes: a quota may be used up."""
@@ -44,7 +44,7 @@ class Disk:
                 else:
                     probe.write(bytes(PROBE_BYTES))
         except OSError as error:
-            return error.errno in NO_ROOM
+            return error.errno in DISK_FULL_ERRNOS
         return False
 
     def full_error(self) -> StoreFullError:

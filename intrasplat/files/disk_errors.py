@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from intrasplat.errors import ErrorCode, UnavailableError
 
-NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 NOT_THERE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ESTALE})
 
@@ -37,7 +37,7 @@ def disk_errors() -> Iterator[None]:
 
 def _disk_error(error: OSError) -> UnavailableError:
     reason = os.strerror(error.errno) if error.errno else type(error).__name__
-    if error.errno in NO_ROOM:
+    if error.errno in DISK_FULL_ERRNOS:
         problem = f"There is no room left in the data directory ({reason})."
         return StoreFullError(problem, "Purge scenes that are no longer needed, or give it a larger disk or quota.")
     if error.errno in NOT_WRITABLE:

@@ -13,7 +13,7 @@ from intrasplat.machine.memory_limit import memory_bytes
 
 MIN_SIDE_PX = 16  # minimum for stereo matching and the rasteriser's tiles
 
-HELD_BYTES_PER_PIXEL = 18
+CLIP_BYTES_PER_PIXEL = 18
 """Bytes per pixel and frame for both eyes during reconstruction; one eye alone takes half.
 
 Each eye takes 9 in the DepthClip: rgb 3, depth_mm 4, depth_confidence 1, tissue 1. Training frames are views of it. If
@@ -49,7 +49,7 @@ class ClipLimits:
     frames            frames of a clip
     duration_s        duration by the frame times
     pixels_per_frame  pixels of one recorded picture (both eyes when they share it); default: two eyes of 3840x2160
-    clip_bytes        bytes of the whole clip during reconstruction (HELD_BYTES_PER_PIXEL)
+    clip_bytes        bytes of the whole clip during reconstruction (CLIP_BYTES_PER_PIXEL)
     decoded_bytes     memory of a clip that has depth, computed likewise, and inflated size of a whole archive;
                       default: memory_for_clip_bytes()
     on_picture        called after each decoded picture, from any thread, as a sign of progress
@@ -112,7 +112,7 @@ class ClipLimits:
         if eyes == 1 and width * height > self.pixels_per_frame // EYES:
             problem = f"an eye of {label} has {width}x{height} pixels; the limit is {self.pixels_per_frame // EYES}."
             raise LimitError(field, problem, "Scale the clip down.")
-        bytes_per_frame = width * height * HELD_BYTES_PER_PIXEL // eyes
+        bytes_per_frame = width * height * CLIP_BYTES_PER_PIXEL // eyes
         place, allowed = ("memory", self.decoded_bytes) if has_depth else ("disk", self.clip_bytes)
         if frames * bytes_per_frame > allowed:
             fitting = allowed // bytes_per_frame

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from intrasplat.files.disk_errors import NO_ROOM, StoreFullError
+from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 AROUND_BYTES = 1 << 16
 """Linux maps this much around an accessed page, so pages beside an array are released with it."""
@@ -34,10 +34,10 @@ def mapped_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
             else:
                 file.truncate(needed_bytes)
         except OSError as error:
-            if error.errno not in NO_ROOM:
+            if error.errno not in DISK_FULL_ERRNOS:
                 raise
-            problem = f"The disk is full: {needed_bytes >> 20} MiB of a clip's frames found no room."
-            raise StoreFullError(problem, f"Make room in {tempfile.gettempdir()}.") from error
+            problem = f"The disk is full: {needed_bytes >> 20} MiB are needed for a clip's frames."
+            raise StoreFullError(problem, f"Free space in {tempfile.gettempdir()}.") from error
         return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
 
 

@@ -24,7 +24,7 @@ INDEPENDENT, NOISE_PX = 0.05, 0.35
 of a match."""
 MIN_SCALE_PX = 0.5
 """Minimum robust scale: the residual at which a match has a quarter of its weight."""
-HELD, FREE = 1e9, 1e-6
+FIXED, DAMPED = 1e9, 1e-6
 """Added to the diagonal of the normal equations: fixes the first camera, which is the world, and damps all others."""
 
 
@@ -135,11 +135,11 @@ class Grams:
         size = 6 + kinds
         normal = self._by_frame(gram[:, :-1, :-1])
         right = -np.einsum("lk,li->ki", self.incidence, gram[:, :-1, -1])
-        usual = np.full((count, size), FREE)
+        usual = np.full((count, size), DAMPED)
         usual[:, 6:] = 1.0  # the size of a course
         right[:, 6:] -= field.courses
         normal += np.diag(usual.ravel())
-        normal[:6, :6] += HELD * np.eye(6)
+        normal[:6, :6] += FIXED * np.eye(6)
         found = np.linalg.solve(normal, right.ravel()).reshape(count, size)
         return found[:, :6], found[:, 6:]
 
@@ -162,7 +162,7 @@ class Grams:
         """Root mean square over the links of the deformation that the field does not explain, mm."""
         squares = []
         for gram in self.gram:
-            normal = gram[:-1, :-1] + np.diag(np.concatenate([np.full(6, FREE), field.ridge]))
+            normal = gram[:-1, :-1] + np.diag(np.concatenate([np.full(6, DAMPED), field.ridge]))
             left = replace(field, weight=np.linalg.solve(normal, -gram[:-1, -1])[None, 6:])
             squares.append(left.sizes_mm(depth_mm)[0] ** 2)
         return float(np.sqrt(np.mean(squares)))
@@ -205,8 +205,8 @@ class Grams:
 
     def _twists(self) -> Reals:
         """[6 K, 6 K] normal matrix of the twists."""
-        normal = self._by_frame(self.gram[:, :6, :6]) + FREE * np.eye(6 * len(self.frames))
-        normal[:6, :6] += HELD * np.eye(6)
+        normal = self._by_frame(self.gram[:, :6, :6]) + DAMPED * np.eye(6 * len(self.frames))
+        normal[:6, :6] += FIXED * np.eye(6)
         return normal
 
     def _by_frame(self, gram: Reals) -> Reals:

@@ -296,12 +296,12 @@ def _powers(table: NDArray[np.int32]) -> Whole:
 
 def _gaussians_of(state: Floats) -> Gaussians:
     """The Gaussians whose numbers at rest are state [N, VALUES]."""
-    held = torch.from_numpy(state)
+    values = torch.from_numpy(state)
     return Gaussians(
-        mean=held[:, MEAN].contiguous(),
-        quaternion=held[:, QUATERNION].contiguous(),
-        log_scale=held[:, LOG_SCALE].contiguous(),
-        opacity_logit=held[:, OPACITY_ROW].contiguous(),
-        sh=held[:, None, COLOUR].contiguous(),
-        gloss=held[:, GLOSS_ROW].contiguous(),
+        mean=values[:, MEAN].contiguous(),
+        quaternion=values[:, QUATERNION].contiguous(),
+        log_scale=values[:, LOG_SCALE].contiguous(),
+        opacity_logit=values[:, OPACITY_ROW].contiguous(),
+        sh=values[:, None, COLOUR].contiguous(),
+        gloss=values[:, GLOSS_ROW].contiguous(),
     )

@@ -109,18 +109,18 @@ def successors(
     """
     pruned = opacity_logit < math.log(settings.min_opacity / (1 - settings.min_opacity))
     asked = np.flatnonzero((gradient > settings.gradient_threshold) & ~pruned)
-    room = max(0, settings.max_count - int((~pruned).sum())) // (settings.split_into - 1)
-    parents = _hardest_pulled(asked, gradient, room)
+    most = max(0, settings.max_count - int((~pruned).sum())) // (settings.split_into - 1)
+    parents = _hardest_pulled(asked, gradient, most)
     kept = ~pruned
     kept[parents] = False
     columns = np.concatenate([np.flatnonzero(kept), np.tile(parents, settings.split_into)])
     return columns, len(parents) * settings.split_into
 
 
-def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.floating], room: int) -> NDArray[np.int64]:
-    """The indices of the `room` candidates with the greatest gradients, or of all if they are fewer; ascending."""
+def _hardest_pulled(candidates: NDArray[np.int64], gradient: NDArray[np.floating], most: int) -> NDArray[np.int64]:
+    """The indices of the `most` candidates with the greatest gradients, or of all if they are fewer; ascending."""
     order = np.argsort(-gradient[candidates], kind="stable")
-    return np.sort(candidates[order[:room]])
+    return np.sort(candidates[order[:most]])
 
 
 def _replace(model: Model, columns: NDArray[np.int64], born: int, children: int, random: np.random.Generator) -> None:

@@ -126,7 +126,7 @@ class Keeper:
         t_train_s = run.setup.timings.seconds.get("t_train_s", run.setup.clock.elapsed_s)
         size_bytes = sum(each.numel() * each.element_size() for each in run.model.arrays().values())
         try:
-            complete = begin_save(self.folder, run, t_train_s) if self._has_room(size_bytes) else None
+            complete = begin_save(self.folder, run, t_train_s) if self._has_free_space(size_bytes) else None
         except OSError as error:
             logger.warning("the state of training was not kept: %s", error.strerror)
             return
@@ -137,7 +137,7 @@ class Keeper:
     def _submit(self, work: Callable[[], None], size_bytes: int) -> Future[None]:
         def attempt() -> None:
             try:
-                if self._has_room(size_bytes):
+                if self._has_free_space(size_bytes):
                     work()
             except OSError as error:
                 logger.warning("what a later attempt could go on from was not kept: %s", error.strerror)
@@ -146,7 +146,7 @@ class Keeper:
 
         return self._threads.submit(attempt)
 
-    def _has_room(self, size_bytes: int) -> bool:
+    def _has_free_space(self, size_bytes: int) -> bool:
         return shutil.disk_usage(self.folder).free >= size_bytes + SPARE_BYTES
 
 

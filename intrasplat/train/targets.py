@@ -69,7 +69,7 @@ MIN_DEPTH_MM = np.float32(1e-3)
 """Any number above 0: pixels without depth are masked after the division."""
 
 
-MAX_HELD_BYTES = 512 << 20
+MAX_RESIDENT_BYTES = 512 << 20
 """An eye whose frames take more memory releases each frame after use, which takes half a millisecond."""
 
 
@@ -87,7 +87,7 @@ class TrainingFrames:
             index: camera_vector(camera_in_units(eye.intrinsics, eye.world_from_camera[index], scale, side))
             for index in range(eye.frame_count)
         }
-        self._lets_go = sum(getattr(eye, name).nbytes for name in PIXELS) > MAX_HELD_BYTES
+        self._lets_go = sum(getattr(eye, name).nbytes for name in PIXELS) > MAX_RESIDENT_BYTES
         self._frames = {index: self._frame(index) for index in self.indices}
         self._digest: str | None = None
 

@@ -181,8 +181,8 @@ def uncertainty_mm(scene: TrainedScene, depth_mm: float, spread_mm: float, likel
     """
     baseline_mm = UNKNOWN_BASELINE_MM if scene.right_eye_mm is None else float(np.linalg.norm(scene.right_eye_mm))
     px_mm = depth_mm**2 / (scene.intrinsics.fx * baseline_mm)
-    held = min(max(likely, 1 - MAX_CONFIDENCE), MAX_CONFIDENCE)
-    return float(np.hypot(DISPARITY_PX * px_mm, spread_mm) / (np.sqrt(2) * erfinv(held)))
+    clamped = min(max(likely, 1 - MAX_CONFIDENCE), MAX_CONFIDENCE)
+    return float(np.hypot(DISPARITY_PX * px_mm, spread_mm) / (np.sqrt(2) * erfinv(clamped)))
 
 
 def _window(camera: Intrinsics, x: float, y: float) -> tuple[Intrinsics, int, int]:

@@ -11,7 +11,7 @@ from intrasplat.notices import Notice
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.measure import MIN_CONFIDENCE, Distances, MeasuredPlace, distances, places_at
-from intrasplat.view.render import held_in_clip, renderer_of
+from intrasplat.view.render import clamped_to_clip, renderer_of
 
 OTHER_PLACE = "Choose another place or another moment."
 EXPANDED = 2.0
@@ -33,7 +33,7 @@ def measured(
     Raises:
         InputError: a point lies outside the picture, or the scene has no trust.
     """
-    shown, outside = held_in_clip(scene, t)
+    shown, outside = clamped_to_clip(scene, t)
     places = places_at(scene, shown, world_from_camera, camera, points, device)
     measured = tuple(
         _point(number, point, place, camera) for number, (point, place) in enumerate(zip(points, places, strict=True))

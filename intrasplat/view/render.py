@@ -171,7 +171,7 @@ class ViewRequest:
     @cached_property
     def shown_t(self) -> float:
         """The model time, clamped to the clip."""
-        return held_in_clip(self.scene, self.t)[0]
+        return clamped_to_clip(self.scene, self.t)[0]
 
     @cached_property
     def endoscope_pose(self) -> NDArray[np.float64]:
@@ -220,7 +220,7 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
     unseen = unseen_pixels(picture.missing)
     yield
-    outside = held_in_clip(scene, view.t)[1]
+    outside = clamped_to_clip(scene, view.t)[1]
     warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(view, picture.trust, unseen))
     if not view.highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
@@ -324,7 +324,7 @@ def _endoscope_rgb(view: ViewRequest) -> Parts[NDArray[np.float32]]:
     return colours
 
 
-def held_in_clip(scene: TrainedScene, t: float) -> tuple[float, tuple[Notice, ...]]:
+def clamped_to_clip(scene: TrainedScene, t: float) -> tuple[float, tuple[Notice, ...]]:
     """t clamped to the clip, and a warning if that changes it."""
     last = (scene.frame_count - 1) / scene.frame_count
     shown = min(max(t, 0.0), last)

@@ -190,7 +190,7 @@ def test_a_disk_that_is_short_of_room_is_named_once_with_the_remedy_and_ends_not
     monkeypatch.setattr(Disk, "free_bytes", lambda disk: free[0])
     with started(tmp_path, SLEEP) as installation:
         for free[0] in (0, 5 << 20, 2**40, 2**40):
-            installation.room.look(now=True)
+            installation.disk.look(now=True)
             assert not installation.wait_until_ready(lambda: True, 1.0)
         assert installation.workers[0].process_id is not None
     short, enough = capsys.readouterr().err.splitlines()

@@ -17,7 +17,7 @@ from websockets import Origin
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from service.server import MAX_CONNECTIONS, MAX_HEAD_BYTES, SPARE_FILES, room_for_connections
+from service.server import MAX_CONNECTIONS, MAX_HEAD_BYTES, SPARE_FILES, max_connections
 from tests.service.live import LiveService, live_service
 from tests.service.under_test import CLIP
 
@@ -195,7 +195,7 @@ def test_the_files_that_a_process_may_open_bound_its_connections(monkeypatch: py
     limits = [(1024, 524_288)]
     monkeypatch.setattr("resource.getrlimit", lambda kind: limits[-1])
     monkeypatch.setattr("resource.setrlimit", lambda kind, limit: limits.append(limit))
-    assert room_for_connections() == MAX_CONNECTIONS
+    assert max_connections() == MAX_CONNECTIONS
     assert limits[-1] == (MAX_CONNECTIONS + SPARE_FILES, 524_288)
     limits.append((1024, 1024))
-    assert room_for_connections() == 1024 - SPARE_FILES
+    assert max_connections() == 1024 - SPARE_FILES

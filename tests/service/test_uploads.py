@@ -150,7 +150,7 @@ def test_an_upload_over_the_limit_is_cut_off_while_it_is_counted(tmp_path: Path)
 
 
 def test_an_upload_leaves_the_room_on_disk_that_must_stay_free(tmp_path: Path) -> None:
-    limits = UploadLimits(upload_bytes=10**9, room_bytes=1000, min_free_bytes=77)
+    limits = UploadLimits(upload_bytes=10**9, available_bytes=1000, min_free_bytes=77)
 
     async def body() -> AsyncIterator[bytes]:
         yield b'--x\r\nContent-Disposition: form-data; name="clip"; filename="a.mp4"\r\n\r\n' + b"x" * 1000

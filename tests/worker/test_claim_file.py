@@ -12,7 +12,7 @@ from contract.wire.job import JobState
 from intrasplat.errors import UnavailableError
 from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import Jobs
-from worker.claim_file import HeldClaim
+from worker.claim_file import ClaimFile
 
 OWNER = "worker-1.a"
 
@@ -31,17 +31,17 @@ def claimed(jobs: Jobs) -> Claim:
 
 def test_a_killed_workers_claim_is_given_back_once_as_a_death(jobs: Jobs, tmp_path: Path) -> None:
     claim = claimed(jobs)
-    HeldClaim(tmp_path / "claim").note(claim)
-    assert HeldClaim(tmp_path / "claim").give_back(jobs.queue)
+    ClaimFile(tmp_path / "claim").note(claim)
+    assert ClaimFile(tmp_path / "claim").give_back(jobs.queue)
     assert jobs.state(claim.job_id) is JobState.QUEUED
-    assert not HeldClaim(tmp_path / "claim").give_back(jobs.queue)
+    assert not ClaimFile(tmp_path / "claim").give_back(jobs.queue)
     again = jobs.queue.claim("worker-1.b", 0.0)
     assert again is not None
     assert (again.job_id, again.attempt) == (claim.job_id, 2)
 
 
 def test_a_job_that_another_worker_has_taken_meanwhile_is_left_to_it(jobs: Jobs, tmp_path: Path) -> None:
-    held, claim = HeldClaim(tmp_path / "claim"), claimed(jobs)
+    held, claim = ClaimFile(tmp_path / "claim"), claimed(jobs)
     held.note(claim)
     jobs.queue.release(claim)
     assert jobs.queue.claim("worker-2.a", 0.0) is not None
@@ -54,14 +54,14 @@ def test_a_job_that_another_worker_has_taken_meanwhile_is_left_to_it(jobs: Jobs,
 def test_a_file_that_holds_no_claim_is_passed_over(content: str, jobs: Jobs, tmp_path: Path) -> None:
     claim = claimed(jobs)
     (tmp_path / "claim").write_text(content)
-    assert not HeldClaim(tmp_path / "claim").give_back(jobs.queue)
+    assert not ClaimFile(tmp_path / "claim").give_back(jobs.queue)
     assert jobs.state(claim.job_id) is JobState.RUNNING
 
 
 def test_a_queue_that_is_away_leaves_the_claim_to_its_lease(
     jobs: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held, claim = HeldClaim(tmp_path / "claim"), claimed(jobs)
+    held, claim = ClaimFile(tmp_path / "claim"), claimed(jobs)
     held.note(claim)
 
     def away(*arguments: object, **named: object) -> bool:
@@ -76,5 +76,5 @@ def test_a_note_that_cannot_be_removed_does_not_end_the_worker(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "claim").mkdir()  # unlink() refuses a folder
-    HeldClaim(tmp_path / "claim").forget()
+    ClaimFile(tmp_path / "claim").forget()
     assert "was not removed" in caplog.text

@@ -11,7 +11,7 @@ from contract.store.store import Store
 from contract.wire.job import JobState
 from intrasplat.errors import ErrorCode
 from tests.worker.test_consume import JobLoop
-from worker.disk_space import MAX_SHORTAGES, MIN_ROOM_BYTES, Room
+from worker.disk_space import MAX_SHORTAGES, SPARE_BYTES, FreeSpace
 
 MIN_FREE_BYTES = 400 * 2**20
 
@@ -32,48 +32,48 @@ def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_after_a_shortage_jobs_pause_until_more_is_free(
     tmp_path: Path, free_bytes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    room = Room(Store(tmp_path), MIN_FREE_BYTES)
+    free_space = FreeSpace(Store(tmp_path), MIN_FREE_BYTES)
     free_bytes[0] = 2 * MIN_FREE_BYTES
-    room.begins()
-    assert room.ran_out("a")
-    assert room.is_short()
-    free_bytes[0] += MIN_ROOM_BYTES + 1
-    assert not room.is_short()
+    free_space.begins()
+    assert free_space.ran_out("a")
+    assert free_space.is_short()
+    free_bytes[0] += SPARE_BYTES + 1
+    assert not free_space.is_short()
     monkeypatch.setattr("worker.disk_space.PAUSE_S", 0.0)
-    room.begins()
-    assert room.ran_out("a")
-    assert not room.is_short()
+    free_space.begins()
+    assert free_space.ran_out("a")
+    assert not free_space.is_short()
 
 
 def test_jobs_begin_while_a_quarter_of_what_stays_free_is_there(tmp_path: Path, free_bytes: list[int]) -> None:
-    room = Room(Store(tmp_path), MIN_FREE_BYTES)
+    free_space = FreeSpace(Store(tmp_path), MIN_FREE_BYTES)
     for free, is_short in ((MIN_FREE_BYTES, False), (MIN_FREE_BYTES // 4, False), (MIN_FREE_BYTES // 4 - 1, True)):
         free_bytes[0] = free
-        assert room.is_short() is is_short
+        assert free_space.is_short() is is_short
 
 
 def test_after_a_shortage_no_job_begins_before_there_is_all_that_stays_free(
     tmp_path: Path, free_bytes: list[int]
 ) -> None:
-    room = Room(Store(tmp_path), MIN_FREE_BYTES)
+    free_space = FreeSpace(Store(tmp_path), MIN_FREE_BYTES)
     free_bytes[0] = MIN_FREE_BYTES // 2
-    room.begins()
-    assert all(room.ran_out("a") for _ in range(2 * MAX_SHORTAGES))  # it never had enough
-    assert room.is_short()
+    free_space.begins()
+    assert all(free_space.ran_out("a") for _ in range(2 * MAX_SHORTAGES))  # it never had enough
+    assert free_space.is_short()
     free_bytes[0] = MIN_FREE_BYTES
-    assert not room.is_short()
-    room.sufficed("a")
+    assert not free_space.is_short()
+    free_space.sufficed("a")
     free_bytes[0] = MIN_FREE_BYTES // 2
-    assert not room.is_short()
+    assert not free_space.is_short()
 
 
 def test_a_job_that_finds_the_disk_full_although_it_had_enough_is_given_up_at_last(
     tmp_path: Path, free_bytes: list[int]
 ) -> None:
-    room = Room(Store(tmp_path), MIN_FREE_BYTES)
-    room.begins()
-    assert [room.ran_out("a") for _ in range(MAX_SHORTAGES)] == [True] * (MAX_SHORTAGES - 1) + [False]
-    assert room.ran_out("b")
+    free_space = FreeSpace(Store(tmp_path), MIN_FREE_BYTES)
+    free_space.begins()
+    assert [free_space.ran_out("a") for _ in range(MAX_SHORTAGES)] == [True] * (MAX_SHORTAGES - 1) + [False]
+    assert free_space.ran_out("b")
 
 
 def test_a_worker_claims_nothing_while_the_disk_is_short_and_goes_on_by_itself(
@@ -116,7 +116,7 @@ def test_a_job_that_is_larger_than_the_disk_fails_as_such(tmp_path: Path, no_pau
 
 
 def test_a_job_that_is_retried_after_it_was_given_up_begins_anew(tmp_path: Path, free_bytes: list[int]) -> None:
-    room = Room(Store(tmp_path), MIN_FREE_BYTES)
-    room.begins()
-    assert [room.ran_out("a") for _ in range(MAX_SHORTAGES)][-1] is False
-    assert room.ran_out("a")
+    free_space = FreeSpace(Store(tmp_path), MIN_FREE_BYTES)
+    free_space.begins()
+    assert [free_space.ran_out("a") for _ in range(MAX_SHORTAGES)][-1] is False
+    assert free_space.ran_out("a")

@@ -22,7 +22,7 @@ def test_points_of_a_stored_scene_are_measured_at_their_depth(tmp_path: Path) ->
     asked = MeasureRequest(scene_id=scene_id, attempt=1, t=0.25, points=(middle, (middle[0] + 10, middle[1])))
     views = Views(store)
     reply = views.answer(asked)
-    assert (reply.media_type, reply.t, reply.is_kept) == ("application/json", 0.25, True)
+    assert (reply.media_type, reply.t, reply.is_untimed) == ("application/json", 0.25, True)
     found = Measurement.model_validate_json(reply.body)
     assert [each.depth_mm for each in found.points] == pytest.approx([60 / UNITS_PER_MM] * 2, rel=0.05)
     assert found.distance is not None

@@ -75,7 +75,7 @@ def test_recorded_frames_are_of_the_job_that_trains_and_of_its_scene(store: Stor
             assert again.body == shown.body
     with pytest.raises(InputError, match="right eye"):
         views.answer(kept.model_copy(update={"eye": "right"}))
-    assert views.held == ()  # no model is loaded for it
+    assert views.cached == ()  # no model is loaded for it
     snapshots.drop(job_id)
     with pytest.raises(NotYetError):
         views.answer(live)

@@ -179,7 +179,7 @@ def test_a_deleted_scene_is_not_shown_from_memory(store: Store, scene_id: str) -
     shutil.rmtree(store.scene_folder(scene_id, 1))
     with pytest.raises(SceneError):
         views.answer(request_of(scene_id))
-    assert views.held == ()
+    assert views.cached == ()
 
 
 def test_a_deleted_scene_leaves_memory_without_a_request(store: Store, scene_id: str) -> None:
@@ -189,7 +189,7 @@ def test_a_deleted_scene_leaves_memory_without_a_request(store: Store, scene_id:
     views.answer(request_of(other))
     store.purge(scene_id)
     views.forget_purged()
-    assert views.held == (other,)
+    assert views.cached == (other,)
 
 
 def test_the_attempt_that_is_named_is_shown(store: Store, scene_id: str) -> None:
@@ -208,13 +208,13 @@ def test_no_more_scenes_are_held_than_their_bytes_allow_and_the_one_used_longest
     views = Views(store, hot_bytes=COPIES * size * 3)
     for each in (*scene_ids[:3], scene_ids[0], scene_ids[3]):
         views.answer(request_of(each))
-    assert views.held == (scene_ids[2], scene_ids[0], scene_ids[3])
+    assert views.cached == (scene_ids[2], scene_ids[0], scene_ids[3])
 
 
 def test_a_scene_larger_than_all_that_may_be_held_is_shown(store: Store, scene_id: str) -> None:
     views = Views(store, hot_bytes=1)
     assert views.answer(request_of(scene_id)).body
-    assert views.held == (scene_id,)
+    assert views.cached == (scene_id,)
 
 
 def test_a_running_job_is_shown_by_its_snapshot_which_vouches_for_nothing(store: Store, scene_id: str) -> None:
@@ -319,7 +319,7 @@ def test_who_asks_the_same_again_gets_the_same_answer_until_the_scene_or_the_sna
     for request in (request_of(scene_id), request_of(running, attempt=None)):
         snapshots.offer(scene(), 40)
         first, again = views.answer(request), views.answer(request)
-        assert (first.is_kept, again.is_kept, again.body) == (False, True, first.body)
+        assert (first.is_untimed, again.is_untimed, again.body) == (False, True, first.body)
         assert views.cost(request) == 0
     snapshots.offer(scene(), 41)
     assert views.answer(request).iteration == 41
@@ -394,7 +394,7 @@ def test_pictures_are_coarse_while_time_is_short_and_exact_formats_are_not(
     assert NoticeCode.COARSE in [each.code for each in coarse.warnings]
     assert NoticeCode.COARSE not in [each.code for each in exact.warnings]
     again = views.answer(request, level)
-    assert (again.is_kept, again.level, again.body) == (True, level, coarse.body)
+    assert (again.is_untimed, again.level, again.body) == (True, level, coarse.body)
     assert views.cost(request) > 0  # it is rendered again when there is time
     sharp = views.answer(request)
     assert views.cost(request) == 0
@@ -412,7 +412,7 @@ def test_a_picture_of_a_scene_that_is_purged_while_it_is_rendered_is_not_kept(st
         views.forget_purged()
 
     made_with(views.answer_in_parts(large), purge)
-    assert views.held == ()
+    assert views.cached == ()
     assert views.cost(large) > 0
 
 

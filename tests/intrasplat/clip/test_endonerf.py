@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import ClipLimits, DepthClip, open_clip
 from intrasplat.errors import InputError, LimitError
-from intrasplat.intake.limits import HELD_BYTES_PER_PIXEL
+from intrasplat.intake.limits import CLIP_BYTES_PER_PIXEL
 from tests.intrasplat.clips import open_with
 
 
@@ -253,7 +253,7 @@ def test_a_clip_over_the_limits_is_refused_before_it_is_decoded(studio) -> None:
     folder = studio.endonerf()
     with pytest.raises(LimitError, match="the limit is 2"):
         open_clip(folder, limits=ClipLimits(frames=2))
-    needed = 3 * 64 * 80 * HELD_BYTES_PER_PIXEL
+    needed = 3 * 64 * 80 * CLIP_BYTES_PER_PIXEL
     with pytest.raises(LimitError, match=r"3 frames of 80x64 pixels.* holds 2\. Cut it to 2 frames"):
         open_clip(folder, limits=ClipLimits(decoded_bytes=needed - 1))
     open_clip(folder, limits=ClipLimits(decoded_bytes=needed))

@@ -10,7 +10,7 @@ from intrasplat.clip import ClipLimits, open_clip
 from intrasplat.decode import decoding
 from intrasplat.errors import LimitError
 from intrasplat.intake import limits as limits_module
-from intrasplat.intake.limits import HELD_BYTES_PER_PIXEL, memory_for_clip_bytes
+from intrasplat.intake.limits import CLIP_BYTES_PER_PIXEL, memory_for_clip_bytes
 from intrasplat.train.targets import TrainingFrames
 from tests.intrasplat.clips import HEIGHT, WIDTH, plane_clip
 
@@ -25,7 +25,7 @@ def test_a_pixel_takes_what_both_eyes_of_the_clip_hold_of_it_and_training_frames
     left, right = plane_clip(12), plane_clip(12)
     held = sum(arrays_bytes(eye) + arrays_bytes(TrainingFrames(eye, range(12), 1.0)) for eye in (left, right))
     pixels = 12 * HEIGHT * WIDTH
-    assert HELD_BYTES_PER_PIXEL - 1 < held / pixels <= HELD_BYTES_PER_PIXEL + 1  # poses and frame times, too
+    assert CLIP_BYTES_PER_PIXEL - 1 < held / pixels <= CLIP_BYTES_PER_PIXEL + 1  # poses and frame times, too
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_a_clip_takes_half_of_the_memory_at_most_and_its_decoder_two_thirds(
 
 def test_a_clip_that_does_not_fit_is_told_how_many_of_its_frames_do() -> None:
     limits = ClipLimits(clip_bytes=GIB)
-    fitting = GIB // (1280 * 1024 * HELD_BYTES_PER_PIXEL)
+    fitting = GIB // (1280 * 1024 * CLIP_BYTES_PER_PIXEL)
     limits.check_clip("clip", "it", fitting, 1280, 1024, eyes=1)
     with pytest.raises(LimitError, match=r"1280x1024 pixels; .* limit of 1024.0 MiB holds 45") as caught:
         limits.check_clip("clip", "it", fitting + 1, 1280, 1024, eyes=1)

@@ -12,14 +12,14 @@ import pytest
 from intrasplat.clip import ClipLimits, StereoClip, open_clip, video
 from intrasplat.clip.video import open_video
 from intrasplat.errors import InputError, LimitError
-from intrasplat.intake.limits import HELD_BYTES_PER_PIXEL
+from intrasplat.intake.limits import CLIP_BYTES_PER_PIXEL
 from tests.intrasplat.clips import open_with
 
 DATA = Path(__file__).parents[2] / "data"
 SBS_H264 = DATA / "stereo_sbs_h264.mp4"
 TB_HEVC = DATA / "stereo_tb_hevc.mov"
 REAL_DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).parents[3].parent / "shared/data"))
-HELD_BYTES = 12 * 96 * 80 * HELD_BYTES_PER_PIXEL  # of the twelve frames in tests/data, once they are reconstructed
+CLIP_BYTES = 12 * 96 * 80 * CLIP_BYTES_PER_PIXEL  # of the twelve frames in tests/data, once they are reconstructed
 LOSSY_LEVELS = 8.0  # mean error of strongly compressed 8-bit frames
 
 
@@ -262,7 +262,7 @@ def test_eyes_of_different_size_are_refused(studio) -> None:
     [
         (ClipLimits(frames=11), "the limit is 11"),
         (ClipLimits(pixels_per_frame=192 * 80 - 1), "192x80 pixels"),
-        (ClipLimits(clip_bytes=HELD_BYTES - 1), "holds 11"),
+        (ClipLimits(clip_bytes=CLIP_BYTES - 1), "holds 11"),
     ],
 )
 def test_clips_over_a_limit_are_refused(limits: ClipLimits, problem: str) -> None:
@@ -270,19 +270,19 @@ def test_clips_over_a_limit_are_refused(limits: ClipLimits, problem: str) -> Non
         open_clip(SBS_H264, limits=limits)
 
 
-@pytest.mark.parametrize("limits", [ClipLimits(frames=11), ClipLimits(clip_bytes=HELD_BYTES - 1)])
+@pytest.mark.parametrize("limits", [ClipLimits(frames=11), ClipLimits(clip_bytes=CLIP_BYTES - 1)])
 def test_limits_hold_while_decoding_where_the_header_says_nothing(limits: ClipLimits) -> None:
     with pytest.raises(LimitError):
         open_clip(DATA / "stereo_sbs_live.webm", limits=limits)
 
 
 def test_a_clip_that_just_fits_is_accepted(studio) -> None:
-    limits = ClipLimits(clip_bytes=HELD_BYTES)
+    limits = ClipLimits(clip_bytes=CLIP_BYTES)
     assert stereo(SBS_H264, limits=limits).frame_count == 12
     left, right = (studio.video(name, eye) for name, eye in zip(("a.webm", "b.webm"), studio.eyes(12), strict=True))
     assert stereo(left, right=right, limits=limits).frame_count == 12
     with pytest.raises(LimitError, match="96x80 pixels"):
-        open_clip(left, right, limits=ClipLimits(clip_bytes=HELD_BYTES - 1))
+        open_clip(left, right, limits=ClipLimits(clip_bytes=CLIP_BYTES - 1))
 
 
 def test_layouts_that_do_not_fit_a_video_are_refused() -> None:
