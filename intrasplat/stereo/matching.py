@@ -46,9 +46,9 @@ MAX_REFINEMENT_PX = 1.0  # beyond it the linearisation of one step is invalid
 BLACK_LEVEL, BLACK_PX = 10, 5  # no confidence where the mean over the window is at most this level
 SATURATED_LEVEL = 250
 MAX_DEVIATION_PX, UNKNOWN_DEVIATION_PX = 3.0, 1.0  # the latter where the matching directions disagree
-DOUBT_AT_LEAST_PX, DOUBT_BY_DEVIATION = 0.03, 0.37
-EVIDENCE_AT_LEAST, DOUBT_BY_EVIDENCE = 0.1, 0.3
-NOISE_AT_LEAST = 0.02
+DEVIATION_FLOOR_PX, DEVIATION_EXPONENT = 0.03, 0.37
+EVIDENCE_FLOOR, EVIDENCE_EXPONENT = 0.1, 0.3
+NOISE_FLOOR = 0.02
 """Fitted model of the expected error: offset and power of deviation (reduced px) and of evidence; offset of noise."""
 ERROR, ERROR_PX = 1.0, 0.5
 """Measured factor of the expected error; expected error at which confidence is a half."""
@@ -97,9 +97,9 @@ def match(
         trust[~instrument & beside_instruments(found, trust, instrument)] = 0
         coarse = np.where(instrument, coarse, _smoothed(found, trust * ~instrument, small))
     deviation = np.where(agreed, np.minimum(np.abs(found - coarse), MAX_DEVIATION_PX), UNKNOWN_DEVIATION_PX)
-    doubt = doubt_of(_mean(deviation.astype(np.float32), ROUGHNESS_PX), _mean(trust, EVIDENCE_PX))
+    uncertainty = uncertainty_of(_mean(deviation.astype(np.float32), ROUGHNESS_PX), _mean(trust, EVIDENCE_PX))
     disparity, texture, residual = _refine(_enlarged(coarse, left) / np.float32(scale), left, right)
-    confidence = confidence_of(_enlarged(doubt, left), texture, residual)
+    confidence = confidence_of(_enlarged(uncertainty, left), texture, residual)
     x_right = np.arange(width, dtype=np.float32) - disparity
     unsure = (left >= SATURATED_LEVEL) | (x_right < 0) | (x_right > width - 1)
     confidence[unsure] = np.maximum(confidence[unsure] * UNSURE_TRUST, np.minimum(confidence[unsure], MIN_CONFIDENCE))
@@ -168,10 +168,10 @@ def beside_instruments(found: Image, trust: Image, instrument: NDArray[np.bool_]
     if surface.size and row.size:
         hidden = found[row, column] - np.percentile(surface, SURFACE_PERCENTILE)
         start = np.clip(column - 1 - np.ceil(np.maximum(hidden, 0)).astype(np.intp), 0, None)
-        begun = np.zeros(found.shape, np.int32)
-        np.add.at(begun, (row, start), 1)
-        np.add.at(begun, (row, column), -1)
-        beside |= begun.cumsum(axis=1) > 0
+        delta = np.zeros(found.shape, np.int32)
+        np.add.at(delta, (row, start), 1)
+        np.add.at(delta, (row, column), -1)
+        beside |= delta.cumsum(axis=1) > 0
     return np.asarray(beside)
 
 
@@ -183,17 +183,17 @@ def _smoothed(found: Image, trust: Image, image: Grey) -> Image:
     return np.where(weight > MIN_WEIGHT, weighted / np.maximum(weight, MIN_WEIGHT), found)
 
 
-def doubt_of(deviation: Image, evidence: Image) -> Image:
+def uncertainty_of(deviation: Image, evidence: Image) -> Image:
     """The expected error's part from the reduced images: deviation from the smooth surface, over evidence."""
-    by_deviation = cv2.pow(deviation + np.float32(DOUBT_AT_LEAST_PX), DOUBT_BY_DEVIATION)
-    doubt: Image = by_deviation / cv2.pow(evidence + np.float32(EVIDENCE_AT_LEAST), DOUBT_BY_EVIDENCE)
-    return doubt
+    by_deviation = cv2.pow(deviation + np.float32(DEVIATION_FLOOR_PX), DEVIATION_EXPONENT)
+    uncertainty: Image = by_deviation / cv2.pow(evidence + np.float32(EVIDENCE_FLOOR), EVIDENCE_EXPONENT)
+    return uncertainty
 
 
-def confidence_of(doubt: Image, texture: Image, residual: Image) -> Image:
-    """Confidence [H, W] in [0, 255] for the expected error in px: doubt times the root of the window's noise."""
-    noise = residual / cv2.sqrt(texture + 1) + np.float32(NOISE_AT_LEAST)
-    expected_px: Image = np.float32(ERROR) * doubt * cv2.sqrt(noise)
+def confidence_of(uncertainty: Image, texture: Image, residual: Image) -> Image:
+    """Confidence [H, W] in [0, 255] for the expected error in px: uncertainty times the root of the window's noise."""
+    noise = residual / cv2.sqrt(texture + 1) + np.float32(NOISE_FLOOR)
+    expected_px: Image = np.float32(ERROR) * uncertainty * cv2.sqrt(noise)
     confidence = 255 / (1 + (expected_px / np.float32(ERROR_PX)) ** 2)
     least = np.minimum(confidence, MIN_CONFIDENCE)
     textured: Image = np.maximum(confidence * np.minimum(texture / TEXTURE_FOR_TRUST, 1), least)

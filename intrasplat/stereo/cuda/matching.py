@@ -27,13 +27,13 @@ from intrasplat.stereo.matching import (
     BLACK_PX,
     COLOUR_SIGMA,
     CONTRAST_PX,
-    DOUBT_AT_LEAST_PX,
-    DOUBT_BY_DEVIATION,
-    DOUBT_BY_EVIDENCE,
+    DEVIATION_EXPONENT,
+    DEVIATION_FLOOR_PX,
     ENDS_PX,
     ERROR,
     ERROR_PX,
-    EVIDENCE_AT_LEAST,
+    EVIDENCE_EXPONENT,
+    EVIDENCE_FLOOR,
     EVIDENCE_PX,
     EVIDENCE_TEXTURE,
     HIGH_PASS_PX,
@@ -42,7 +42,7 @@ from intrasplat.stereo.matching import (
     MAX_REFINEMENT_PX,
     MIN_CONFIDENCE,
     MIN_WEIGHT,
-    NOISE_AT_LEAST,
+    NOISE_FLOOR,
     REFERENCE_WIDTH,
     REFINE_DAMPING,
     REFINE_WINDOW_PX,
@@ -131,10 +131,10 @@ def match_frames(left: Tensor, right: Tensor, plan: MatchPlan, tissue: Tensor | 
         trust.masked_fill_(~instrument & _beside_instruments(found, trust, instrument), 0)
         coarse = torch.where(instrument, coarse, filled(found, trust * ~instrument, guide))
     deviation = torch.where(agreed > 0, (found - coarse).abs().clamp_max(MAX_DEVIATION_PX), UNKNOWN_DEVIATION_PX)
-    doubt = doubt_of(_box(deviation, ROUGHNESS_PX), _box(trust, EVIDENCE_PX))
+    uncertainty = uncertainty_of(_box(deviation, ROUGHNESS_PX), _box(trust, EVIDENCE_PX))
     disparity = _enlarged(coarse, (height, width)) * (width / size[1])
     disparity, texture, residual = refine(disparity, left, right)
-    confidence = confidence_of(_enlarged(doubt, (height, width)), texture, residual)
+    confidence = confidence_of(_enlarged(uncertainty, (height, width)), texture, residual)
     x_right = torch.arange(width, device=left.device) - disparity
     unsure = (left >= SATURATED_LEVEL) | (x_right < 0) | (x_right > width - 1)
     least = confidence.clamp_max(MIN_CONFIDENCE)
@@ -166,20 +166,20 @@ def _beside_instruments(found: Tensor, trust: Tensor, instrument: Tensor) -> Ten
     hidden = torch.where(matched, (found - behind).clamp_min(0), 0)
     column = torch.arange(found.shape[2], device=found.device).expand_as(matched)
     start = (column - 1 - hidden.ceil().long()).clamp_min(0)
-    begun = torch.zeros(found.shape, dtype=torch.int32, device=found.device)
-    begun.scatter_add_(2, start, matched.int())
-    return beside | ((begun - matched.int()).cumsum(2) > 0)
+    starts = torch.zeros(found.shape, dtype=torch.int32, device=found.device)
+    starts.scatter_add_(2, start, matched.int())
+    return beside | ((starts - matched.int()).cumsum(2) > 0)
 
 
-def doubt_of(deviation: Tensor, evidence: Tensor) -> Tensor:
-    """As matching.doubt_of."""
-    by_deviation = (deviation + DOUBT_AT_LEAST_PX).pow(DOUBT_BY_DEVIATION)
-    return by_deviation / (evidence + EVIDENCE_AT_LEAST).pow(DOUBT_BY_EVIDENCE)
+def uncertainty_of(deviation: Tensor, evidence: Tensor) -> Tensor:
+    """As matching.uncertainty_of."""
+    by_deviation = (deviation + DEVIATION_FLOOR_PX).pow(DEVIATION_EXPONENT)
+    return by_deviation / (evidence + EVIDENCE_FLOOR).pow(EVIDENCE_EXPONENT)
 
 
-def confidence_of(doubt: Tensor, texture: Tensor, residual: Tensor) -> Tensor:
+def confidence_of(uncertainty: Tensor, texture: Tensor, residual: Tensor) -> Tensor:
     """As matching.confidence_of."""
-    expected_px = ERROR * doubt * (residual / (texture + 1).sqrt() + NOISE_AT_LEAST).sqrt()
+    expected_px = ERROR * uncertainty * (residual / (texture + 1).sqrt() + NOISE_FLOOR).sqrt()
     confidence = 255 / (1 + (expected_px / ERROR_PX).square())
     return (confidence * (texture / TEXTURE_FOR_TRUST).clamp_max(1)).maximum(confidence.clamp_max(MIN_CONFIDENCE))
 
