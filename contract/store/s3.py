@@ -277,23 +277,23 @@ class S3Shelf:
 
     def _fetch_once(self, entry: ShelfEntry) -> None:
         """Copy the entry to a temporary folder, check it, and move it to its path on this machine."""
-        aside = self._here.path(ShelfEntry(Area.INCOMING, new_job_id()))
-        aside.mkdir(mode=0o700)
+        temporary = self._here.path(ShelfEntry(Area.INCOMING, new_job_id()))
+        temporary.mkdir(mode=0o700)
         try:
             for each in self._bucket.objects(_key(entry)):
-                path = aside / each.key.removeprefix(_key(entry))
-                if not path.resolve().is_relative_to(aside):
+                path = temporary / each.key.removeprefix(_key(entry))
+                if not path.resolve().is_relative_to(temporary):
                     raise SceneError(f"The bucket holds a foreign object under {_key(entry)}: its name is not ours.")
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 self._bucket.get(each.key, path)
-            _check(aside)
-            if (aside / entry.marker).is_file() and not self._here.holds(entry):
-                self._here.put(aside, entry)
+            _check(temporary)
+            if (temporary / entry.marker).is_file() and not self._here.holds(entry):
+                self._here.put(temporary, entry)
         except UnavailableError:
             if not self._here.holds(entry):  # else another process was faster
                 raise
         finally:
-            remove_tree(aside)
+            remove_tree(temporary)
 
 
 def _key(entry: ShelfEntry) -> str:

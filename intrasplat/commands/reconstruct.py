@@ -19,7 +19,7 @@ from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.commands.progress_bar import ProgressBar
 from intrasplat.errors import Cancelled, InputError
-from intrasplat.files.durable import aside_of
+from intrasplat.files.durable import temporary_path
 from intrasplat.names import CURVE, KEPT, MANIFEST, MASKS, RECORDED, REPORT, SCENE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 _BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, MASKS, RECORDED, SCENE)
-UNFINISHED = {*_BEFORE_MANIFEST, *(aside_of(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
+UNFINISHED = {*_BEFORE_MANIFEST, *(temporary_path(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
 """Files that a stopped or killed run may leave. The manifest is written last: it marks a finished scene."""
 
 
@@ -118,14 +118,14 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     clip: Path | DepthClip = options.clip
     timings = Timings()
     on_cpu = options.device == "cpu" or not may_have_gpu()
-    aside = ThreadPoolExecutor(1)
-    pipeline = aside.submit(import_module, "intrasplat.pipeline")
-    aside.submit(_compile, on_cpu)  # not awaited here: the pipeline waits for it, and shows that as a stage
+    background = ThreadPoolExecutor(1)
+    pipeline = background.submit(import_module, "intrasplat.pipeline")
+    background.submit(_compile, on_cpu)  # not awaited here: the pipeline waits for it, and shows that as a stage
     if on_cpu:
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
     pipeline.result()
-    aside.shutdown(wait=False)
+    background.shutdown(wait=False)
     from intrasplat.pipeline import reconstruct
     from intrasplat.train.hooks import TrainingHooks
     from intrasplat.train.request import ReconstructionRequest

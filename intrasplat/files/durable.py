@@ -22,7 +22,7 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def aside_of(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """The temporary path at which a file is written before the rename; a crash may leave a file there."""
     return path.with_name(f".{path.name}.new")
 
@@ -38,17 +38,17 @@ def replace_file(path: Path, content: bytes, mode: int = OWNER_ONLY) -> None:
     Raises:
         OSError: the disk is full or refuses; the old file is unchanged.
     """
-    aside = aside_of(path)
-    aside.unlink(missing_ok=True)  # left by a crash
+    temporary = temporary_path(path)
+    temporary.unlink(missing_ok=True)  # left by a crash
     try:
-        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         with open(descriptor, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(descriptor)
-        aside.rename(path)
+        temporary.rename(path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     flush(path.parent)
 
 

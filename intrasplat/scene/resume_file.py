@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from intrasplat.errors import SceneError
-from intrasplat.files.durable import FOR_ALL, aside_of, flush
+from intrasplat.files.durable import FOR_ALL, flush, temporary_path
 from intrasplat.names import RESUME
 
 RESUME_FILE = RESUME
@@ -61,12 +61,12 @@ def begin_resume(
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / RESUME_FILE
-    aside = aside_of(path)
-    aside.unlink(missing_ok=True)  # left by a crash
+    temporary = temporary_path(path)
+    temporary.unlink(missing_ok=True)  # left by a crash
     tensors = dict(sorted(tensors.items(), key=lambda each: -each[1].element_size()))  # so that each is aligned
     text, places = json.dumps(dict(state), sort_keys=True), _places(tensors)
     try:
-        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, FOR_ALL)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, FOR_ALL)
         with open(descriptor, "wb") as file:
             file.write(_header(places, text, _NO_CHECKSUM))
             for tensor in tensors.values():
@@ -75,19 +75,19 @@ def begin_resume(
                     if piece.nbytes >= _PIECE_BYTES:
                         after_each()
     except BaseException:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
     def complete() -> None:
         try:
             start = len(_header(places, text, _NO_CHECKSUM))
-            with aside.open("r+b") as file:
-                file.write(_header(places, text, _checksum(aside, start, text)))
+            with temporary.open("r+b") as file:
+                file.write(_header(places, text, _checksum(temporary, start, text)))
                 file.flush()
                 os.fsync(file.fileno())
-            aside.rename(path)
+            temporary.rename(path)
         finally:
-            aside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
         flush(directory)
 
     return complete

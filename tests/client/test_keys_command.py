@@ -13,7 +13,7 @@ from client.cli import main
 from contract.access.audit import AUDIT_FILE, utc_text
 from contract.access.keys import DAY_S, KEYS_FILE, KeyFile, KeyScope
 from intrasplat.commands.exits import ExitCode
-from intrasplat.files.durable import aside_of
+from intrasplat.files.durable import temporary_path
 from tests.contract.stores import SERVICE, given_to
 
 
@@ -81,7 +81,7 @@ def test_of_a_change_that_fails_the_audit_says_that_it_was_begun_and_not_that_it
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     before, _ = KeyFile(tmp_path).create("ward-3")
-    aside_of(tmp_path / KEYS_FILE).mkdir()  # the new file cannot be written
+    temporary_path(tmp_path / KEYS_FILE).mkdir()  # the new file cannot be written
     assert change(tmp_path, arguments) == ExitCode.UNAVAILABLE
     told = capsys.readouterr()
     assert (told.out, told.err[:12]) == ("", "intrasplat: ")
