@@ -16,7 +16,7 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.report import Training
 from intrasplat.quality.trust import trust
 from intrasplat.quality.visibility import drop_strays
-from intrasplat.scene.scene import POSE_DOUBTS, TrainedScene
+from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
 from intrasplat.train.rate_distortion import QuantizedScene
 from intrasplat.train.run import Run
 
@@ -54,7 +54,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,
             "eyes": run.taught_by,
-            "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_DOUBTS],
+            "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_WARNINGS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
         },
     )

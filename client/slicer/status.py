@@ -19,7 +19,7 @@ class Status:
 
     def __init__(self, playback: Playback, report: Report) -> None:
         self._playback = playback
-        self._doubts = [each.text for each in report.warnings if each.severity == Severity.WARNING]
+        self._warnings = [each.text for each in report.warnings if each.severity == Severity.WARNING]
         self._shown: tuple[Image, int, bool] | None = None
         self._shown_at = ""
         self.trouble = self.refused = self.surface = self.ended = ""
@@ -41,7 +41,7 @@ class Status:
             self._head(),
             f"Confidence: {confidence}{unseen}.",
             *([f"This view: {image.warning}"] if image is not None and image.warning else []),
-            *(f"This scene: {each}" for each in self._doubts),
+            *(f"This scene: {each}" for each in self._warnings),
             *(each for each in (self.surface, self.refused) if each),
         ]
         return "\n".join(lines)

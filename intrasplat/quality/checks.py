@@ -100,10 +100,12 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.",
             )
         )
-    return found + _brightness_warnings(clip, sampled) + picture_doubts(clip, sampled) + course_doubts(clip, train)
+    return (
+        found + _brightness_warnings(clip, sampled) + picture_warnings(clip, sampled) + sequence_warnings(clip, train)
+    )
 
 
-def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
+def picture_warnings(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
     """Warnings about the pictures of the sampled training frames: veiled, out of focus, smeared, changing colour."""
     seen = [index for index in clip.one_by_one(sampled) if clip.tissue[index].any()]
     if not seen:
@@ -118,10 +120,10 @@ def picture_doubts(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
                 "much light takes its contrast, and the model shows the veil as if it were tissue.",
             )
         )
-    return found + _focus_doubts(clip, seen) + _colour_doubts(clip, seen)
+    return found + _focus_warnings(clip, seen) + _colour_warnings(clip, seen)
 
 
-def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
+def sequence_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Warnings about the sequence of training frames: repeated, hidden at first, with masks or depth that jump."""
     found = []
     pairs = list(itertools.pairwise(train))
@@ -158,10 +160,10 @@ def course_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 "as if it were tissue.",
             )
         )
-    return found + _depth_doubts(clip, train)
+    return found + _depth_warnings(clip, train)
 
 
-def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
+def _focus_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     measured = [_fine_detail(clip, index) for index in clip.one_by_one(frames)]
     detail = np.array([each for each in measured if each is not None])
     if not detail.size:
@@ -184,7 +186,7 @@ def _focus_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     ]
 
 
-def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
+def _colour_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     """Warn about blood that appears, or else about a white balance that drifts."""
     flooded = float(np.ptp([_blood_share(clip, index) for index in clip.one_by_one(frames)]))
     if flooded > MAX_FLOODED_SHARE:
@@ -210,7 +212,7 @@ def _colour_doubts(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     ]
 
 
-def _depth_doubts(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
+def _depth_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Warn if the depth of much tissue jumps by a tenth within a frame: no tissue moves so fast, so depth is wrong."""
     still = set(clip.left_out)
     following = {one: two for one, two in itertools.pairwise(train) if still.issuperset(range(one + 1, two))}

@@ -137,9 +137,9 @@ def measure(
     )
 
 
-def first_report(clip: DepthClip, split: FrameSplit, training: Training, doubts: Sequence[Notice] = ()) -> Report:
-    """The report of a finished scene before it is scored. doubts: the result of clip_warnings()."""
-    found = [*clip.warnings, *split.warnings, *training.warnings, *doubts, SCORES_PENDING]
+def first_report(clip: DepthClip, split: FrameSplit, training: Training, warnings: Sequence[Notice] = ()) -> Report:
+    """The report of a finished scene before it is scored. warnings: the result of clip_warnings()."""
+    found = [*clip.warnings, *split.warnings, *training.warnings, *warnings, SCORES_PENDING]
     return Report(
         scored=False,
         psnr_tissue_db=None,

@@ -24,7 +24,7 @@ from intrasplat.scene.files import dtype_name
 from intrasplat.splat.deformation import Deformation
 from intrasplat.splat.gaussians import Gaussians
 
-POSE_DOUBTS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE, NoticeCode.POSE_JITTER})
+POSE_WARNINGS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE, NoticeCode.POSE_JITTER})
 """Warnings of a clip that every view of its scene repeats: a view is only as right as the poses of its training."""
 
 
@@ -73,7 +73,7 @@ class TrainedScene:
 
     @cached_property
     def pose_warnings(self) -> tuple[Notice, ...]:
-        """The clip's warnings in POSE_DOUBTS: why the endoscope's poses may be wrong."""
+        """The clip's warnings in POSE_WARNINGS: why the endoscope's poses may be wrong."""
         return tuple(Notice.model_validate(each) for each in self.settings.get("pose_warnings", ()))
 
     def without_motion(self) -> TrainedScene:

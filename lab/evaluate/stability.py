@@ -32,7 +32,7 @@ from intrasplat.poses.trajectory import trajectory_error
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
-from intrasplat.scene.scene import POSE_DOUBTS
+from intrasplat.scene.scene import POSE_WARNINGS
 from intrasplat.splat.backend import choose_device
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
@@ -70,7 +70,7 @@ has SEVERITY:CODE of each of the warnings."""
 MAX_LOSS_DB = 3.0
 """Twice the squared error: nobody would call that the same quality."""
 MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG = 1.5, 1.0
-"""Error of an estimated camera path above which a cell is harmed and must have a warning in POSE_DOUBTS."""
+"""Error of an estimated camera path above which a cell is harmed and must have a warning in POSE_WARNINGS."""
 MAX_DEPTH_LOSS_MM = 2.0
 """About the width of a grasper's jaw."""
 SEPARATOR = " | "
@@ -224,7 +224,7 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     harmed = loss_db > MAX_LOSS_DB or depth_loss_mm > MAX_DEPTH_LOSS_MM
     outcome = "held" if not harmed else "told" if new else "silent"
     if _lost_its_way(row):
-        doubts = {f"{Severity.WARNING}:{each}" for each in POSE_DOUBTS}
+        doubts = {f"{Severity.WARNING}:{each}" for each in POSE_WARNINGS}
         outcome = "told" if doubts & {*row["codes"].split()} else "silent"
     return {
         "outcome": outcome,

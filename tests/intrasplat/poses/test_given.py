@@ -16,7 +16,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.options import Poses, ReconstructionOptions
 from intrasplat.poses import with_poses
 from intrasplat.poses.trajectory import trajectory_error
-from intrasplat.scene.scene import POSE_DOUBTS
+from intrasplat.scene.scene import POSE_WARNINGS
 from lab.conditions.clean import clean_of
 from lab.conditions.scenes import noisy
 from lab.evaluate.sources import open_source, source_of
@@ -71,7 +71,7 @@ def test_poses_that_must_be_given_stay_as_they_are_and_their_jumps_are_told() ->
     result = posed(given, "given")
     np.testing.assert_array_equal(result.world_from_camera, given.world_from_camera)
     assert [notice.code for notice in result.warnings if notice not in given.warnings] == [NoticeCode.POSE_JITTER]
-    assert NoticeCode.POSE_JITTER in POSE_DOUBTS  # so every view repeats it
+    assert NoticeCode.POSE_JITTER in POSE_WARNINGS  # so every view repeats it
 
 
 @dataclass(frozen=True)

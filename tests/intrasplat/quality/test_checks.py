@@ -11,7 +11,7 @@ import pytest
 
 from intrasplat.clip import DepthClip, open_clip, split_frames
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.quality.checks import course_doubts, picture_doubts
+from intrasplat.quality.checks import picture_warnings, sequence_warnings
 from intrasplat.train.scoring import sample_frames
 from lab.conditions import CONDITIONS, CleanClip, clean_clip
 from lab.phantom import MOTIONS, Motion, PhantomSettings
@@ -27,7 +27,7 @@ def clean() -> CleanClip:
 
 def doubts(clip: DepthClip) -> list[Notice]:
     train = split_frames(clip).train
-    return picture_doubts(clip, sample_frames(train)) + course_doubts(clip, train)
+    return picture_warnings(clip, sample_frames(train)) + sequence_warnings(clip, train)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -104,7 +104,7 @@ def test_a_picture_of_one_colour_and_one_of_no_tissue_are_survived() -> None:
     clip = phantom_clip(frames=20)
     train = split_frames(clip).train
     flat = dataclasses.replace(clip, rgb=np.full_like(clip.rgb, 40))
-    assert picture_doubts(flat, train) == []
+    assert picture_warnings(flat, train) == []
     nothing = dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue))
-    assert picture_doubts(nothing, train) == []
-    assert course_doubts(nothing, train) == []
+    assert picture_warnings(nothing, train) == []
+    assert sequence_warnings(nothing, train) == []

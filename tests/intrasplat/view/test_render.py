@@ -18,7 +18,7 @@ from intrasplat.names import LABORATORY_PRESETS
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.outcome import scene_of, snapshot_of
 from intrasplat.scene.checkpoint import load_scene, save_scene
-from intrasplat.scene.scene import POSE_DOUBTS, TrainedScene
+from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.run import Run
 from intrasplat.view.camera import endoscope_pose
@@ -63,7 +63,7 @@ def test_the_endoscopes_own_view_needs_no_warning(scene: TrainedScene) -> None:
 
 
 def test_every_view_repeats_that_the_clips_poses_are_in_doubt(tmp_path: Path) -> None:
-    doubts = tuple(Notice.warning(code, f"{code} is so.") for code in sorted(POSE_DOUBTS))
+    doubts = tuple(Notice.warning(code, f"{code} is so.") for code in sorted(POSE_WARNINGS))
     other = Notice.warning(NoticeCode.BLOOD, "It is red.")
     clip = dataclasses.replace(phantom_clip(), warnings=(other, *doubts))
     run, _ = prepared(clip, "fast", iterations=2)
@@ -72,7 +72,7 @@ def test_every_view_repeats_that_the_clips_poses_are_in_doubt(tmp_path: Path) ->
     assert snapshot_of(run).pose_warnings == doubts
     assert load_scene(tmp_path / "scene").pose_warnings == doubts
     beside = render_frame(load_scene(tmp_path / "scene"), 0.4, orbit_pose(3, 0)).warnings
-    assert [each for each in beside if each.code in POSE_DOUBTS] == list(doubts)
+    assert [each for each in beside if each.code in POSE_WARNINGS] == list(doubts)
     assert other not in beside
 
 
