@@ -105,13 +105,13 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, ke
         forecast.learn(used, used * setup.clip.tissue[0].size / 1e6)
         run = resume(keeper.folder, setup) or prepare(setup)
         optimise(run, keeper)
-        with ThreadPoolExecutor(1) as aside:
-            doubts = aside.submit(clip_warnings, setup.clip, setup.split.train)
-            masks, recorded = aside.submit(zipped_masks, setup.clip), aside.submit(recorded_frames, run)
+        with ThreadPoolExecutor(1) as background:
+            warnings = background.submit(clip_warnings, setup.clip, setup.split.train)
+            masks, recorded = background.submit(zipped_masks, setup.clip), background.submit(recorded_frames, run)
             scene, quantized = finish(run)
         frames, summary = recorded.result()
         beside = {name: each for name, each in {MASKS: masks.result(), RECORDED: frames}.items() if each is not None}
-        report = publish(out_dir, run, scene, quantized, doubts.result(), beside, summary)
+        report = publish(out_dir, run, scene, quantized, warnings.result(), beside, summary)
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -258,14 +258,14 @@ def publish(
     run: Run,
     scene: TrainedScene,
     quantized: QuantizedScene | None,
-    doubts: Sequence[Notice],
+    warnings: Sequence[Notice],
     beside: Mapping[str, bytes],
     recorded: Recorded | None,
 ) -> Report:
     """Write the report, the curve, the scene and the files `beside` it, by name. The report has no scores yet."""
     setup = run.setup
     setup.timings.seconds["t_post_s"] = time.time() - setup.accepted_at_s
-    report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), doubts)
+    report = first_report(setup.clip, setup.split, training_of(run, scene, quantized), warnings)
     report = report.model_copy(update={"recorded": recorded})
     (out_dir / REPORT).write_text(report.model_dump_json(indent=1))
     write_curve(out_dir / CURVE, run)

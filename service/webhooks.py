@@ -67,14 +67,14 @@ class Webhooks:
         self._settings = settings
         self._queue = queue
         self._is_away = False
-        self._under_way: Counter[str] = Counter()
+        self._in_progress: Counter[str] = Counter()
         """Attempts in progress, by tenant."""
         self._threads = CapacityLimiter(MAX_CALLS)
         self._look_ups = LookUps(MAX_AT_ONCE)
 
     async def run(self) -> None:
         """Send all due webhooks, until cancelled."""
-        self._under_way.clear()
+        self._in_progress.clear()
         tls = await run_in_threadpool(ssl.create_default_context)
         timeout = httpx.Timeout(TRY_S, connect=CONNECT_S)
         limits = httpx.Limits(max_keepalive_connections=0)  # never reuse a connection for another host name
@@ -86,13 +86,13 @@ class Webhooks:
         ):
             while True:
                 loan = None
-                if self._under_way.total() < MAX_AT_ONCE:
-                    full = [tenant for tenant, count in self._under_way.items() if count >= MAX_OF_TENANT]
+                if self._in_progress.total() < MAX_AT_ONCE:
+                    full = [tenant for tenant, count in self._in_progress.items() if count >= MAX_OF_TENANT]
                     loan = await to_thread.run_sync(self._lent, full, limiter=self._threads)
                 if loan is None:
                     await asyncio.sleep(LOOK_PERIOD_S)
                 else:
-                    self._under_way[loan.tenant] += 1
+                    self._in_progress[loan.tenant] += 1
                     tries.create_task(self._deliver(http, loan))
 
     def _lent(self, full: Collection[str]) -> Loan | None:
@@ -117,7 +117,7 @@ class Webhooks:
         except Exception:
             logger.exception("what became of a webhook is not noted", extra={"job_id": loan.delivery.job_id})
         finally:
-            self._under_way[loan.tenant] -= 1
+            self._in_progress[loan.tenant] -= 1
 
     async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
         """Attempt a delivery. Returns it with the new attempt."""

@@ -63,15 +63,15 @@ class AwaitedScores:
             if detector.is_hung() or (asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S):
                 child.kill()
         if isinstance(report, Scored):
-            return self._settle(lambda: report.report)
+            return self._add_report(lambda: report.report)
         if isinstance(report, Ended) and asked_s is None:
             cause = report.cause
             self._log.warning("the device process %s while it scored a scene", cause)
             if gives_up:
-                return self._settle(lambda: without_scores(self._store.newest_report(*self._scene[1:]), cause))
+                return self._add_report(lambda: without_scores(self._store.newest_report(*self._scene[1:]), cause))
         return False
 
-    def _settle(self, scored: Callable[[], Report]) -> bool:
+    def _add_report(self, scored: Callable[[], Report]) -> bool:
         """Add the report that `scored` returns. False: that failed, and the scene will be scored again later."""
         try:
             try:

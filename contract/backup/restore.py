@@ -124,13 +124,13 @@ def restore_backup(
         try:
             _empty(data_dir, {RESTORING} if queue_url else {RESTORING, *EMBEDDED_QUEUE})
             with open_queue as queue:
-                begun = _begun(marker)
-                _check_queue(queue, begun, entering, backup)
+                interrupted = _interrupted(marker)
+                _check_queue(queue, interrupted, entering, backup)
                 _copy_files(backup, manifest, data_dir, since.purged)
                 restored = Restored(backup, manifest.created_at, unreadable=manifest.unreadable)
                 restored.revoked_keys = _revoke(data_dir, since.revoked_keys)
                 records = list(read_jobs(backup))
-                if begun != entering:  # when equal, the queue has records, and the marker must never be empty
+                if interrupted != entering:  # when equal, the queue has records, and the marker must never be empty
                     marker.write_text(entering.model_dump_json())
                     flush(marker)
                 _fill_queue(queue, Store(data_dir, settings.store_url), records, since.purged, restored)
@@ -147,7 +147,7 @@ def restore_backup(
     return restored
 
 
-def _begun(marker: Path) -> _Entering | None:
+def _interrupted(marker: Path) -> _Entering | None:
     """What an earlier restore was entering into the queue when it failed or was cut off; None: nothing yet."""
     try:
         return _Entering.model_validate_json(marker.read_bytes())
@@ -155,16 +155,16 @@ def _begun(marker: Path) -> _Entering | None:
         return None
 
 
-def _check_queue(queue: Queue, begun: _Entering | None, entering: _Entering, backup: Path) -> None:
+def _check_queue(queue: Queue, interrupted: _Entering | None, entering: _Entering, backup: Path) -> None:
     """Refuse a queue with records other than those that the same restore has already entered."""
-    goes_on = begun == entering
+    goes_on = interrupted == entering
     found = queue.records(None, None) if goes_on else queue.records(limit=1)
     own = {record.job_id for record in read_jobs(backup)} if goes_on else set()
     if all(record.job_id in own for record in found):
         return
     problem, remedy = "The queue is not empty: it holds jobs of another installation, or of a restore cut off.", ""
-    if begun is not None and not goes_on and begun.queue == entering.queue:
-        remedy = f"Restore the backup of {begun.backup} again, which was being entered, or empty the queue. Or: "
+    if interrupted is not None and not goes_on and interrupted.queue == entering.queue:
+        remedy = f"Restore the backup of {interrupted.backup} again, which was being entered, or empty the queue. Or: "
     raise UnavailableError(
         problem, f"{remedy}Give the restored service a queue of its own (REDIS_URL), or empty this one."
     )

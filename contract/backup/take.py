@@ -92,8 +92,8 @@ def take_backup(settings: Settings, queue: Queue, destination: Path, *, full: bo
 
 def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) -> Taken:
     AuditLog(settings.data_dir).append(AuditEntry(time=utc_now(), action=AuditAction.BACKED_UP))
-    begun = datetime.now(UTC)
-    name = f"{begun:%Y-%m-%dT%H%M%S}.{begun.microsecond // 1000:03d}Z"
+    started = datetime.now(UTC)
+    name = f"{started:%Y-%m-%dT%H%M%S}.{started.microsecond // 1000:03d}Z"
     folder = destination / f"{UNFINISHED}{name}"
     folder.mkdir(mode=0o700)
     try:
@@ -106,7 +106,7 @@ def _take(settings: Settings, queue: Queue, destination: Path, *, full: bool) ->
         copier.write(JOBS_FILE, b"".join(record.model_dump_json().encode() + b"\n" for record in jobs))
         manifest = Manifest(
             intrasplat=version(),
-            created_at=begun.isoformat(timespec="milliseconds"),
+            created_at=started.isoformat(timespec="milliseconds"),
             store_url=settings.store_url,
             unreadable=unreadable,
             files=copier.files,

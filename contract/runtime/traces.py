@@ -116,9 +116,9 @@ def begin(
         return INVALID_SPAN
     context = None if parent is None else _propagator.extract({TRACEPARENT: parent}, Context())
     start_ns = None if since_s is None else round(since_s * 1e9)
-    begun = _recorder.tracer.start_span(name, context, kind, start_time=start_ns)
-    describe(begun, **attributes)
-    return begun
+    new_span = _recorder.tracer.start_span(name, context, kind, start_time=start_ns)
+    describe(new_span, **attributes)
+    return new_span
 
 
 @contextmanager
@@ -134,12 +134,12 @@ def span(
     if _recorder is None:
         yield INVALID_SPAN
         return
-    begun = begin(name, parent, kind=kind, since_s=since_s, **attributes)
-    with use_span(begun, end_on_exit=True, record_exception=False, set_status_on_exception=False):
+    new_span = begin(name, parent, kind=kind, since_s=since_s, **attributes)
+    with use_span(new_span, end_on_exit=True, record_exception=False, set_status_on_exception=False):
         try:
-            yield begun
+            yield new_span
         except BaseException as error:
-            fail(begun, type(error).__name__)
+            fail(new_span, type(error).__name__)
             raise
 
 

@@ -61,7 +61,7 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
             return _fixed(clip, "is fixed: most of the picture rests")
         from intrasplat.poses.estimate import find_path
 
-        return _settled(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
+        return _posed_or_fixed(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
 
 
 def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
@@ -101,7 +101,7 @@ def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
     return clip
 
 
-def _settled(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
+def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
     """The clip with the found path, or with a fixed camera if that explains the clip as well."""
     if len(found.unsure) > MAX_UNSURE * clip.frame_count:
         text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "

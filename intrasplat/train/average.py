@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from intrasplat.train.tensor_copy import Aside
+from intrasplat.train.tensor_copy import TensorCopy
 
 PREFIX = "average."
 
@@ -17,13 +17,13 @@ class RunningMean:
 
     def __init__(self) -> None:
         self.count = 0
-        self._total: dict[str, Aside] = {}
+        self._total: dict[str, TensorCopy] = {}
 
     def add(self, parameters: Mapping[str, Tensor]) -> None:
         """Add one model to the mean."""
         self.count += 1
         if self.count == 1:
-            self._total = {name: Aside(values) for name, values in parameters.items()}
+            self._total = {name: TensorCopy(values) for name, values in parameters.items()}
             return
         for name, values in parameters.items():
             self._total[name].each(values, Tensor.add_)
@@ -46,4 +46,6 @@ class RunningMean:
     def load_arrays(self, arrays: Mapping[str, Tensor], count: int) -> None:
         """Load what arrays() returned; `arrays` may hold other names too. count: models added so far."""
         self.count = count
-        self._total = {name.removeprefix(PREFIX): Aside(a) for name, a in arrays.items() if name.startswith(PREFIX)}
+        self._total = {
+            name.removeprefix(PREFIX): TensorCopy(a) for name, a in arrays.items() if name.startswith(PREFIX)
+        }

@@ -71,7 +71,7 @@ class Keeper:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._ending = threading.Event()
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="keep", initializer=_give_way)
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="keep", initializer=_lower_priority)
         self._state: Future[None] | None = None
         self._due_s: float | None = None
         self.written: set[str] = set()
@@ -150,7 +150,7 @@ class Keeper:
         return shutil.disk_usage(self.folder).free >= size_bytes + SPARE_BYTES
 
 
-def _give_way() -> None:
+def _lower_priority() -> None:
     """Lower the priority of the calling thread. Only on Linux: elsewhere nice() is for the whole process."""
     if sys.platform == "linux":
         os.nice(NICENESS)

@@ -19,7 +19,7 @@ from intrasplat.train.densify import Densifier
 from intrasplat.train.run import Box, Run
 from intrasplat.train.schedule import Schedule, validation_frames
 from intrasplat.train.setup import Setup
-from intrasplat.train.start import bounded, box_of, fusion_for, settled, start_model
+from intrasplat.train.start import bounded, box_of, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import TrainingFrames, units_per_mm
 
 
@@ -36,7 +36,7 @@ def prepare(setup: Setup) -> Run:
     tracks = _tracks(setup)
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
-        preset, chosen = settled(setup.preset, tracks, clip, train)
+        preset, chosen = resolve_preset(setup.preset, tracks, clip, train)
     with timings.measure("fusion_s"):
         moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
         right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
@@ -48,7 +48,7 @@ def prepare(setup: Setup) -> Run:
         model = start_model(
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
-    run = begun(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
+    run = new_run(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
     keep_free_memory(LITTLE_BYTES)
     run.schedule = _schedule(run)
     return run
@@ -69,14 +69,14 @@ def frames_of(setup: Setup, scale: float) -> list[TrainingFrames]:
         return [TrainingFrames(eye, setup.split.train, scale, side) for eye, side in eyes]
 
 
-def begun(
+def new_run(
     setup: Setup, frames: Sequence[TrainingFrames], model: Model, preset: Preset, chosen: tuple[Notice, ...], box: Box
 ) -> Run:
     """The run of a model that has made no step; it has no schedule yet. A GPU compiles the kernels of this model here.
 
     Args:
         frames: the targets of each eye that is trained on.
-        preset: with all that it leaves to the scene filled in (start.settled).
+        preset: with all that it leaves to the scene filled in (start.resolve_preset).
     """
     densifier = Densifier(preset.densify, model.count) if preset.densify else None
     run = Run(setup, model, frames[0], preset, Schedule(planned=0), box, densifier=densifier, chosen=chosen)

@@ -19,7 +19,7 @@ from intrasplat.methods.method import Preset
 from intrasplat.notices import Notice
 from intrasplat.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from intrasplat.splat.model import Model, state_of
-from intrasplat.train.prepare import begun, examine_device, frames_of
+from intrasplat.train.prepare import examine_device, frames_of, new_run
 from intrasplat.train.run import CurvePoint, Run
 from intrasplat.train.schedule import Schedule
 from intrasplat.train.setup import Setup
@@ -44,7 +44,7 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         return None
     try:
         tensors, state = load_resume(directory)
-        preset = _settled(setup.preset, state["start"])
+        preset = _resolved_preset(setup.preset, state["start"])
         frames = frames_of(setup, float(state["start"]["units_per_mm"]))
         _check(state, setup, preset, frames)
         examine_device(setup)
@@ -52,7 +52,7 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         model = resting_model(state["count"], (low, high), setup, preset)
         _load_parameters(model, tensors)  # a GPU warms up on them
         chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
-        run = begun(setup, frames, model, preset, chosen, (low, high))
+        run = new_run(setup, frames, model, preset, chosen, (low, high))
         _put(run, tensors, state)
     except MISFITS as error:
         problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
@@ -96,7 +96,7 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
     return begin_resume(directory, arrays, state, after_each=run.average.let_go)
 
 
-def _settled(preset: Preset, start: Mapping[str, Any]) -> Preset:
+def _resolved_preset(preset: Preset, start: Mapping[str, Any]) -> Preset:
     """The preset with the bases and the stride that were chosen for the scene when the run started."""
     fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
     return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)

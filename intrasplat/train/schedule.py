@@ -89,14 +89,14 @@ class Schedule:
         """How far rates have fallen, in [0, 1]: 1 at the end of every cycle, 0 in the opening."""
         if iteration <= self.opening:
             return 0.0
-        begun, end = self.cycle(iteration)
-        fallen = RESTART if begun else 0.0
-        return fallen + (1 - fallen) * (iteration - begun) / (end - begun)
+        start, end = self.cycle(iteration)
+        fallen = RESTART if start else 0.0
+        return fallen + (1 - fallen) * (iteration - start) / (end - start)
 
     def averages(self, iteration: int) -> bool:
         """Whether the model after an iteration is one of those that are averaged at the end of the cycle."""
-        begun, end = self.cycle(iteration)
-        apart = max(1, int((end - begun) * AVERAGED_SHARE / AVERAGED))
+        start, end = self.cycle(iteration)
+        apart = max(1, int((end - start) * AVERAGED_SHARE / AVERAGED))
         return self.warm_restarts and (end - iteration) % apart == 0 and (end - iteration) // apart < AVERAGED
 
     def withholds_validation(self, iteration: int) -> bool:

@@ -47,7 +47,7 @@ def stride_for(points: int, intrinsics: Intrinsics) -> int:
     return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 
-def settled(
+def resolve_preset(
     preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
 ) -> tuple[Preset, tuple[Notice, ...]]:
     """The preset with the stride of the points' grid and the number of bases chosen for the scene, where it leaves them
@@ -89,7 +89,7 @@ def settled(
 
 
 def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:
-    """The preset of settled() with no more bases than a scene of so many Gaussians can store, and a notice if fewer."""
+    """The resolved preset with no more bases than a scene of so many Gaussians can store, and a notice if fewer."""
     most = MAX_WEIGHTS // (ROWS * points)
     if preset.deformation != SharedBasis.kind or preset.bases is None or preset.bases <= most:
         return preset, ()
@@ -119,7 +119,7 @@ def start_model(
     *,
     gloss: bool = False,
 ) -> Model:
-    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the motion of the preset of settled().
+    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the resolved preset's motion.
 
     A "shared" motion starts from the tracks of the keyframes, if there are any. Every other motion starts at rest.
     gloss: whether two eyes are trained on.

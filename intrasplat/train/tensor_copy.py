@@ -14,7 +14,7 @@ LARGE_BYTES = 192 << 20
 """Only the weights of a long clip are larger. Those of a usual clip, of up to 33 bases, stay in memory."""
 
 
-class Aside:
+class TensorCopy:
     """A copy of a float32 tensor. That of a GPU's tensor lies on the GPU."""
 
     def __init__(self, values: Tensor) -> None:

@@ -216,8 +216,8 @@ def distances(
 ) -> Distances:
     """The distance of two places that were chosen at model time t, at that time and at every frame."""
     both = (first, second)
-    ways, apart_mm = zip(*(_ways(scene, t, each) for each in both), strict=True)
-    paths_mm = np.stack([each.point_mm + way for each, way in zip(both, ways, strict=True)])
+    displacements, apart_mm = zip(*(_displacements(scene, t, each) for each in both), strict=True)
+    paths_mm = np.stack([each.point_mm + displacement for each, displacement in zip(both, displacements, strict=True)])
     covariance = sum((each.uncertainty_mm**2 * np.outer(each.ray, each.ray) for each in both), np.zeros((3, 3)))
     apart_mm2 = MOTION_FACTOR**2 * np.sum(np.square(apart_mm), axis=0)
     now = _apart((second.point_mm - first.point_mm)[None], covariance[None])
@@ -242,7 +242,9 @@ def _apart(
     return length_mm, np.sqrt(np.minimum(along + across, every))
 
 
-def _ways(scene: TrainedScene, t: float, place: MeasuredPlace) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _displacements(
+    scene: TrainedScene, t: float, place: MeasuredPlace
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """[T, 3] displacement of a place at every frame since time t, in mm, and [T] the spread of its Gaussians'
     displacements: their RMS distance from it.
     """
@@ -255,9 +257,9 @@ def _ways(scene: TrainedScene, t: float, place: MeasuredPlace) -> tuple[NDArray[
 
     with torch.no_grad():
         start = means_mm(t)
-        ways = np.stack([means_mm(frame / scene.frame_count) - start for frame in range(scene.frame_count)])
-    way = np.einsum("m,tmc->tc", place.shares, ways)
-    return way, np.sqrt(np.einsum("m,tmc->t", place.shares, (ways - way[:, None]) ** 2))
+        displacements = np.stack([means_mm(frame / scene.frame_count) - start for frame in range(scene.frame_count)])
+    displacement = np.einsum("m,tmc->tc", place.shares, displacements)
+    return displacement, np.sqrt(np.einsum("m,tmc->t", place.shares, (displacements - displacement[:, None]) ** 2))
 
 
 def _kept_trust(scene: TrainedScene, place: MeasuredPlace, device: Device) -> NDArray[np.float64]:

@@ -115,7 +115,7 @@ class CudaModel:
             ValueError: no frame, or more than the rasteriser draws at once (bins.MAX_FRAMES).
         """
         if len(frames) != self._training.frames:
-            self._settle()
+            self._synchronize()
             self._training.launches.forget()
             self._training = self._training_view(len(frames))
         capacity, slot = self._store.capacity, len(self._sent)
@@ -131,7 +131,7 @@ class CudaModel:
         self._sent.append(sh_degree)
         self._send(slot)
         if len(self._sent) == CHECK_EVERY:
-            self._settle()
+            self._synchronize()
         return self._answer()
 
     def _training_view(self, frames: int) -> FrameBuffers:
@@ -142,7 +142,7 @@ class CudaModel:
 
     def wait(self) -> StepSums | None:
         """Wait until every step is made; the sums of the steps since the last StepSums, or None without any."""
-        self._settle()
+        self._synchronize()
         return self._answer()
 
     def _send(self, slot: int) -> None:
@@ -181,7 +181,7 @@ class CudaModel:
             harmonics.show(self._sh_rest, view.state, control["centre"], view.colour, sh_degree)
         view.rasterizer.project(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
 
-    def _settle(self) -> None:
+    def _synchronize(self) -> None:
         """Wait for the steps sent, and send those again that exceeded the capacity."""
         first = 0
         while first < len(self._sent):
@@ -221,7 +221,7 @@ class CudaModel:
     @property
     def gradient_norm(self) -> Tensor:
         """[N] |dL/dmean2d| of the last step in NDC, the largest of its frames."""
-        self._settle()
+        self._synchronize()
         if self._gradients is None:
             raise ValueError("no step has been made")
         return self._gradients.mean2d_norm[:, : self.count].amax(0)
@@ -229,7 +229,7 @@ class CudaModel:
     @property
     def visible(self) -> Tensor:
         """[N] whether any of the last step's frames could see each Gaussian."""
-        self._settle()
+        self._synchronize()
         return self._training.rasterizer.count[:, : self.count].amax(0) > 0
 
     # Pictures
@@ -249,7 +249,7 @@ class CudaModel:
 
     def _steer(self, camera: NDArray[np.float64], times: Sequence[float]) -> FrameBuffers:
         """Wait for all steps; the buffers, with these times and this camera in their control block."""
-        self._settle()
+        self._synchronize()
         view = self._view(*image_size(camera), len(times))
         view.write_cameras(0, [camera] * len(times))
         self.motion.write_times(view.control.rows[0], times)
@@ -320,7 +320,7 @@ class CudaModel:
 
     def deformed_mean(self, t: float) -> Floats:
         """Centres at time t, [3, N] in units, as a copy."""
-        self._settle()
+        self._synchronize()
         view = self._view(*self._size, 1)
         self.motion.write_times(view.control.rows[0], [t])
         view.control.send(0)
@@ -332,7 +332,7 @@ class CudaModel:
 
     def take(self, columns: NDArray[np.int64], fresh: NDArray[np.bool_]) -> None:
         """Keep these Gaussians, in this order (repeats are copies); Adam's moments start at 0 where fresh."""
-        self._settle()
+        self._synchronize()
         count = len(columns)
         fill = padded(count) - count
         chosen = torch.from_numpy(np.concatenate([columns, np.zeros(fill, np.int64)])).to(self.device)
@@ -351,7 +351,7 @@ class CudaModel:
 
     def parameters(self) -> dict[str, Tensor]:
         """The trained tensors by name; views."""
-        self._settle()
+        self._synchronize()
         return self._own(self._values, self._sh_rest) | self.motion.parameters(self.count)
 
     def _own(self, values: Tensor, sh_rest: Tensor, prefix: str = "") -> dict[str, Tensor]:
@@ -361,7 +361,7 @@ class CudaModel:
 
     def arrays(self) -> dict[str, Tensor]:
         """All tensors that a resumed run needs, by name; views, motion.steps on the host."""
-        self._settle()
+        self._synchronize()
         moments = self._own(self._moments, self._rest_moments, "moments.")
         return self._own(self._values, self._sh_rest) | moments | self.motion.arrays(self.count)
 
@@ -372,7 +372,7 @@ class CudaModel:
     def export(self, *, as_it_lies: bool = False) -> tuple[Gaussians, Deformation]:
         """The Gaussians and their deformation as tensors on the host (copies)."""
         del as_it_lies
-        self._settle()
+        self._synchronize()
         values, sh_rest = (each[..., : self.count].cpu() for each in (self._values, self._sh_rest))
         mean, quaternion, log_scale = (
             values[rows].T.clone(memory_format=torch.contiguous_format) for rows in (MEAN, QUATERNION, LOG_SCALE)

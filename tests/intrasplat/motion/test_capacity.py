@@ -24,7 +24,7 @@ from intrasplat.motion.capacity import (
 )
 from intrasplat.motion.tracks import Tracks, track
 from intrasplat.motion.trials import FitError
-from intrasplat.train.start import MIN_STRIDE, basis_values, fusion_for, settled
+from intrasplat.train.start import MIN_STRIDE, basis_values, fusion_for, resolve_preset
 from lab.phantom import Motion
 from tests.intrasplat.phantoms import phantom_clip, prepared_on
 
@@ -41,7 +41,7 @@ def followed(motion: Motion) -> tuple[DepthClip, list[int], list[Tracks]]:
 
 def bases_for(motion: Motion) -> int:
     clip, train, tracks = followed(motion)
-    bases = settled(FAST, tracks, clip, train)[0].bases
+    bases = resolve_preset(FAST, tracks, clip, train)[0].bases
     assert bases is not None
     return bases
 
@@ -77,7 +77,7 @@ def test_displacements_that_the_pictures_do_not_confirm_ask_for_no_bases() -> No
     drift_mm = np.random.default_rng(0).normal(0, 0.1, (len(train), 1, 1, 3)).cumsum(0).astype(np.float32)
     drifting = [dataclasses.replace(tracks[0], displacement_mm=tracks[0].displacement_mm + drift_mm)]
     tried = tried_bases(drifting, clip, train)
-    assert settled(FAST, drifting, clip, train)[0].bases == REST
+    assert resolve_preset(FAST, drifting, clip, train)[0].bases == REST
     assert choose_bases(dataclasses.replace(tried, resting={}), 0.1, len(train)).count > REST
 
 
@@ -94,7 +94,7 @@ def test_light_that_changes_on_tissue_at_rest_gets_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, FRAMES))[:, None, None, None]
     fading = dataclasses.replace(clip, rgb=np.clip(clip.rgb * brightness, 0, 255).astype(np.uint8))
-    assert (settled(FAST, [track(fading, train)], fading, train)[0].bases or 0) > REST
+    assert (resolve_preset(FAST, [track(fading, train)], fading, train)[0].bases or 0) > REST
 
 
 def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
@@ -103,7 +103,7 @@ def test_faster_motion_never_gets_fewer_bases_for_as_many_frames() -> None:
     for every in (1, 2):
         quicker = faster(clip, every)
         frames = list(range(FRAMES))
-        chosen.append(settled(FAST, [track(quicker, frames)], quicker, frames)[0].bases or 0)
+        chosen.append(resolve_preset(FAST, [track(quicker, frames)], quicker, frames)[0].bases or 0)
     assert chosen[0] <= chosen[1]
 
 
@@ -113,7 +113,7 @@ def test_held_out_frames_are_never_read() -> None:
     poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy(), tissue=clip.tissue.copy(), depth_mm=clip.depth_mm.copy())
     poisoned.rgb[held_out], poisoned.tissue[held_out], poisoned.depth_mm[held_out] = 255, False, np.nan
     assert tried_bases([track(poisoned, train)], poisoned, train) == tried_bases(tracks, clip, train)
-    assert settled(FAST, tracks, poisoned, train) == settled(FAST, tracks, clip, train)
+    assert resolve_preset(FAST, tracks, poisoned, train) == resolve_preset(FAST, tracks, clip, train)
 
 
 def test_the_choice_is_the_fewest_within_the_tolerance_of_the_best() -> None:
@@ -193,7 +193,7 @@ def test_a_flat_picture_gets_points_farther_apart() -> None:
     clip, train, tracks = followed("still")
     open_grid = dataclasses.replace(FAST, points_per_image=None)
     flat = dataclasses.replace(clip, rgb=np.full_like(clip.rgb, 130))
-    detailed, smooth = (settled(open_grid, tracks, each, train)[0].fusion.stride for each in (clip, flat))
+    detailed, smooth = (resolve_preset(open_grid, tracks, each, train)[0].fusion.stride for each in (clip, flat))
     assert detailed == MIN_STRIDE
     assert smooth == MAX_COARSENING * MIN_STRIDE
 
@@ -201,7 +201,7 @@ def test_a_flat_picture_gets_points_farther_apart() -> None:
 @pytest.mark.parametrize("points", [100, 500, 2000])
 def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
     clip, train, tracks = followed("still")
-    fixed, _ = settled(dataclasses.replace(FAST, points_per_image=points), tracks, clip, train)
+    fixed, _ = resolve_preset(dataclasses.replace(FAST, points_per_image=points), tracks, clip, train)
     assert fixed.points_per_image == points
     assert fusion_for(fixed, clip.intrinsics).stride == max(MIN_STRIDE, round(math.sqrt(96 * 80 / points)))
 
@@ -210,7 +210,7 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
-    preset, notices = settled(FAST, [track(clip, train)] if frames > 1 else [], clip, train)
+    preset, notices = resolve_preset(FAST, [track(clip, train)] if frames > 1 else [], clip, train)
     assert preset.bases is not None
     assert 1 <= preset.bases <= frames
     assert any("too little could be followed" in each.text for each in notices)
@@ -224,7 +224,7 @@ def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
 def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> None:
     clip, train, tracks = followed("breathing")
-    limited, notices = settled(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
+    limited, notices = resolve_preset(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
     assert limited.bases is not None
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")
@@ -241,7 +241,7 @@ def test_where_nothing_could_be_followed_a_preset_gets_no_more_bases_than_it_all
 def test_a_fixed_number_is_kept_to(bases: int) -> None:
     clip, train, tracks = followed("breathing")
     fixed = dataclasses.replace(FAST, bases=bases)
-    assert settled(fixed, tracks, clip, train)[0] == fixed
+    assert resolve_preset(fixed, tracks, clip, train)[0] == fixed
 
 
 def test_the_report_is_told_what_was_chosen() -> None:

@@ -22,7 +22,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.scene.compact import MAX_WEIGHTS
 from intrasplat.splat.layout import ROWS
 from intrasplat.splat.model import Model
-from intrasplat.train.start import MIN_STRIDE, bounded, fusion_for, settled, start_model
+from intrasplat.train.start import MIN_STRIDE, bounded, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import units_per_mm
 from lab.phantom import Phantom, PhantomSettings, make_phantom
 from tests.helpers import assert_close
@@ -39,7 +39,7 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     frames = train or list(range(clip.frame_count))
     scale = units_per_mm(clip, frames)
     tracks = track_keyframes(clip, frames) if preset.tracks and len(frames) > 1 else []
-    preset, _ = settled(preset, tracks, clip, frames)
+    preset, _ = resolve_preset(preset, tracks, clip, frames)
     moved = {frames[each.reference]: moved_along(each, frames, clip.intrinsics.width) for each in tracks}
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0, moved=moved)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale
