@@ -49,7 +49,7 @@ class WaitingRequest:
         return self.arrived_s + PATIENCE * self.seconds
 
 
-class Turns:
+class RequestQueue:
     """All waiting requests, and how fast they are answered; for use in one thread."""
 
     def __init__(self) -> None:
@@ -63,14 +63,14 @@ class Turns:
         """Predicted CPU seconds of a request of this cost at a level of detail."""
         return cost / self._speeds[level]
 
-    def learn(self, turn: WaitingRequest) -> None:
+    def learn(self, waiting: WaitingRequest) -> None:
         """Update the speed with the time that the answer took."""
-        if turn.cost > 0 and turn.spent_s > 0:
-            self._speeds[turn.level] += LEARNING * (turn.cost / turn.spent_s - self._speeds[turn.level])
+        if waiting.cost > 0 and waiting.spent_s > 0:
+            self._speeds[waiting.level] += LEARNING * (waiting.cost / waiting.spent_s - self._speeds[waiting.level])
 
-    def add(self, turn: WaitingRequest) -> None:
+    def add(self, waiting: WaitingRequest) -> None:
         """Add a request."""
-        self._waiting.append(turn)
+        self._waiting.append(waiting)
 
     def give_up(self, caller: bytes, request_id: bytes) -> None:
         """Remove a request that its caller gave up."""
@@ -78,12 +78,12 @@ class Turns:
 
     def take(self, below_s: float = math.inf) -> WaitingRequest | None:
         """Remove and return the next request to answer, of those that take less than below_s."""
-        turn = min(
+        waiting = min(
             (each for each in self._waiting if each.seconds < below_s), key=lambda each: each.due_s, default=None
         )
-        if turn is not None:
-            self._waiting.remove(turn)
-        return turn
+        if waiting is not None:
+            self._waiting.remove(waiting)
+        return waiting
 
     def take_same(self, request: SceneRequest) -> list[WaitingRequest]:
         """Remove and return all requests that wait for the same answer."""
@@ -95,7 +95,7 @@ class Turns:
         """The number of other answers that are waited for."""
         return len({each.request for each in self._waiting} - {request})
 
-    def seconds_before(self, turn: WaitingRequest) -> float:
+    def seconds_before(self, waiting: WaitingRequest) -> float:
         """Least CPU seconds of all requests answered before this one; 0 if one of them has the same answer."""
-        before = [each for each in self._waiting if each.due_s <= turn.due_s]
-        return 0.0 if any(each.request == turn.request for each in before) else sum(each.least_s for each in before)
+        before = [each for each in self._waiting if each.due_s <= waiting.due_s]
+        return 0.0 if any(each.request == waiting.request for each in before) else sum(each.least_s for each in before)

@@ -11,19 +11,19 @@ from worker.request_queue import WaitingRequest
 
 
 @contextmanager
-def answer_span(turn: WaitingRequest) -> Iterator[None]:
+def answer_span(queued: WaitingRequest) -> Iterator[None]:
     """The span of an answer in progress; spans that start in the context become its children."""
-    came_s = _came_s(turn)
-    with traces.span(turn.request.kind, turn.trace or traces.NEW, since_s=came_s, job_id=turn.request.scene_id):
+    came_s = _came_s(queued)
+    with traces.span(queued.request.kind, queued.trace or traces.NEW, since_s=came_s, job_id=queued.request.scene_id):
         traces.begin("wait for turn", since_s=came_s).end()
         yield
 
 
-def shared_span(turn: WaitingRequest) -> None:
+def shared_span(queued: WaitingRequest) -> None:
     """The span of a request that shares the answer to another, equal request."""
-    attributes = traces.Attributes(job_id=turn.request.scene_id, shared=True)
-    traces.begin(turn.request.kind, turn.trace or traces.NEW, since_s=_came_s(turn), **attributes).end()
+    attributes = traces.Attributes(job_id=queued.request.scene_id, shared=True)
+    traces.begin(queued.request.kind, queued.trace or traces.NEW, since_s=_came_s(queued), **attributes).end()
 
 
-def _came_s(turn: WaitingRequest) -> float:
-    return time.time() - (time.monotonic() - turn.arrived_s)
+def _came_s(queued: WaitingRequest) -> float:
+    return time.time() - (time.monotonic() - queued.arrived_s)

@@ -19,7 +19,7 @@ from intrasplat.machine.parts import Parts
 from intrasplat.view.encode import FOR_EYES
 from worker.pace import RenderPace
 from worker.reply import Reply
-from worker.request_queue import COARSEST, Turns, WaitingRequest
+from worker.request_queue import COARSEST, RequestQueue, WaitingRequest
 from worker.request_spans import answer_span, shared_span
 
 SMALL_SHARE = 0.25
@@ -42,7 +42,7 @@ class Answered:
     seconds: wall time from the first part to the last, including other work in between
     """
 
-    turns: tuple[WaitingRequest, ...]
+    requests: tuple[WaitingRequest, ...]
     outcome: Reply | Exception
     seconds: float
 
@@ -51,7 +51,7 @@ class Answered:
 class _Task:
     """An answer in progress. small_s: CPU seconds that smaller answers may take before its next part."""
 
-    turn: WaitingRequest
+    waiting: WaitingRequest
     parts: Parts[Reply]
     context: Context = field(default_factory=copy_context)
     small_s: float = 0.0
@@ -86,7 +86,7 @@ class Scheduler:
         self._within = within
         self._spent_s = spent_s
         self._max_wait_s = max_wait_s
-        self._turns = Turns()
+        self._queue = RequestQueue()
         self._tasks: list[_Task] = []  # a stack: each task waits for the next one, which is much smaller
 
     def take_in(
@@ -97,17 +97,19 @@ class Scheduler:
         trace: traceparent of the caller (WaitingRequest). Raises whatever `cost` raises.
         """
         cost = self._cost(request)
-        seconds, least_s = self._turns.seconds(cost), self._turns.seconds(cost, self._coarsest(request))
-        turn = WaitingRequest(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
-        if (wait_s := self._wait_s(turn)) > self._max_wait_s:
+        seconds, least_s = self._queue.seconds(cost), self._queue.seconds(cost, self._coarsest(request))
+        waiting = WaitingRequest(caller, request_id, request, cost, seconds, least_s, time.monotonic(), trace=trace)
+        if (wait_s := self._wait_s(waiting)) > self._max_wait_s:
             return wait_s
-        self._turns.add(turn)
+        self._queue.add(waiting)
         return None
 
     def give_up(self, caller: bytes, request_id: bytes) -> None:
         """Remove a request that its caller gave up, or abandon its answer."""
-        self._turns.give_up(caller, request_id)
-        for task in [each for each in self._tasks if (each.turn.caller, each.turn.request_id) == (caller, request_id)]:
+        self._queue.give_up(caller, request_id)
+        for task in [
+            each for each in self._tasks if (each.waiting.caller, each.waiting.request_id) == (caller, request_id)
+        ]:
             self._abandon(task)
 
     def close(self) -> None:
@@ -117,27 +119,27 @@ class Scheduler:
 
     def rest_s(self) -> float:
         """Seconds until the next part may be computed; infinity if no request waits."""
-        return self._pace.rest_s() if self._tasks or len(self._turns) else math.inf
+        return self._pace.rest_s() if self._tasks or len(self._queue) else math.inf
 
     def advance(self) -> Answered | None:
         """Compute the next part, if the pace allows one now. Return the requests whose answer it completes."""
         if self.rest_s() > 0.0:
             return None
-        if (turn := self._next()) is not None:
-            turn.level = self._level(turn)
-            self._tasks.append(_Task(turn, self._traced(turn)))
+        if (waiting := self._next()) is not None:
+            waiting.level = self._level(waiting)
+            self._tasks.append(_Task(waiting, self._traced(waiting)))
         return self._make_part(self._tasks[-1])
 
     def _next(self) -> WaitingRequest | None:
         """The request to start now, if any; the others wait for the task on top of the stack."""
         if not self._tasks:
-            return self._turns.take()
+            return self._queue.take()
         top = self._tasks[-1]
-        return self._turns.take(SMALL_SHARE * top.turn.seconds) if top.small_s > 0.0 else None
+        return self._queue.take(SMALL_SHARE * top.waiting.seconds) if top.small_s > 0.0 else None
 
-    def _traced(self, turn: WaitingRequest) -> Parts[Reply]:
-        with answer_span(turn):
-            return (yield from self._answer(turn.request, turn.level))
+    def _traced(self, waiting: WaitingRequest) -> Parts[Reply]:
+        with answer_span(waiting):
+            return (yield from self._answer(waiting.request, waiting.level))
 
     def _make_part(self, task: _Task) -> Answered | None:
         outcome: Reply | Exception | None = None
@@ -150,26 +152,26 @@ class Scheduler:
         except Exception as error:  # one caller's request must not end the thread for all
             outcome = error
         task.small_s = self._spent_s() - start_s
-        task.turn.spent_s += task.small_s
+        task.waiting.spent_s += task.small_s
         self._pace.charge(task.small_s)
         return None if outcome is None else self._end(task, outcome)
 
     def _end(self, task: _Task, outcome: Reply | Exception) -> Answered:
         self._remove(task)
-        turn = task.turn
+        waiting = task.waiting
         if isinstance(outcome, Reply) and not outcome.is_untimed:
-            self._turns.learn(turn)
-        turns = (turn, *self._turns.take_same(turn.request))
-        self._pace.charge(max(0.0, len(turns) * MIN_CHARGE_S - turn.spent_s))
-        for each in turns[1:]:
+            self._queue.learn(waiting)
+        requests = (waiting, *self._queue.take_same(waiting.request))
+        self._pace.charge(max(0.0, len(requests) * MIN_CHARGE_S - waiting.spent_s))
+        for each in requests[1:]:
             shared_span(each)
-        return Answered(turns, outcome, time.perf_counter() - task.start_s)
+        return Answered(requests, outcome, time.perf_counter() - task.start_s)
 
-    def _wait_s(self, turn: WaitingRequest) -> float:
+    def _wait_s(self, waiting: WaitingRequest) -> float:
         """Predicted seconds until a request is answered."""
-        larger = [each.turn for each in self._tasks if turn.seconds >= SMALL_SHARE * each.turn.seconds]
-        left_s = (max(0.0, self._turns.seconds(each.cost, each.level) - each.spent_s) for each in larger)
-        before_s = self._turns.seconds_before(turn) + sum(left_s)
+        larger = [each.waiting for each in self._tasks if waiting.seconds >= SMALL_SHARE * each.waiting.seconds]
+        left_s = (max(0.0, self._queue.seconds(each.cost, each.level) - each.spent_s) for each in larger)
+        before_s = self._queue.seconds_before(waiting) + sum(left_s)
         return self._pace.rest_s() + before_s / self._pace.rate
 
     def _abandon(self, task: _Task) -> None:
@@ -179,7 +181,7 @@ class Scheduler:
     def _remove(self, task: _Task) -> None:
         place = self._tasks.index(task)
         if place > 0:
-            self._tasks[place - 1].small_s -= task.turn.spent_s
+            self._tasks[place - 1].small_s -= task.waiting.spent_s
         del self._tasks[place]
 
     def _coarsest(self, request: SceneRequest) -> int:
@@ -187,14 +189,14 @@ class Scheduler:
         may_be_coarse = isinstance(request, RenderRequest) and request.format in FOR_EYES
         return COARSEST if self._pace.trains and may_be_coarse else 0
 
-    def _level(self, turn: WaitingRequest) -> int:
+    def _level(self, waiting: WaitingRequest) -> int:
         """The level of detail at which a request is answered now: as fine as time allows.
 
         0, the finest, if no job trains, the format is exact, or nobody else waits and the pace affords it. 1 if answers
         of this level to all waiting requests take less than ALL_WITHIN_S. 2 otherwise.
         """
-        others = self._turns.others(turn.request)
-        if self._coarsest(turn.request) == 0 or (others == 0 and self._pace.affords(turn.seconds)):
+        others = self._queue.others(waiting.request)
+        if self._coarsest(waiting.request) == 0 or (others == 0 and self._pace.affords(waiting.seconds)):
             return 0
-        all_s = (1 + others) * self._turns.seconds(turn.cost, 1)
+        all_s = (1 + others) * self._queue.seconds(waiting.cost, 1)
         return 1 if all_s <= ALL_WITHIN_S * self._pace.rate else COARSEST

@@ -153,7 +153,7 @@ class RequestServer:
             head, body = _head(outcome, answered.seconds), outcome.body
         else:
             head = WorkerReply(error=_reply_error(outcome))
-        for each in answered.turns:
+        for each in answered.requests:
             self._send(each.caller, each.request_id, head, body)
 
     def _send(self, caller: bytes, request_id: bytes, head: WorkerReply, body: bytes = b"") -> None:

@@ -90,7 +90,7 @@ class Studio:
         while self.scheduler.rest_s() == 0.0:
             if (each := self.scheduler.advance()) is not None:
                 answered.append(each)
-        return [each.turns[0].request.t for each in answered if isinstance(each.turns[0].request, RenderRequest)]
+        return [each.requests[0].request.t for each in answered if isinstance(each.requests[0].request, RenderRequest)]
 
 
 def test_an_answer_is_made_part_by_part() -> None:
@@ -100,7 +100,7 @@ def test_an_answer_is_made_part_by_part() -> None:
     answered = studio.scheduler.advance()
     assert answered is not None
     assert isinstance(answered.outcome, Reply)
-    assert [each.request_id for each in answered.turns] == [b"2.5"]
+    assert [each.request_id for each in answered.requests] == [b"2.5"]
     assert studio.scheduler.advance() is None
     assert studio.made == [2.5, 2.5, 2.5]
 
@@ -167,7 +167,7 @@ def test_who_asks_the_same_while_it_is_made_shares_the_answer() -> None:
     studio.ask(2.0, number=2)
     answered = studio.scheduler.advance()
     assert answered is not None
-    assert [each.request_id for each in answered.turns] == [b"1", b"2"]
+    assert [each.request_id for each in answered.requests] == [b"1", b"2"]
     assert studio.scheduler.rest_s() > 1e9
 
 
