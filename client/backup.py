@@ -56,10 +56,10 @@ def _backup(options: argparse.Namespace) -> int:
     _say(f"{_counts(taken.jobs)}; {taken.files} files, {taken.bytes} bytes{linked}")
     if settings.store_url is not None:
         _say(f"clips and scenes stay in {settings.store_url}: back up the bucket by its own means")
-    _say_left_out("were purged meanwhile and left out", taken.purged)
+    _say_skipped("were purged meanwhile and left out", taken.purged)
     why = "have no files here and were left out (is INTRASPLAT_STORE_URL that of the service?)"
-    _say_left_out(why, taken.without_files)
-    _say_left_out(UNREADABLE, taken.unreadable)
+    _say_skipped(why, taken.without_files)
+    _say_skipped(UNREADABLE, taken.unreadable)
     print(taken.path)
     return ExitCode.FAILED if taken.unreadable else ExitCode.OK
 
@@ -72,9 +72,9 @@ def _restore(options: argparse.Namespace) -> int:
     check_owner(settings.data_dir)
     restored = restore_backup(settings, installed_queue(settings), options.source, options.audit)
     _say(f"restored the backup of {restored.created_at}, every hash compared: {_counts(restored.jobs)}")
-    _say_left_out("had been purged and did not come back", restored.purged)
-    _say_left_out("have neither clip nor scene and did not come back", restored.lost)
-    _say_left_out(UNREADABLE, restored.unreadable)
+    _say_skipped("had been purged and did not come back", restored.purged)
+    _say_skipped("have neither clip nor scene and did not come back", restored.lost)
+    _say_skipped(UNREADABLE, restored.unreadable)
     if restored.revoked_keys:
         _say(f"keys that had been revoked and did not come back: {', '.join(restored.revoked_keys)}")
     if not options.audit:
@@ -100,7 +100,7 @@ def _counts(jobs: Mapping[JobState, int]) -> str:
     return f"{sum(jobs.values())} jobs" + (f" ({counts})" if counts else "")
 
 
-def _say_left_out(why: str, job_ids: Sequence[str]) -> None:
+def _say_skipped(why: str, job_ids: Sequence[str]) -> None:
     if job_ids:
         _say(f"{len(job_ids)} jobs {why}: {', '.join(job_ids)}")
 

@@ -182,7 +182,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
     On a GPU the splatting kernels are checked before stereo matching.
     """
     if isinstance(request.clip, DepthClip):
-        clip = request.clip if request.clip.left_out else sampled(request.clip, request.options)
+        clip = request.clip if request.clip.skipped else sampled(request.clip, request.options)
         return with_poses(clip, request.options, hooks, timings)
 
     def examined() -> None:

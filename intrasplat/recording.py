@@ -99,7 +99,7 @@ class Clip:
                 chosen.holdout,
                 hooks,
                 timings,
-                leave_out=chosen.use_frames == "new",
+                skip_redundant=chosen.use_frames == "new",
                 device=where.kind,
                 depth_range_mm=(chosen.min_depth_mm, chosen.max_depth_mm),
                 mask_source=chosen.mask_source,

@@ -157,8 +157,8 @@ def _copy_all(
         copier.write(f"{PURGING}/{job_id}", b"")
     for name in (KEYS_FILE, ROTATED_FILE, AUDIT_FILE):
         copier.copy(name)
-    left_out = [tuple(sorted(job_ids)) for job_ids in (purged, without_files, unreadable - purged)]
-    return _in_order(queue, chosen), left_out[0], left_out[1], left_out[2]
+    skipped = [tuple(sorted(job_ids)) for job_ids in (purged, without_files, unreadable - purged)]
+    return _in_order(queue, chosen), skipped[0], skipped[1], skipped[2]
 
 
 def _copy_entries(shelf: LocalShelf | None, copier: Copier) -> None:

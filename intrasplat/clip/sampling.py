@@ -25,7 +25,7 @@ from intrasplat.options import ReconstructionOptions
 
 FRAMES_A_SECOND, LEAST_FRAMES = 5.8, 32
 """Training frames for each second of training, and the minimum: two cores make some three steps on each of them."""
-LEFT_OUT_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
+SKIPPED_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
 KEPT_FRAMES = 64
 """Approximate minimum of frames used: a clip of less than twice as many keeps all of them."""
 MAX_MOVED = 1 / 640
@@ -57,7 +57,7 @@ def thumbnail(rgb: RgbFrame) -> Thumbnail:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class SkippedFrames:
     """Skipped training frames, rising: those that show nothing new, and those for which there is no time."""
 
     nothing_new: tuple[int, ...] = ()
@@ -80,7 +80,9 @@ class LeftOut:
         return tuple(found)
 
 
-def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = None, mapping: Mapping = map) -> LeftOut:
+def skippable_frames(
+    rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = None, mapping: Mapping = map
+) -> SkippedFrames:
     """The frames, out of `frames`, that training can skip. Others, such as held-out frames, are not read.
 
     A frame shows nothing new if, since the last used frame, no patch has changed beyond noise by as much as a motion of
@@ -96,7 +98,7 @@ def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = N
     longest = len(rgb) // KEPT_FRAMES
     too_many = most is not None and len(frames) > most
     if (longest < 2 and not too_many) or min(rgb.shape[1:3]) < THUMBNAIL_WIDTH // 2:
-        return LeftOut()
+        return SkippedFrames()
     thumbnails = dict(zip(frames, mapping(lambda i: thumbnail(rgb[i]), frames), strict=True))
     noise = _noise(list(thumbnails.values()))
     used: list[int] = [frames[0]]
@@ -105,9 +107,9 @@ def left_out(rgb: NDArray[np.uint8], frames: Sequence[int], most: int | None = N
         moved = _moved(thumbnails[used[-1]], thumbnails[i], noise)
         (unused if i - used[-1] < longest and moved <= MAX_MOVED else used).append(i)
     if most is None or len(used) <= most:
-        return LeftOut(tuple(unused))
+        return SkippedFrames(tuple(unused))
     steps = [_moved(thumbnails[one], thumbnails[two], noise) for one, two in pairwise(used)]
-    return LeftOut(tuple(unused), tuple(sorted(set(used) - set(_spread(used, steps, most)))))
+    return SkippedFrames(tuple(unused), tuple(sorted(set(used) - set(_spread(used, steps, most)))))
 
 
 def _spread(frames: Sequence[int], moved: Sequence[float], count: int) -> list[int]:
@@ -129,12 +131,12 @@ def most_frames(options: ReconstructionOptions) -> int | None:
 
 
 def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
-    """A clip with depth, with skipped training frames in left_out."""
+    """A clip with depth, with skipped training frames in skipped."""
     if options.use_frames == "all":
         return clip
-    found = left_out(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
-    assumptions = tuple(each for each in clip.assumptions if each.code not in LEFT_OUT_CODES)
-    return replace(clip, left_out=found.frames, assumptions=(*assumptions, *found.notices(clip.frame_count)))
+    found = skippable_frames(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
+    assumptions = tuple(each for each in clip.assumptions if each.code not in SKIPPED_CODES)
+    return replace(clip, skipped=found.frames, assumptions=(*assumptions, *found.notices(clip.frame_count)))
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:

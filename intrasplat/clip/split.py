@@ -32,7 +32,7 @@ class FrameSplit:
     """The training and held-out frames, as rising lists of indices. No part of training reads held-out frames.
 
     repeated lists frames in neither set: training frames that repeat a held-out frame, held-out frames that repeat
-    training frames in a pause, and frames that the clip skips (left_out).
+    training frames in a pause, and frames that the clip skips (skipped).
     """
 
     train: list[int]
@@ -50,9 +50,9 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     """
     count = clip.frame_count
     held_out = held_out_frames(count, holdout)
-    train = sorted(set(range(count)) - set(held_out) - set(clip.left_out))
+    train = sorted(set(range(count)) - set(held_out) - set(clip.skipped))
     if holdout == "none":
-        return FrameSplit(train, [], list(clip.left_out))
+        return FrameSplit(train, [], list(clip.skipped))
     if count < MIN_FRAMES:
         return _nothing_held_out(clip, f"the clip has {count} frames, fewer than {MIN_FRAMES}")
     if not held_out:
@@ -64,7 +64,7 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     repeated = find_repeats(clip.rgb, train, judged)
     if len(repeated) == len(train):
         return _nothing_held_out(clip, "every training frame repeats a held-out one: the picture does not change")
-    unused = {*repeated, *paused, *clip.left_out}
+    unused = {*repeated, *paused, *clip.skipped}
     return FrameSplit(
         train=[index for index in train if index not in unused],
         held_out=judged,
@@ -181,6 +181,6 @@ def _warnings(repeated: int, paused: int) -> tuple[Notice, ...]:
 
 def _nothing_held_out(clip: DepthClip, reason: str) -> FrameSplit:
     text = f"no frames are held out, so quality is not measured: {reason}"
-    left_out = set(clip.left_out)
-    train = [index for index in range(clip.frame_count) if index not in left_out]
-    return FrameSplit(train, [], list(clip.left_out), (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))
+    skipped = set(clip.skipped)
+    train = [index for index in range(clip.frame_count) if index not in skipped]
+    return FrameSplit(train, [], list(clip.skipped), (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))

@@ -103,7 +103,7 @@ class DepthClip(Eye):
     masks            source of `tissue`
     rectification    rectification of the recorded left eye; None: it is as recorded
     poses            source of world_from_camera; None: poses are not set yet
-    left_out         skipped frames (sampling.py): no stage reads them, and stereo gives them no depth
+    skipped         skipped frames (sampling.py): no stage reads them, and stereo gives them no depth
     """
 
     frame_times_s: NDArray[np.float64]
@@ -112,7 +112,7 @@ class DepthClip(Eye):
     masks: Masks | None = None
     rectification: Rectification | None = None
     poses: CameraPoses | None = None
-    left_out: tuple[int, ...] = ()
+    skipped: tuple[int, ...] = ()
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)  # e.g. vertical misalignment in px, for the report
@@ -124,11 +124,11 @@ class DepthClip(Eye):
 
     @property
     def used(self) -> list[int]:
-        """The frames that are not in left_out, in order."""
-        return sorted(set(range(self.frame_count)) - set(self.left_out))
+        """The frames that are not in skipped, in order."""
+        return sorted(set(range(self.frame_count)) - set(self.skipped))
 
     def moment(self, index: int) -> DepthClip:
         """A clip of one frame of both eyes, with views of this clip's arrays."""
         only = slice(index, index + 1)
         right = None if self.right is None else replace(self.right, **self.right.arrays_at(only))
-        return replace(self, right=right, frame_times_s=self.frame_times_s[only], left_out=(), **self.arrays_at(only))
+        return replace(self, right=right, frame_times_s=self.frame_times_s[only], skipped=(), **self.arrays_at(only))

@@ -25,7 +25,7 @@ def zipped_masks(clip: DepthClip) -> bytes | None:
     """A zip with a PNG for each frame of the clip, if masks were found.
 
     000000.png and so on are [H, W] in the pixels of the recorded left eye, 255 on instruments. A skipped frame
-    (left_out) gets the mask of the nearest searched one. None if nothing was found, or if the file would exceed
+    (skipped) gets the mask of the nearest searched one. None if nothing was found, or if the file would exceed
     MAX_BYTES. The same masks give the same bytes, because ZipInfo's time is fixed.
     """
     if clip.masks is None or not clip.masks.are_found or clip.masks.share == 0:

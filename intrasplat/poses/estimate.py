@@ -115,7 +115,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     path = np.tile(np.eye(4), (clip.frame_count, 1, 1))
     path[list(used)] = gauge.poses
     unsure = _apart(used, fit, chain.links)
-    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.left_out))
+    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
     for done, i in enumerate(others):
         pose, share = _placed(frames, used, fit, gauge, i)
         path[i] = pose
@@ -123,7 +123,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
         unsure += [i] if share < MIN_AGREEING else []
         on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
     known = sorted({*used, *others})
-    for i in clip.left_out:
+    for i in clip.skipped:
         path[i] = between(known, path[known], i)
     return _found_path(path, used, fit, gauge, half_mm, frames, unsure)
 

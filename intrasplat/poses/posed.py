@@ -45,7 +45,7 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
     if options.poses == "given" and not brought:
         problem = '"given" asks for poses that come with the clip, and stereo clips bring none.'
         raise InputError("options.poses", problem, 'Say "auto" or "estimate", or give the EndoNeRF layout.')
-    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.left_out))
+    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
     with timings.measure("poses_s"):
         if options.poses == "given":
             return _as_given(clip, *jitter_mm(clip, train))

@@ -214,7 +214,7 @@ def _colour_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 def _depth_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
     """Warn if the depth of much tissue jumps by a tenth within a frame: no tissue moves so fast, so depth is wrong."""
-    still = set(clip.left_out)
+    still = set(clip.skipped)
     following = {one: two for one, two in itertools.pairwise(train) if still.issuperset(range(one + 1, two))}
     jumps, total = 0, 0
     for index in clip.one_by_one(list(following)[:: -(-len(following) // MAX_PAIRS) or 1]):

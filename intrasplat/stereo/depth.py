@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.clip.sampling import LeftOut, left_out
+from intrasplat.clip.sampling import SkippedFrames, skippable_frames
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import Cancelled, InputError
@@ -64,7 +64,7 @@ def estimate_depth(
     hooks: Hooks | None = None,
     *,
     measured_frames: Sequence[int] | None = None,
-    leave_out: bool = False,
+    skip_redundant: bool = False,
     most_frames: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
@@ -74,7 +74,7 @@ def estimate_depth(
 
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
     on all). Otherwise a frame's depth depends on its own pair only, so frames outside measured_frames do not change the
-    depth of others. With leave_out, measured frames that show nothing new (intrasplat/clip/sampling.py) get no depth.
+    depth of others. With skip_redundant, measured frames that show nothing new (clip/sampling.py) get no depth.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -96,7 +96,7 @@ def estimate_depth(
     aligned = spread(measured, ALIGNMENT_PAIRS)
     with one_opencv_thread(), _pool() as pool:
         rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
-        unused = left_out(rgb, measured, most_frames, pool.map) if leave_out else LeftOut()
+        unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
         finder = None if finder_of is None else finder_of(rgb[i] for i in looked_at(measured))
@@ -125,7 +125,7 @@ def estimate_depth(
         assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), assumption)
     return replace(
         work.matched,
-        left_out=unused.frames,
+        skipped=unused.frames,
         masks=masks,
         rectification=clip.rectification,
         assumptions=(*assumptions, _scale_assumption(clip), *unused.notices(clip.frame_count)),

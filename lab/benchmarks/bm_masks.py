@@ -198,7 +198,7 @@ def measured(opened: Opened) -> dict[str, object]:
     """Compare the found masks with the given ones."""
     found = opened.found
     assert found.masks is not None
-    used = [i for i in range(found.frame_count) if i not in found.left_out]
+    used = [i for i in range(found.frame_count) if i not in found.skipped]
     row: dict[str, object] = {}
     if opened.given is not None:
         counts = np.array([_counts(~found.tissue[i], ~opened.given.tissue[i]) for i in used])
@@ -224,7 +224,7 @@ def measured(opened: Opened) -> dict[str, object]:
 
 def doubts_of(clip: DepthClip) -> Sequence[Notice]:
     """The warnings of the clip's report."""
-    split = sorted(set(training_frames(clip.frame_count, HOLDOUT)) - set(clip.left_out))
+    split = sorted(set(training_frames(clip.frame_count, HOLDOUT)) - set(clip.skipped))
     return [*clip.warnings, *clip_warnings(clip, split)]
 
 

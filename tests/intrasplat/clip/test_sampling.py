@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import held_out_frames, split_frames, training_frames
-from intrasplat.clip.sampling import KEPT_FRAMES, LEAST_FRAMES, left_out, most_frames, sampled
+from intrasplat.clip.sampling import KEPT_FRAMES, LEAST_FRAMES, most_frames, sampled, skippable_frames
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from lab.phantom import Phantom, PhantomSettings, make_phantom
@@ -46,7 +46,7 @@ def recorded(moments: list[float], noise: bool = True) -> NDArray[np.uint8]:
 
 
 def nothing_new(rgb: NDArray[np.uint8], frames: Sequence[int]) -> tuple[int, ...]:
-    return left_out(rgb, frames).nothing_new
+    return skippable_frames(rgb, frames).nothing_new
 
 
 @pytest.mark.parametrize("noise", [False, True])
@@ -118,9 +118,9 @@ def test_a_split_trains_on_no_frame_that_is_left_out_and_times_stay(holdout: str
     )
     shorter = sampled(long, ReconstructionOptions(holdout=holdout, iterations=9))
     split, whole = split_frames(shorter, holdout), split_frames(long, holdout)
-    assert len(shorter.left_out) > 20
+    assert len(shorter.skipped) > 20
     assert sorted(split.train + split.held_out + split.repeated) == list(range(len(index)))
-    assert set(split.train) == set(whole.train) - set(shorter.left_out)
+    assert set(split.train) == set(whole.train) - set(shorter.skipped)
     assert split.held_out == whole.held_out
     assert np.array_equal(shorter.t, long.t)
     assert np.array_equal(shorter.frame_times_s, long.frame_times_s)
@@ -146,20 +146,20 @@ def test_time_limits_the_frames_of_our_presets(options: dict[str, Any], most: in
 def test_of_too_many_frames_half_are_spread_over_time_and_half_over_the_motion() -> None:
     rest, count = 40, 24
     rgb = recorded([*[0.0] * rest, *(float(frame) for frame in range(rest))])
-    found = left_out(rgb, range(len(rgb)), count)
+    found = skippable_frames(rgb, range(len(rgb)), count)
     used = [frame for frame in range(len(rgb)) if frame not in found.frames]
     assert found.nothing_new == ()
     assert 0.8 * count <= len(used) <= count
     assert (used[0], used[-1]) == (0, len(rgb) - 1)
     assert sum(frame < rest for frame in used) == pytest.approx(count / 4, abs=1)
-    assert left_out(rgb, range(len(rgb)), len(rgb)).frames == ()
+    assert skippable_frames(rgb, range(len(rgb)), len(rgb)).frames == ()
 
 
 def test_the_report_says_how_many_frames_there_was_no_time_for() -> None:
     clip = phantom_clip(frames=48, width=WIDTH, height=HEIGHT, tools=False)
     shorter = sampled(clip, ReconstructionOptions(preset="instant"))
     (told,) = [each for each in shorter.assumptions if each.code is NoticeCode.NO_TIME]
-    assert told.text.startswith(f"frames: {len(shorter.left_out)} of 48 were left out")
+    assert told.text.startswith(f"frames: {len(shorter.skipped)} of 48 were left out")
     again = sampled(shorter, ReconstructionOptions(preset="fast"))
-    assert again.left_out == ()
+    assert again.skipped == ()
     assert again.assumptions == clip.assumptions

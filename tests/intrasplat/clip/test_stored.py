@@ -24,7 +24,7 @@ REGISTRATION = RightEye(
 def clip_of(eyes: int) -> DepthClip:
     """A clip with something in every field."""
     told = {
-        "left_out": (2, 5),
+        "skipped": (2, 5),
         "assumptions": (Notice.info(NoticeCode.DECODING, "it was decoded"),),
         "warnings": (Notice.warning(NoticeCode.TIME_TOO_SHORT, "too short"),),
         "measurements": {"valid_share": 0.5},

@@ -85,7 +85,7 @@ def test_a_frame_that_nobody_looked_at_has_the_nearest_ones_mask(tmp_path: Path)
     clip = found_clip()
     tissue = clip.tissue.copy()
     tissue[1] = False
-    content = zipped_masks(dataclasses.replace(clip, tissue=tissue, left_out=(1,)))
+    content = zipped_masks(dataclasses.replace(clip, tissue=tissue, skipped=(1,)))
     assert content is not None
     assert (sent_again(content, tmp_path)[1] == clip.tissue[0]).all()
 

@@ -86,9 +86,9 @@ def test_what_does_no_harm_is_not(clean: CleanClip, condition: str, severity: in
 def test_depth_that_jumps_across_frames_that_were_left_out_is_told(clean: CleanClip) -> None:
     spoilt = CONDITIONS["depth_outliers"].apply(clean, 2, 0).clip
     assert isinstance(spoilt, DepthClip)
-    left_out = tuple(index for index in range(1, 20, 2) if index % 8 != 1)
+    skipped = tuple(index for index in range(1, 20, 2) if index % 8 != 1)
     for clip, jumps in ((spoilt, 1), (clean.clip, 0)):
-        found = doubts(dataclasses.replace(clip, left_out=left_out))
+        found = doubts(dataclasses.replace(clip, skipped=skipped))
         assert [each.code for each in found].count(NoticeCode.DEPTH_JUMPS) == jumps
 
 

@@ -53,19 +53,20 @@ def test_frames_that_show_nothing_new_get_no_depth_and_change_no_bit_of_the_othe
         frame_times_s=np.arange(len(shown)) / 25,
     )
     whole, sampled = (
-        match_eyes(paused, drawn.calibration, "every8", Hooks(), Timings(), leave_out=each) for each in (False, True)
+        match_eyes(paused, drawn.calibration, "every8", Hooks(), Timings(), skip_redundant=each)
+        for each in (False, True)
     )
-    assert whole.left_out == ()
-    assert len(sampled.left_out) > 30
-    assert set(sampled.left_out) <= set(range(12, 118)) - set(held_out_frames(len(shown), "every8"))
-    used = np.setdiff1d(range(len(shown)), sampled.left_out)
+    assert whole.skipped == ()
+    assert len(sampled.skipped) > 30
+    assert set(sampled.skipped) <= set(range(12, 118)) - set(held_out_frames(len(shown), "every8"))
+    used = np.setdiff1d(range(len(shown)), sampled.skipped)
     for eye, sampled_eye in zip(whole.eyes, sampled.eyes, strict=True):
         for name in PIXELS:
             assert np.array_equal(getattr(eye, name)[used], getattr(sampled_eye, name)[used])
-        assert not sampled_eye.depth_mm[list(sampled.left_out)].any()
+        assert not sampled_eye.depth_mm[list(sampled.skipped)].any()
     assert np.array_equal(sampled.frame_times_s, whole.frame_times_s)
     told = [each.text for each in sampled.assumptions if each.code is NoticeCode.NOTHING_NEW]
-    assert [text.split(" show")[0] for text in told] == [f"frames: {len(sampled.left_out)} of 130"]
+    assert [text.split(" show")[0] for text in told] == [f"frames: {len(sampled.skipped)} of 130"]
 
 
 @pytest.mark.parametrize("use_frames", ["new", "all"])
@@ -76,4 +77,4 @@ def test_of_a_long_clip_with_depth_frames_are_left_out_unless_all_are_asked_for(
     write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=12, motion="still", tools=())), tmp_path)
     options = ReconstructionOptions.model_validate({"use_frames": use_frames, "mask_polarity": "tool"})
     clip = open_with_depth(ClipPaths(tmp_path), options, Hooks(), Timings())
-    assert clip.left_out == {"new": (2, 4, 5, 7, 8, 11), "all": ()}[use_frames]
+    assert clip.skipped == {"new": (2, 4, 5, 7, 8, 11), "all": ()}[use_frames]

@@ -212,8 +212,8 @@ def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_d
     pairs: list[Pair], whole: DepthClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("intrasplat.clip.sampling.KEPT_FRAMES", 2)
-    sampled = estimate_depth(clip_of(pairs), leave_out=True, device="cuda")
-    assert (whole.left_out, sampled.left_out) == ((), (1, 3))
+    sampled = estimate_depth(clip_of(pairs), skip_redundant=True, device="cuda")
+    assert (whole.skipped, sampled.skipped) == ((), (1, 3))
     assert np.array_equal(sampled.depth_mm[::2], whole.depth_mm[::2])
     assert np.array_equal(sampled.depth_confidence[::2], whole.depth_confidence[::2])
     assert not sampled.depth_mm[1::2].any()

@@ -84,7 +84,7 @@ def test_a_large_picture_is_made_smaller_by_a_whole_factor(width: int, shown: tu
 
 @pytest.mark.parametrize(("t", "index"), [(0.0, 0), (0.13, 6), (5.0, FRAMES - 1)])
 def test_frames_without_masks_are_passed_over(t: float, index: int) -> None:
-    assert live_frame(dataclasses.replace(clip(), left_out=(5,)), t)[0] == index
+    assert live_frame(dataclasses.replace(clip(), skipped=(5,)), t)[0] == index
 
 
 @pytest.mark.parametrize("masks", RecordedMasks)
@@ -130,7 +130,7 @@ def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Pa
 @pytest.mark.parametrize(("source", "frames"), [("found", 2 * FRAMES - 3), ("given", 2 * FRAMES)])
 def test_frames_that_nobody_looked_at_are_kept_where_their_masks_are_known(source: str, frames: int) -> None:
     masks = Masks(source=source, share=0.33)  # type: ignore[arg-type]
-    _, told = kept_frames(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), left_out=(4, 5, 6)), EYES[:1])
+    _, told = kept_frames(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), skipped=(4, 5, 6)), EYES[:1])
     assert len(told.frames) == frames
 
 
