@@ -70,5 +70,5 @@ THUMBNAIL = "thumbnail.jpg"
 RESUME = "resume.safetensors"
 PREPARED = "prepared"
 """The folder with the clip and its depth."""
-KEPT = (RESUME, PREPARED)
+RESUME_STATE = (RESUME, PREPARED)
 """What a stopped or killed job stores for the next attempt."""

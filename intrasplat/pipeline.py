@@ -91,15 +91,15 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     return report
 
 
-def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, kept_dir: Path | None = None) -> Made:
+def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, resume_dir: Path | None = None) -> Made:
     """Like reconstruct, without the scores: the scene in out_dir is complete and can be viewed.
 
-    kept_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
+    resume_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
     """
     length, tell = length_of(request.options, request.preset), hooks.on_progress
     forecast = TimeEstimate(*length, most_frames(request.options))
     hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
-    with keeping(kept_dir or out_dir, forgets=kept_dir is None) as keeper:
+    with keeping(resume_dir or out_dir, forgets=resume_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
         used = len(setup.clip.used)
         forecast.learn(used, used * setup.clip.tissue[0].size / 1e6)

@@ -25,7 +25,7 @@ from intrasplat.errors import InputError
 from intrasplat.export import export_parts
 from intrasplat.formats import EXPORT_FORMATS, check_export
 from intrasplat.machine.hooks import Progress, ignore, never
-from intrasplat.names import KEPT, MANIFEST, REPORT
+from intrasplat.names import MANIFEST, REPORT, RESUME_STATE
 from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
 from intrasplat.picture import MAX_RENDER_PIXELS, IntrinsicsOverride
 from intrasplat.pipeline import reconstruct as run_pipeline
@@ -164,7 +164,7 @@ class Scene:
         target.mkdir(parents=True, exist_ok=True)
         files = sorted(self._folder.iterdir(), key=lambda path: path.name == MANIFEST)  # the manifest completes it
         for path in files:
-            if path.is_file() and path.name not in KEPT:
+            if path.is_file() and path.name not in RESUME_STATE:
                 shutil.copyfile(path, target / path.name)
 
     def export(

@@ -57,7 +57,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         background = (deps.sweep.run, deps.retention.run, deps.webhooks.run, renderer.run)
-        tasks = [asyncio.create_task(_kept_up(run)) for run in background]
+        tasks = [asyncio.create_task(_restart_on_error(run)) for run in background]
         yield
         deps.feeds.end()
         for task in tasks:
@@ -90,7 +90,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     return app
 
 
-async def _kept_up(run: Callable[[], Awaitable[None]]) -> None:
+async def _restart_on_error(run: Callable[[], Awaitable[None]]) -> None:
     """Run background work, and run it again after an unexpected error."""
     while True:
         try:

@@ -25,7 +25,7 @@ MIN_BYTES = 4096
 class UploadSlot:
     """An upload that is being received, and the disk space that is reserved for its remaining bytes."""
 
-    kept_bytes: int
+    reserved_bytes: int
     tenant: str
 
 
@@ -72,7 +72,7 @@ class Intake:
         available_bytes = self.available_bytes()
         if declared_bytes > available_bytes:
             raise disk_full_for_upload(declared_bytes, available_bytes, self._settings.min_free_bytes)
-        own_bytes = self._kept_bytes(tenant)
+        own_bytes = self._reserved_bytes(tenant)
         allowed_bytes = self._settings.tenant_share * (available_bytes + own_bytes)
         if own_bytes and own_bytes + declared_bytes > allowed_bytes:
             detail = f"Your uploads have been promised {own_bytes} bytes that have not come, and {declared_bytes} more "
@@ -93,11 +93,11 @@ class Intake:
 
     def available_bytes(self) -> int:
         """Bytes that may be written now: free space less the minimum and what is reserved for uploads."""
-        return self._store.free_bytes() - self._settings.min_free_bytes - self._kept_bytes()
+        return self._store.free_bytes() - self._settings.min_free_bytes - self._reserved_bytes()
 
-    def _kept_bytes(self, tenant: str | None = None) -> int:
+    def _reserved_bytes(self, tenant: str | None = None) -> int:
         """Bytes reserved for unfinished uploads, of one tenant or of all."""
-        places = sum(place.kept_bytes for place in self._places if tenant in (None, place.tenant))
+        places = sum(place.reserved_bytes for place in self._places if tenant in (None, place.tenant))
         return places + promised_bytes(self._store, tenant)
 
     async def body(self, request: Request, place: UploadSlot | None = None) -> AsyncIterator[bytes]:
@@ -122,7 +122,7 @@ class Intake:
                 left_s -= time.monotonic() - asked_at_s  # counts waiting for the caller, not writing to disk
                 new_bytes += len(piece)
                 if place is not None:
-                    place.kept_bytes = max(place.kept_bytes - len(piece), 0)
+                    place.reserved_bytes = max(place.reserved_bytes - len(piece), 0)
                 yield piece
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from service.problems import Problem
 
-BUCKETS_KEPT = 10_000
+MAX_BUCKETS = 10_000
 """Maximum number of buckets, about 2 MB. The least recently used one is removed first."""
 
 BURST_S = 1.0
@@ -40,7 +40,7 @@ class Limiter:
         bucket = self._buckets.get(name)
         if bucket is None:
             bucket = self._buckets[name] = _Bucket(self._burst, now_s)
-            if len(self._buckets) > BUCKETS_KEPT:
+            if len(self._buckets) > MAX_BUCKETS:
                 self._buckets.popitem(last=False)
         self._buckets.move_to_end(name)
         bucket.tokens = min(self._burst, bucket.tokens + (now_s - bucket.at_s) * self._rate_per_s)

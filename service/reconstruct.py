@@ -123,7 +123,7 @@ async def receive_form(
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
-            available_bytes = services.intake.available_bytes() + place.kept_bytes
+            available_bytes = services.intake.available_bytes() + place.reserved_bytes
             limits = UploadLimits(settings.max_upload_bytes, available_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
             with traces.span("receive"):

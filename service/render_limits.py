@@ -23,7 +23,7 @@ OF_CALLER, OF_TENANT = 2, 4
 SMALL_SHARE = 1 / 8
 """A render is small if it costs less than this share of one at the maximum size."""
 
-SCENES_KEPT = 1_000
+MAX_SCENES = 1_000
 
 FIRST_SPEED = 1e11
 """Assumed cost per second until large renders have been timed."""
@@ -79,7 +79,7 @@ class RenderLimits:
         if head.gaussians and head.clip_size is not None:
             self._scenes[scene_id] = head.gaussians, head.clip_size
             self._scenes.move_to_end(scene_id)
-            if len(self._scenes) > SCENES_KEPT:
+            if len(self._scenes) > MAX_SCENES:
                 self._scenes.popitem(last=False)
 
     def _too_much(self, whose: str, excess: float) -> Problem:

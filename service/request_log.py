@@ -25,7 +25,7 @@ from service.metrics import METHODS
 from service.problems import Problem, fault
 
 REQUEST_ID = "X-Request-Id"
-KEPT_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
+ACCEPTED_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
 """A caller's request id is used if it is a UUID or trace id. The id is logged, and words in it could name somebody."""
 
 QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -69,7 +69,7 @@ class RequestLog:
         answered, began_s = _Answered(), time.perf_counter()
         self._open += 1
         with _span_of(scope) as span:
-            request_id = given if KEPT_REQUEST_ID.fullmatch(given) else traces.trace_id() or uuid.uuid4().hex
+            request_id = given if ACCEPTED_REQUEST_ID.fullmatch(given) else traces.trace_id() or uuid.uuid4().hex
             with answering(request_id):
                 try:
                     await self._answer(scope, receive, _marking(scope, send, request_id, answered), answered)

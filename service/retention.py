@@ -37,7 +37,7 @@ def check_retention(options: JobOptions, settings: Settings) -> None:
         raise InputError("options.retention_hours", problem, f"Ask for {most:g} or less, or leave it out.")
 
 
-def kept_hours(options: JobOptions, settings: Settings) -> float | None:
+def retention_hours(options: JobOptions, settings: Settings) -> float | None:
     """How many hours a job is kept after its end; None: until it is deleted."""
     wanted = settings.retention_hours if options.retention_hours is None else options.retention_hours
     limits = [hours for hours in (wanted, settings.max_retention_hours) if hours is not None]
@@ -73,7 +73,7 @@ class Retention:
         return purged
 
     def _is_due(self, record: JobRecord, now_s: float) -> bool:
-        hours = kept_hours(record.options, self._settings)
+        hours = retention_hours(record.options, self._settings)
         ended_s = record.finished_at_s
         if hours is None or ended_s is None or record.state not in TERMINAL_STATES:
             return False

@@ -198,11 +198,11 @@ class _Job:
         job_id, attempt = self._claim.job_id, self._claim.attempt
         self._report(JobProgress(stage=FETCHING, fraction=0.0))
         spool = self._retry_store(lambda: self._store.fetch_clip(job_id))
-        kept = self._retry_store(lambda: self._store.kept_folder(job_id, attempt))
+        resume_dir = self._retry_store(lambda: self._store.resume_folder(job_id, attempt))
         out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
-        child.send(RunJob(record=record, spool=spool, out=out, kept=kept))
+        child.send(RunJob(record=record, spool=spool, out=out, kept=resume_dir))
         detector, asked_s = HangDetector(), None
         while True:
             report = child.next_report(LOOK_PERIOD_S)

@@ -69,7 +69,7 @@ def run_supervisor(
         check_queue(queue)
         with (
             announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
-            kept_tidy(store),
+            periodic_tidy(store),
         ):
             if renders_only:
                 keep_rendering(keeper, end)
@@ -107,7 +107,7 @@ def address_of(
 
 
 @contextlib.contextmanager
-def kept_tidy(store: Store) -> Iterator[None]:
+def periodic_tidy(store: Store) -> Iterator[None]:
     """Tidy the store every TIDY_PERIOD_S while the context lasts."""
     end = threading.Event()
 

@@ -138,8 +138,8 @@ class Views:
     def cost(self, request: SceneRequest) -> float:
         """The cost of the answer in pixels x Gaussians; 0 if it is cached at full detail."""
         if isinstance(request, RenderRequest):
-            kept = self._replies.get(request)
-            if kept is not None and kept.level == 0:
+            cached = self._replies.get(request)
+            if cached is not None and cached.level == 0:
                 return 0.0
         if isinstance(request, RecordedRequest | CamerasRequest):
             return 0.0

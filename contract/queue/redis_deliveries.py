@@ -40,13 +40,13 @@ class RedisDeliveries:
     def send_again(self, record: JobRecord) -> None:
         delivery = Delivery.of(record)
         with reachable():
-            known = self._client.hget(self._kept(record.job_id), delivery.event_id) or ""
+            known = self._client.hget(self._key(record.job_id), delivery.event_id) or ""
         again = (delivery_of(known) or delivery).again()
         self._scripts.run("again", delivery.event_id, known, _document(again))
 
     def deliveries(self, job_id: str) -> list[Delivery]:
         with reachable():
-            found = [each for each in map(delivery_of, self._client.hvals(self._kept(job_id))) if each]
+            found = [each for each in map(delivery_of, self._client.hvals(self._key(job_id))) if each]
             if not found:
                 return []
             tenant = self._client.hget(f"{self._prefix}job:{job_id}", "tenant")
@@ -58,7 +58,7 @@ class RedisDeliveries:
         views = [each.model_copy(update={"next_try_at_s": at_s}) for each, at_s in zip(found, next_s, strict=True)]
         return sorted(views, key=lambda each: each.ended_at_s)
 
-    def _kept(self, job_id: str) -> str:
+    def _key(self, job_id: str) -> str:
         return f"{self._prefix}deliveries:{job_id}"
 
 

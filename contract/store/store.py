@@ -41,7 +41,7 @@ from contract.wire.labels import Labels
 from intrasplat.errors import SceneError, UnavailableError
 from intrasplat.files.disk_errors import disk_errors
 from intrasplat.files.durable import replace_file
-from intrasplat.names import KEPT, LABELS, REPORT, SUBMISSION, THUMBNAIL
+from intrasplat.names import LABELS, REPORT, RESUME_STATE, SUBMISSION, THUMBNAIL
 from intrasplat.report import Report
 from intrasplat.scene.results import RESULTS, add_scores
 
@@ -174,7 +174,7 @@ class Store:
                 remove_tree(self._here.path(entry))
         return folder
 
-    def kept_folder(self, job_id: str, attempt: int) -> Path:
+    def resume_folder(self, job_id: str, attempt: int) -> Path:
         """The folder from which a later attempt resumes, with the newest state that this or an earlier attempt stored.
 
         The folders of earlier attempts are removed; a later attempt's is not touched.
@@ -183,10 +183,10 @@ class Store:
         folder = self._here.path(ShelfEntry(Area.KEPT, job_id, attempt))
         with disk_errors():
             folder.mkdir(mode=0o700, exist_ok=True)
-            for path in [path for path in folder.iterdir() if path.name not in KEPT]:
+            for path in [path for path in folder.iterdir() if path.name not in RESUME_STATE]:
                 remove_tree(path)
             for entry in self._earlier(Area.KEPT, job_id, attempt):
-                for name in KEPT:
+                for name in RESUME_STATE:
                     if not (folder / name).exists():
                         with contextlib.suppress(FileNotFoundError):
                             (self._here.path(entry) / name).rename(folder / name)

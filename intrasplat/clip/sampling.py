@@ -26,7 +26,7 @@ from intrasplat.options import ReconstructionOptions
 FRAMES_A_SECOND, LEAST_FRAMES = 5.8, 32
 """Training frames for each second of training, and the minimum: two cores make some three steps on each of them."""
 SKIPPED_CODES = (NoticeCode.NOTHING_NEW, NoticeCode.NO_TIME)
-KEPT_FRAMES = 64
+MIN_USED_FRAMES = 64
 """Approximate minimum of frames used: a clip of less than twice as many keeps all of them."""
 MAX_MOVED = 1 / 640
 """Share of the picture's width: a frame with less motion since the last used frame shows nothing new."""
@@ -86,8 +86,8 @@ def skippable_frames(
     """The frames, out of `frames`, that training can skip. Others, such as held-out frames, are not read.
 
     A frame shows nothing new if, since the last used frame, no patch has changed beyond noise by as much as a motion of
-    MAX_MOVED. One in T // KEPT_FRAMES frames is used in any case. If more than `most` remain, about `most` are used:
-    half of them spread evenly over time, half evenly over the motion.
+    MAX_MOVED. One in T // MIN_USED_FRAMES frames is used in any case. If more than `most` remain, about `most` are
+    used: half of them spread evenly over time, half evenly over the motion.
 
     Args:
         rgb: [T, H, W, 3] of the whole clip.
@@ -95,7 +95,7 @@ def skippable_frames(
         most: maximum number of used frames; None: no limit.
         mapping: a replacement of map(), such as a thread pool's.
     """
-    longest = len(rgb) // KEPT_FRAMES
+    longest = len(rgb) // MIN_USED_FRAMES
     too_many = most is not None and len(frames) > most
     if (longest < 2 and not too_many) or min(rgb.shape[1:3]) < THUMBNAIL_WIDTH // 2:
         return SkippedFrames()

@@ -32,7 +32,7 @@ from intrasplat.notices import Notice, NoticeCode
 
 MAX_MISSING_FRAMES = 1  # containers that store a duration instead of a count round it
 FALLBACK_RATE_HZ = 30.0
-MAX_KEPT_BYTES = 512 << 20
+MAX_CACHE_BYTES = 512 << 20
 
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm"
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
@@ -42,10 +42,10 @@ _QUIET = "-8"  # AV_LOG_QUIET: hides the messages of decoders that refuse a file
 _environment_lock = threading.Lock()  # OpenCV reads the options from the environment, which all threads share
 
 
-class KeptFrames:
+class CachedFrames:
     """Decoded frames of a video, cached in an unnamed file, so that the pass that counts them need not be repeated.
 
-    It stores MAX_KEPT_BYTES at most: for a longer video, decoding twice is cheaper than the disk space.
+    It stores MAX_CACHE_BYTES at most: for a longer video, decoding twice is cheaper than the disk space.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class KeptFrames:
 
     def add(self, frame: NDArray[np.uint8]) -> bool:
         """Store the next frame [H, W, 3], BGR. False if it exceeds the limit, the disk is full, or sizes differ."""
-        if (self._count + 1) * frame.nbytes > MAX_KEPT_BYTES or frame.shape != (self._shape or frame.shape):
+        if (self._count + 1) * frame.nbytes > MAX_CACHE_BYTES or frame.shape != (self._shape or frame.shape):
             return False
         self._shape, self._count = frame.shape, self._count + 1
         try:
@@ -85,14 +85,14 @@ class VideoFile:
     frame_times_s: NDArray[np.float64] | None  # None: the container has no usable times
     limits: ClipLimits
     warnings: tuple[Notice, ...] = ()
-    kept: KeptFrames | None = None  # None: each call of frames() decodes anew
+    cached: CachedFrames | None = None  # None: each call of frames() decodes anew
 
     def frames(self) -> Iterator[RgbFrame]:
         """The frames, RGB uint8 [H, W, 3], from the first on. InputError if frames change size or end early."""
-        if self.kept is not None:
+        if self.cached is not None:
             for index in range(self.frame_count):
                 self.limits.on_picture()
-                yield self.kept.frame(index)
+                yield self.cached.frame(index)
             return
         with _capture(self.path, self.decoder) as capture:
             for index in range(self.frame_count):
@@ -151,15 +151,15 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
     limits.check_frame(field, label, width, height)
     limits.check_clip(field, label, declared, width, height)
     times_ms: list[float] = []
-    kept: KeptFrames | None = KeptFrames()
+    cached: CachedFrames | None = CachedFrames()
     while capture.grab():
         times_ms.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
         limits.on_picture()
-        if kept is not None or len(times_ms) == 1:
+        if cached is not None or len(times_ms) == 1:
             good, frame = capture.retrieve()
             if len(times_ms) == 1:  # a rotated clip differs in size from its header
                 height, width = frame.shape[:2] if good else (height, width)
-            kept = kept if kept is not None and good and kept.add(frame) else None
+            cached = cached if cached is not None and good and cached.add(frame) else None
         limits.check_clip(field, label, len(times_ms), width, height)
     times_s = _times_s(times_ms, rate_hz)
     limits.check_duration(field, label, 0.0 if times_s is None or len(times_s) == 0 else float(times_s[-1]))
@@ -168,7 +168,7 @@ def _survey(capture: Any, path: Path, field: str, limits: ClipLimits, label: str
         raise _cut_short(field, label, len(times_ms), declared)
     unknown = f"{field}: the video names no frame count, a missing end would not be noticed"
     warnings = () if declared else (Notice.warning(NoticeCode.FRAME_COUNT_UNKNOWN, unknown),)
-    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings, kept)
+    return VideoFile(path, field, label, decoder, len(times_ms), height, width, times_s, limits, warnings, cached)
 
 
 def _whole_despite_count(

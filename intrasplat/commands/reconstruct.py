@@ -20,7 +20,7 @@ from intrasplat.commands.exits import ExitCode
 from intrasplat.commands.progress_bar import ProgressBar
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.files.durable import temporary_path
-from intrasplat.names import CURVE, KEPT, MANIFEST, MASKS, RECORDED, REPORT, SCENE
+from intrasplat.names import CURVE, MANIFEST, MASKS, RECORDED, REPORT, RESUME_STATE, SCENE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.report import Report
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from intrasplat.machine.hooks import Hooks
 
 
-_BEFORE_MANIFEST = (*KEPT, REPORT, CURVE, MASKS, RECORDED, SCENE)
+_BEFORE_MANIFEST = (*RESUME_STATE, REPORT, CURVE, MASKS, RECORDED, SCENE)
 UNFINISHED = {*_BEFORE_MANIFEST, *(temporary_path(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
 """Files that a stopped or killed run may leave. The manifest is written last: it marks a finished scene."""
 
@@ -83,7 +83,7 @@ def run_cli(options: argparse.Namespace) -> int:
             hooks = Hooks(on_progress=bar.show, should_stop=interrupted.is_set)
             report = _reconstruct(options, out, hooks, accepted_at_s)
     except Cancelled as error:
-        again = " The same command goes on from there." if any((out / name).exists() for name in KEPT) else ""
+        again = " The same command goes on from there." if any((out / name).exists() for name in RESUME_STATE) else ""
         raise Cancelled(f"{error}{again}") from error
     finally:
         for number, handler in before.items():

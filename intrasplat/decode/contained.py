@@ -40,7 +40,7 @@ MALFORMED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # 
 MEMORY_REMEDY = "Cut it shorter or scale it down, or give the worker's machine or container more memory."
 REMEDY = "Export it again as H.264 in mp4, or give its frames as PNG in a zip."
 _PACKAGES = Path(__file__).resolve().parents[2]  # the folder that contains `intrasplat`
-_KEPT_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
+_PASSED_VARIABLES = ("LD_LIBRARY_PATH", "SYSTEMROOT")  # some installations find no libraries without them
 
 logger = logging.getLogger(__name__)
 
@@ -283,7 +283,7 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
 
 def _environment(folder: Path) -> dict[str, str]:
     """The process's environment. From the parent's it keeps only the variables for finding libraries."""
-    kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
+    kept = {name: os.environ[name] for name in _PASSED_VARIABLES if name in os.environ}
     return kept | {
         "PYTHONPATH": str(_PACKAGES),
         "PYTHONDONTWRITEBYTECODE": "1",

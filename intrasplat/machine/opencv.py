@@ -34,11 +34,11 @@ def silent_stderr() -> Iterator[None]:
     tag there. For commands with one thread, around calls whose failure is detected by other means.
     """
     sys.stderr.flush()
-    kept = os.dup(STDERR)
+    saved = os.dup(STDERR)
     try:
         with open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), STDERR)
         yield
     finally:
-        os.dup2(kept, STDERR)
-        os.close(kept)
+        os.dup2(saved, STDERR)
+        os.close(saved)

@@ -94,12 +94,12 @@ class Frames:
         if right is not None:
             baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
-        self._kept: dict[int, TrackedFrame] = {}
+        self._cache: dict[int, TrackedFrame] = {}
         self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
-        if index not in self._kept:
+        if index not in self._cache:
             clip, step = self._clip, self._step
             grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), step)
             height, width = grey.shape
@@ -110,14 +110,14 @@ class Frames:
             ratio = np.float32(self.camera.fx * self.camera.baseline_mm)
             disparity = np.where(usable, ratio / np.maximum(depth_mm, 1e-3), np.float32(0))
             clip.let_go(index)
-            self._kept[index] = TrackedFrame(
+            self._cache[index] = TrackedFrame(
                 grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0))
             )
-        return self._kept[index]
+        return self._cache[index]
 
     def forget(self, index: int) -> None:
         """Free a frame's memory."""
-        self._kept.pop(index, None)
+        self._cache.pop(index, None)
 
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""

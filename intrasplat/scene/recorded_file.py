@@ -48,7 +48,7 @@ def read_frame(path: Path, frame_count: int, t: float, eye: Eye = "left", kind: 
             found = [match.groups() for name in archive.namelist() if (match := NAME.fullmatch(name))]
             frames = [int(number) for side, number, ending in found if (side, ending) == (eye, kind)]
             if not found:
-                raise _nothing_kept()
+                raise _no_recorded_frames()
             if not frames:
                 raise _none_of(eye, kind, is_masked=any(ending == MASK for _, _, ending in found))
             index = nearest(frames, t, frame_count)
@@ -57,12 +57,12 @@ def read_frame(path: Path, frame_count: int, t: float, eye: Eye = "left", kind: 
                 raise zipfile.BadZipFile
             return index, archive.read(entry)
     except FileNotFoundError:
-        raise _nothing_kept() from None
+        raise _no_recorded_frames() from None
     except (OSError, ValueError, LookupError, NotImplementedError, zipfile.BadZipFile) as error:
         raise SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).") from error
 
 
-def _nothing_kept() -> SceneError:
+def _no_recorded_frames() -> SceneError:
     return SceneError(
         "This scene keeps no recorded frames: keep_recorded was off, or it was made before they were kept."
     )

@@ -23,7 +23,7 @@ from intrasplat.clip import DepthClip
 from intrasplat.clip.layouts import registered_files
 from intrasplat.clip.stored import load_clip, save_clip
 from intrasplat.errors import Cancelled
-from intrasplat.names import KEPT, PREPARED
+from intrasplat.names import PREPARED, RESUME_STATE
 from intrasplat.scene.resume_file import RESUME_FILE
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.resume import begin_save
@@ -59,13 +59,13 @@ def keeping(folder: Path, *, forgets: bool) -> Iterator[Keeper]:
         raise
     keeper.close()
     if forgets:
-        keeper.forget(KEPT)
+        keeper.forget(RESUME_STATE)
 
 
 class Keeper:
     """Stores one run in a folder. Two threads write and wait for the disk: one the clip, one a state at a time.
 
-    written: names of KEPT that this keeper has written
+    written: names of RESUME_STATE that this keeper has written
     """
 
     def __init__(self, folder: Path) -> None:
@@ -82,7 +82,7 @@ class Keeper:
         self._threads.shutdown()
 
     def forget(self, names: Collection[str]) -> None:
-        """Remove the files of these names of KEPT; call it after close()."""
+        """Remove the files of these names of RESUME_STATE; call it after close()."""
         if RESUME_FILE in names:
             (self.folder / RESUME_FILE).unlink(missing_ok=True)
         if PREPARED in names:

@@ -46,7 +46,7 @@ UNKNOWN_BASELINE_MM = 4.0
 """Baseline of a clip whose eyes are not known: that of usual stereo endoscopes."""
 MOTION_FACTOR = 2.0
 """Standard uncertainty of a displacement, in any direction, over the spread of its Gaussians' displacements."""
-LEAST_KEPT_TRUST = 0.5
+MIN_REMAINING_TRUST = 0.5
 """A place is not measured at a frame where less than this share of its trust is left: after 0.7 s out of view."""
 
 
@@ -222,7 +222,7 @@ def distances(
     apart_mm2 = MOTION_FACTOR**2 * np.sum(np.square(apart_mm), axis=0)
     now = _apart((second.point_mm - first.point_mm)[None], covariance[None])
     over_time = _apart(paths_mm[1] - paths_mm[0], covariance + apart_mm2[:, None, None] * np.eye(3))
-    known = np.all([_kept_trust(scene, each, device) >= LEAST_KEPT_TRUST for each in both], axis=0)
+    known = np.all([_remaining_trust(scene, each, device) >= MIN_REMAINING_TRUST for each in both], axis=0)
     return Distances(float(now[0][0]), float(now[1][0]), *over_time, known, paths_mm)
 
 
@@ -262,7 +262,7 @@ def _displacements(
     return displacement, np.sqrt(np.einsum("m,tmc->t", place.shares, (displacements - displacement[:, None]) ** 2))
 
 
-def _kept_trust(scene: TrainedScene, place: MeasuredPlace, device: Device) -> NDArray[np.float64]:
+def _remaining_trust(scene: TrainedScene, place: MeasuredPlace, device: Device) -> NDArray[np.float64]:
     """[T] share of the trust in a place that is left at every frame; 1 where the endoscope has it in view."""
     renderer, seen = renderer_of(scene, device), scene.seen.numpy()[place.gaussians]
     whole = max(float(place.shares @ seen), 1e-9)

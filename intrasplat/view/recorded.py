@@ -1,6 +1,6 @@
 """Recorded frames as the model's cameras see them, with their masks, to compare model and masks with.
 
-A scene stores them of at most MAX_KEPT moments in one file, which intrasplat/scene/recorded_file.py reads.
+A scene stores them of at most MAX_MOMENTS moments in one file, which intrasplat/scene/recorded_file.py reads.
 Symbols: h w pixels of a picture.
 """
 
@@ -26,7 +26,7 @@ from intrasplat.picture import RecordedMasks
 from intrasplat.report import Recorded
 from intrasplat.scene.recorded_file import MASK, PICTURE, name_of, nearest, read_frame
 
-MAX_KEPT = 120
+MAX_MOMENTS = 120
 """Most moments of a clip whose frames are stored."""
 MAX_WIDTH = 720
 """Pixels: a wider frame is shrunk by an integer factor, which takes a third of the time of any other factor."""
@@ -48,11 +48,11 @@ Mask = NDArray[np.bool_]
 def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
     """The zip file of a clip's recorded frames, and its entry in the report. The same clip gives the same bytes.
 
-    It contains all frames, or MAX_KEPT that are spread evenly. If the masks were found in the pictures, it skips frames
-    without a mask: nobody searched them.
+    It contains all frames, or MAX_MOMENTS that are spread evenly. If the masks were found in the pictures, it skips
+    frames without a mask: nobody searched them.
     """
     looked_at = clip.used if clip.masks is not None and clip.masks.are_found else range(clip.frame_count)
-    frames = spread(looked_at, MAX_KEPT)
+    frames = spread(looked_at, MAX_MOMENTS)
     content, is_masked, size = io.BytesIO(), False, (0, 0)
     masks: dict[str, bytes] = {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:

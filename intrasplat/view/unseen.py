@@ -20,7 +20,7 @@ STRIPE_SHARE = 1 / 96
 """Width of a stripe of the hatch along a row, as a share of the image's width: 3 mm where the picture is 30 cm wide."""
 DARK_GREY, LIGHT_GREY = 40, 74
 """Greys of the stripes, of 255 (luminance 2 and 7 %): distinct from 3 m away; nothing in a body is grey and striped."""
-HATCHES_KEPT = 8
+MAX_CACHED_HATCHES = 8
 
 
 def blended_values(seen: NDArray[np.float32]) -> NDArray[np.float32] | None:
@@ -56,7 +56,7 @@ def hatched(rgb: NDArray[np.uint8], unseen: NDArray[np.bool_]) -> NDArray[np.uin
     return np.asarray(cv2.copyTo(_hatch(*unseen.shape), unseen.astype(np.uint8), rgb.copy()), np.uint8)
 
 
-@lru_cache(HATCHES_KEPT)
+@lru_cache(MAX_CACHED_HATCHES)
 def _hatch(height: int, width: int) -> NDArray[np.uint8]:
     """[H, W, 3] diagonal stripes of two dark greys."""
     stripe_px = max(2, round(width * STRIPE_SHARE))

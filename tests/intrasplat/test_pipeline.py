@@ -25,7 +25,7 @@ from intrasplat.errors import Cancelled, InputError, SceneError, TrainingDiverge
 from intrasplat.machine.hooks import Progress
 from intrasplat.methods.method import Preset
 from intrasplat.methods.registry import PRESETS
-from intrasplat.names import KEPT, LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME
+from intrasplat.names import LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME, RESUME_STATE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions, parse_options
 from intrasplat.outcome import scene_of
@@ -194,7 +194,9 @@ def test_a_stopped_run_goes_on_in_its_folder(name: str, clip: Path, whole: Whole
     straight, out = whole(name)
     with pytest.raises(Cancelled):
         run(clip, tmp_path / "stopped", stopping_after(7), preset=name)
-    assert RESUME in files(tmp_path / "stopped") <= set(KEPT)  # the clip may still have been on its way to the disk
+    assert (
+        RESUME in files(tmp_path / "stopped") <= set(RESUME_STATE)
+    )  # the clip may still have been on its way to the disk
     resumed = run(clip, tmp_path / "stopped", preset=name)
     assert files(tmp_path / "stopped") == SCENE_FILES
     assert tensor_bits(tmp_path / "stopped") == tensor_bits(out)

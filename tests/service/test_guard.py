@@ -15,7 +15,7 @@ from contract.runtime.settings import LOOPBACK_NAMES, Settings
 from service.access import WRONG_KEYS_AT_ONCE, Access
 from service.deps import address_of
 from service.guard import Guard
-from service.limits import BUCKETS_KEPT, Limiter
+from service.limits import MAX_BUCKETS, Limiter
 from service.problems import Problem
 
 WEBSOCKET: dict[str, Any] = {"type": "websocket", "path": "/stream", "extensions": {"websocket.http.response": {}}}
@@ -112,10 +112,10 @@ def test_a_bucket_lets_the_burst_through_and_then_the_rate() -> None:
 
 def test_buckets_of_many_addresses_take_bounded_memory() -> None:
     limiter = Limiter(rate_per_s=1.0)
-    for number in range(BUCKETS_KEPT + 100):
+    for number in range(MAX_BUCKETS + 100):
         limiter.take(str(number), 0.0)
-    assert len(limiter._buckets) == BUCKETS_KEPT
-    assert limiter.take(str(BUCKETS_KEPT + 99), 0.0) > 0.0
+    assert len(limiter._buckets) == MAX_BUCKETS
+    assert limiter.take(str(MAX_BUCKETS + 99), 0.0) > 0.0
 
 
 def test_too_many_requests_are_told_when_to_come_back() -> None:

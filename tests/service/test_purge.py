@@ -29,7 +29,7 @@ from service.audit import Audit
 from service.done import DoneJobs
 from service.purge import LOG_CLEARED_AFTER_S, Purger
 from service.questions import Questions
-from service.retention import HOUR_S, Retention, check_retention, kept_hours
+from service.retention import HOUR_S, Retention, check_retention, retention_hours
 from tests.service.test_tus import uploaded
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
 
@@ -226,7 +226,7 @@ def test_a_job_is_kept_as_long_as_it_asks_else_as_usual_and_never_longer_than_th
     asked: float | None, usual: float | None, most: float | None, kept: float | None
 ) -> None:
     settings = Settings(retention_hours=usual, max_retention_hours=most)
-    assert kept_hours(JobOptions(retention_hours=asked), settings) == kept
+    assert retention_hours(JobOptions(retention_hours=asked), settings) == kept
     check_retention(JobOptions(retention_hours=asked), settings)
 
 

@@ -197,7 +197,7 @@ def test_the_work_of_a_job_that_deaths_of_whole_workers_failed_goes(
         for attempt in range(1, MAX_ATTEMPTS + 1):
             record = queue.claim(f"worker-{attempt}.dead", 0.0)  # which finds the lease of the one before run out
             assert record is not None
-            kept = service.store.kept_folder(job_id, record.attempt)
+            kept = service.store.resume_folder(job_id, record.attempt)
             (kept / RESUME).write_text("x")
         assert queue.claim("worker-9", 0.0) is None
         assert is_in(queue, job_id, JobState.FAILED)
@@ -212,7 +212,7 @@ def test_what_led_to_a_scene_goes_though_its_worker_died_when_the_job_was_done(t
         record = queue.claim("worker-1.dead", 60.0)
         assert record is not None
         assert record.owner is not None
-        kept = service.store.kept_folder(job_id, record.attempt)
+        kept = service.store.resume_folder(job_id, record.attempt)
         (kept / RESUME).write_text("x")
         (service.store.work_folder(job_id, record.attempt) / MANIFEST).write_text("{}")
         service.store.publish_scene(job_id, record.attempt)

@@ -19,7 +19,7 @@ from contract.store.shelf import new_job_id
 from contract.wire.job import JobFiles, JobRecord
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, TrainingDiverged, UnavailableError
-from intrasplat.names import KEPT, REPORT
+from intrasplat.names import REPORT, RESUME_STATE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import JobOptions, ReconstructionOptions
 from intrasplat.report import Report
@@ -146,7 +146,7 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
     kept = tmp_path / "out.kept"
     assert list(out.iterdir()) == []
-    assert {path.name for path in kept.iterdir()} == set(KEPT)
+    assert {path.name for path in kept.iterdir()} == set(RESUME_STATE)
     stopped_at = load_resume(kept)[1]["iteration"]
     device.send(StopJob())  # too late for the last job, and not meant for the next
     device.send(order(clip, out, iterations=600))

@@ -19,7 +19,7 @@ from torch import Tensor
 from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.cpu import harmonics, update
 from intrasplat.splat.cpu.bins import TILE_ROWS
-from intrasplat.splat.cpu.motion import Motion, kept_where_old, motion_of
+from intrasplat.splat.cpu.motion import Motion, motion_of, take_moments
 from intrasplat.splat.cpu.rasterizer import Floats, Gradients, Rasterizer, padded
 from intrasplat.splat.cpu.threads import flushing, run
 from intrasplat.splat.deformation import Deformation
@@ -44,7 +44,7 @@ from intrasplat.splat.step import StepSums, TrainingFrame, camera_centre, image_
 
 PAD_LOGIT = -30.0
 """Opacity logit of the padding columns, which are never drawn."""
-SIZES_KEPT = 3
+MAX_CACHED_SIZES = 3
 """Buffers are kept for so many image sizes, those used last."""
 
 
@@ -97,14 +97,14 @@ class CpuModel:
 
     def _rasterizer(self, width: int, height: int) -> Rasterizer:
         """The buffers of an image size."""
-        return self._kept(self._rasterizers.get((width, height)) or Rasterizer(width, height))
+        return self._cached(self._rasterizers.get((width, height)) or Rasterizer(width, height))
 
-    def _kept(self, rasterizer: Rasterizer) -> Rasterizer:
+    def _cached(self, rasterizer: Rasterizer) -> Rasterizer:
         """Keep these buffers, and those of the few other sizes used last."""
         size = rasterizer.width, rasterizer.height
         self._rasterizers[size] = rasterizer
         self._rasterizers.move_to_end(size)
-        while len(self._rasterizers) > SIZES_KEPT:
+        while len(self._rasterizers) > MAX_CACHED_SIZES:
             self._rasterizers.popitem(last=False)
         return rasterizer
 
@@ -150,7 +150,7 @@ class CpuModel:
         self._place_state(camera, self.sh_degree, rasterizer)
         if values is not None:
             rasterizer.set_values(values)
-        return _Projected(rasterizer, values is not None, self._kept)
+        return _Projected(rasterizer, values is not None, self._cached)
 
     def blend_values(self, values: Floats) -> Floats:
         """Further values [N], blended as colour was in the last render: [H, W]; a view."""
@@ -252,7 +252,7 @@ class CpuModel:
         fresh = np.concatenate([fresh, np.ones(fill, np.bool_)])
         for name, values in self._parameters().items():
             setattr(self, name, np.ascontiguousarray(values[..., columns]))
-            self._moments[name] = kept_where_old(self._moments[name], columns, fresh)
+            self._moments[name] = take_moments(self._moments[name], columns, fresh)
         self.motion.take(columns, fresh)
         self.opacity_logit[count:] = PAD_LOGIT
         self.count = count

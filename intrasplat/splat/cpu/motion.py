@@ -49,7 +49,7 @@ class Motion(Protocol):
         """The first count Gaussians' deformation as torch tensors (copies); as_it_lies as in Model.export."""
 
 
-def kept_where_old(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
+def take_moments(moments: Floats, columns: np.ndarray, fresh: np.ndarray) -> Floats:
     """These columns of Adam's moments, 0 where fresh. Contiguous by rows, which indexing alone is not."""
     if fresh.all():  # zeros that are never written take no memory
         return np.zeros((*moments.shape[:-1], len(columns)), np.float32)
@@ -114,8 +114,8 @@ class LinearMotion:
 
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         # one after the other, so that old and new arrays are in memory for one of the three at a time
-        self.first = kept_where_old(self.first, columns, fresh)
-        self.second = kept_where_old(self.second, columns, fresh)
+        self.first = take_moments(self.first, columns, fresh)
+        self.second = take_moments(self.second, columns, fresh)
         self.weight = np.take(self.weight, columns, axis=-1)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
@@ -156,8 +156,8 @@ class FdmMotion:
     def take(self, columns: np.ndarray, fresh: np.ndarray) -> None:
         for name in ("weight", "centre", "width"):
             setattr(self, name, np.take(getattr(self, name), columns, axis=-1))
-        self.first = kept_where_old(self.first, columns, fresh)
-        self.second = kept_where_old(self.second, columns, fresh)
+        self.first = take_moments(self.first, columns, fresh)
+        self.second = take_moments(self.second, columns, fresh)
 
     def parameters(self, count: int) -> dict[str, Tensor]:
         return _views(self, ("weight", "centre", "width"), count)

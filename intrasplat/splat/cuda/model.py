@@ -29,7 +29,7 @@ from intrasplat.splat.cuda import harmonics
 from intrasplat.splat.cuda.buffers import FrameBuffers
 from intrasplat.splat.cuda.control import write_adam
 from intrasplat.splat.cuda.frames import FrameStore
-from intrasplat.splat.cuda.motion import Motion, TrainedValues, kept_where_old, motion_of
+from intrasplat.splat.cuda.motion import Motion, TrainedValues, motion_of, take_moments
 from intrasplat.splat.cuda.rasterizer import Gradients
 from intrasplat.splat.cuda.update import MADE, SEEN, SUMS, padded
 from intrasplat.splat.deformation import Deformation
@@ -59,7 +59,7 @@ PAD_LOGIT = -30.0
 CHECK_EVERY = 32
 """Steps from one read of the device's report to the next. The device idles during a read. After a step that exceeded
 the capacity, at most so many are made again."""
-SIZES_KEPT = 3
+MAX_CACHED_SIZES = 3
 """Buffers are kept for so many image sizes, those rendered last."""
 
 
@@ -243,7 +243,7 @@ class CudaModel:
             self._views[size] = FrameBuffers(width, height, frames, self.motion, self.device)
             self._views[size].fit(self._values.shape[1])
         self._views.move_to_end(size)
-        while len(self._views) > SIZES_KEPT:
+        while len(self._views) > MAX_CACHED_SIZES:
             self._views.popitem(last=False)[1].launches.forget()
         return self._views[size]
 
@@ -339,7 +339,7 @@ class CudaModel:
         is_fresh = torch.from_numpy(np.concatenate([fresh, np.ones(fill, np.bool_)])).to(self.device)
         self._values, self._sh_rest = (each.index_select(-1, chosen) for each in (self._values, self._sh_rest))
         self._moments, self._rest_moments = (
-            kept_where_old(each, chosen, is_fresh) for each in (self._moments, self._rest_moments)
+            take_moments(each, chosen, is_fresh) for each in (self._moments, self._rest_moments)
         )
         self.motion.take(chosen, is_fresh)
         self._values[OPACITY_ROW, count:] = PAD_LOGIT

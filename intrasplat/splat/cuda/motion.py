@@ -91,11 +91,11 @@ class Motion(Protocol):
         """The first count Gaussians' deformation as tensors on the CPU (copies)."""
 
 
-TIMES_KEPT = 4096
+MAX_CACHED_TIMES = 4096
 """Bases are cached for so many times: more than a clip has frames, but bounded for a scene rendered for days."""
 
 
-def kept_where_old(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
+def take_moments(moments: Tensor, columns: Tensor, fresh: Tensor) -> Tensor:
     """These columns of Adam's moments, 0 where fresh."""
     return moments.index_select(-1, columns).masked_fill_(fresh, 0.0)
 
@@ -127,7 +127,7 @@ class Moments:
         """Keep these columns, 0 where fresh."""
         self._shape = (*self._shape[:-1], len(columns))
         if self._tensor is not None:
-            self._tensor = kept_where_old(self._tensor, columns, fresh)
+            self._tensor = take_moments(self._tensor, columns, fresh)
 
 
 class LinearMotion:
@@ -150,7 +150,7 @@ class LinearMotion:
     def _alive(self, t: float) -> tuple[np.ndarray, int, int]:
         """The bases' values at t, 0 for those not in use; the first in use, and the one after the last."""
         if t not in self._found:
-            if len(self._found) == TIMES_KEPT:
+            if len(self._found) == MAX_CACHED_TIMES:
                 self._found.clear()
             values = self._form.basis(t).numpy()
             alive = np.flatnonzero(np.abs(values) >= NEGLIGIBLE)

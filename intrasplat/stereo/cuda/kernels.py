@@ -193,20 +193,20 @@ def winners(  # type: ignore[no-untyped-def]
 
 @_kernel
 def smooth_lines(  # type: ignore[no-untyped-def]
-    guide, first, second, kept, lines, length, line_stride, step_stride, frame_size, strength, steepness,
+    guide, first, second, gains, lines, length, line_stride, step_stride, frame_size, strength, steepness,
     LINES: tl.constexpr,
 ):  # fmt: skip
     """Solve (I + strength A) u = v along every line for two images at once, in place: one pass of Min et al. 2014.
 
     A is the Laplacian of a chain whose links weigh 2^(-steepness |difference of guide|). guide uint8, first, second and
-    the scratch kept float32 [F, h, w]; lines as in add_paths. The system is tridiagonal (Thomas's algorithm): forward
-    u_k = (v_k + a u_(k-1)) / (1 + a + c - a g_(k-1)), g_k = c / (the same), with links a before and c behind; then
-    backward u_k += g_k u_(k+1). The result is a mean with positive weights, so it is stable.
+    the scratch `gains` float32 [F, h, w]; lines as in add_paths. The system is tridiagonal (Thomas's algorithm):
+    forward u_k = (v_k + a u_(k-1)) / (1 + a + c - a g_(k-1)), g_k = c / (the same), with links a before and c behind;
+    then backward u_k += g_k u_(k+1). The result is a mean with positive weights, so it is stable.
     """
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     there = line < lines
     start = tl.program_id(1) * frame_size + line * line_stride
-    guide_at, first_at, second_at, kept_at = guide + start, first + start, second + start, kept + start
+    guide_at, first_at, second_at, gains_at = guide + start, first + start, second + start, gains + start
     here = tl.load(guide_at, mask=there, other=0).to(tl.float32)
     before = tl.zeros((LINES,), tl.float32)
     gain, one, two = before, before, before
@@ -221,19 +221,19 @@ def smooth_lines(  # type: ignore[no-untyped-def]
         one, two, gain = (v_one + before * one) * share, (v_two + before * two) * share, behind * share
         tl.store(first_at, one, mask=there)
         tl.store(second_at, two, mask=there)
-        tl.store(kept_at, gain, mask=there)
+        tl.store(gains_at, gain, mask=there)
         here, before = following, behind
         first_at += step_stride
         second_at += step_stride
-        kept_at += step_stride
+        gains_at += step_stride
         k += 1
     tl.debug_barrier()  # what was stored is read again, perhaps by another thread
     one, two = tl.zeros((LINES,), tl.float32), tl.zeros((LINES,), tl.float32)
     while k > 1:
         first_at -= step_stride
         second_at -= step_stride
-        kept_at -= step_stride
-        gain = tl.load(kept_at, mask=there, other=0.0)
+        gains_at -= step_stride
+        gain = tl.load(gains_at, mask=there, other=0.0)
         one = tl.load(first_at, mask=there, other=0.0) + gain * one
         two = tl.load(second_at, mask=there, other=0.0) + gain * two
         tl.store(first_at, one, mask=there)

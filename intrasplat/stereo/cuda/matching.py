@@ -288,12 +288,12 @@ def filled(disparity: Tensor, trust: Tensor, guide: Tensor) -> Tensor:
     """Edge-aware weighted mean of the trusted disparities, guided by guide uint8 [F, h, w]; it fills every pixel."""
     share = _share()
     frames, h, w = disparity.shape
-    weighted, weight, kept = disparity * trust, trust.clone(), torch.empty_like(trust)
+    weighted, weight, gains = disparity * trust, trust.clone(), torch.empty_like(trust)
     strength = SMOOTHNESS
     for _ in range(FILTER_PASSES):
         for lines, length, line_stride, step_stride in ((h, w, w, 1), (w, h, 1, w)):
             kernels.smooth_lines[(triton.cdiv(lines, share.lines), frames)](
-                guide, weighted, weight, kept, lines, length, line_stride, step_stride, h * w,
+                guide, weighted, weight, gains, lines, length, line_stride, step_stride, h * w,
                 strength, 1 / (COLOUR_SIGMA * math.log(2)), share.lines, num_warps=1,
             )  # fmt: skip
         strength *= FILTER_EASING

@@ -110,7 +110,7 @@ def test_a_purge_leaves_nothing_in_the_bucket_nor_on_any_machine_that_shows_it(
     worker.fetch_clip(job_id)
     for content in (b"first", b"again"):
         scene = published(worker, job_id, 1, content)
-    kept, work = worker.kept_folder(job_id, 2), worker.work_folder(job_id, 2)
+    kept, work = worker.resume_folder(job_id, 2), worker.work_folder(job_id, 2)
     (kept / RESUME).write_bytes(b"state")
     (kept / "frames").write_bytes(b"tissue")
     goes_on = worker.work_folder(other, 1)

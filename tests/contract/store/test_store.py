@@ -128,11 +128,11 @@ def test_an_attempt_starts_from_an_empty_folder(store: Store) -> None:
 def test_an_attempt_takes_over_what_was_kept_to_go_on_from_and_removes_earlier_folders(store: Store) -> None:
     job_id = new_job_id()
     for name in (RESUME, "half-written"):
-        (store.kept_folder(job_id, 9) / name).write_text(name)
-    (store.kept_folder(job_id, 9) / PREPARED).mkdir()
-    (store.kept_folder(job_id, 9) / PREPARED / "left_rgb.npy").write_text("frames")
+        (store.resume_folder(job_id, 9) / name).write_text(name)
+    (store.resume_folder(job_id, 9) / PREPARED).mkdir()
+    (store.resume_folder(job_id, 9) / PREPARED / "left_rgb.npy").write_text("frames")
     store.work_folder(job_id, 9)
-    kept, work = store.kept_folder(job_id, 10), store.work_folder(job_id, 10)
+    kept, work = store.resume_folder(job_id, 10), store.work_folder(job_id, 10)
     assert {path.name for path in kept.iterdir()} == {RESUME, PREPARED}
     assert (kept / PREPARED / "left_rgb.npy").read_text() == "frames"
     assert list(work.iterdir()) == []
@@ -146,7 +146,7 @@ def test_each_thing_that_was_kept_is_of_the_latest_attempt_that_kept_it(store: S
         folder = store.data_dir / "kept" / f"{job_id}.{attempt}"
         folder.mkdir(exist_ok=True)
         (folder / name).write_text(f"of attempt {attempt}")
-    kept = store.kept_folder(job_id, 3)
+    kept = store.resume_folder(job_id, 3)
     assert {path.name: path.read_text() for path in kept.iterdir()} == {
         PREPARED: "of attempt 1",
         RESUME: "of attempt 2",
@@ -160,37 +160,37 @@ def test_what_an_attempt_goes_on_from_is_the_latest_that_any_earlier_one_left(st
         folder.mkdir()
         if left:
             (folder / RESUME).write_text(f"of attempt {attempt}")
-    assert (store.kept_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
-    assert (store.kept_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
+    assert (store.resume_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
+    assert (store.resume_folder(job_id, 4) / RESUME).read_text() == "of attempt 2"
 
 
 def test_an_attempt_goes_on_from_what_one_on_another_machine_handed_over(machine: MakeStore) -> None:
     job_id = new_job_id()
     for name, attempt in (("first", 1), ("second", 2), ("first", 3)):
         store = machine(name)
-        folder = store.kept_folder(job_id, attempt)
+        folder = store.resume_folder(job_id, attempt)
         before = (folder / RESUME).read_text() if (folder / RESUME).exists() else ""
         assert before == "".join(f"{n} " for n in range(1, attempt))
         (folder / RESUME).write_text(f"{before}{attempt} ")
         store.hand_over(job_id, attempt)
     published(store, job_id, 3)
     store.remove_other_attempts(job_id, 3)
-    assert not (machine("third").kept_folder(job_id, 4) / RESUME).exists()
+    assert not (machine("third").resume_folder(job_id, 4) / RESUME).exists()
 
 
 def test_what_lies_here_from_a_later_attempt_is_preferred_to_what_was_handed_over(store: Store) -> None:
     job_id = new_job_id()
     for attempt in (1, 2):
-        (store.kept_folder(job_id, attempt) / RESUME).write_text(f"of attempt {attempt}")
+        (store.resume_folder(job_id, attempt) / RESUME).write_text(f"of attempt {attempt}")
         if attempt == 1:
             store.hand_over(job_id, attempt)
-    assert (store.kept_folder(job_id, 3) / RESUME).read_text() == "of attempt 2"
+    assert (store.resume_folder(job_id, 3) / RESUME).read_text() == "of attempt 2"
 
 
 def test_an_attempt_that_starts_late_leaves_a_later_one_alone(store: Store) -> None:
     job_id = new_job_id()
-    (store.kept_folder(job_id, 2) / RESUME).write_text("of attempt 2")
-    assert list(store.kept_folder(job_id, 1).iterdir()) == []
+    (store.resume_folder(job_id, 2) / RESUME).write_text("of attempt 2")
+    assert list(store.resume_folder(job_id, 1).iterdir()) == []
     assert (store.data_dir / "kept" / f"{job_id}.2" / RESUME).is_file()
 
 
@@ -199,7 +199,7 @@ def test_after_a_scene_is_reported_nothing_else_is_left_of_its_attempts(store: S
     for attempt in (1, 2):
         publish(store, job_id, attempt)
     store.work_folder(job_id, 3)
-    (store.kept_folder(job_id, 3) / RESUME).write_text("state")
+    (store.resume_folder(job_id, 3) / RESUME).write_text("state")
     store.remove_other_attempts(job_id, 2)
     assert [path.name for path in everything_of(store, job_id)] == [f"{job_id}.2"]
     assert store.scene_attempts(job_id) == [2]
@@ -239,7 +239,7 @@ def test_a_purge_on_one_machine_leaves_nothing_of_a_job_and_nothing_of_it_is_fou
     service, worker = machine("service"), machine("worker")
     job_id, other = accepted(service).job_id, accepted(service).job_id
     published(worker, job_id, 1)
-    (worker.kept_folder(job_id, 2) / RESUME).write_bytes(b"12345")
+    (worker.resume_folder(job_id, 2) / RESUME).write_bytes(b"12345")
     worker.hand_over(job_id, 2)
     service.open_incoming(job_id)
     assert sum(service.purge(job_id).files.values()) == 5

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import held_out_frames, split_frames, training_frames
-from intrasplat.clip.sampling import KEPT_FRAMES, LEAST_FRAMES, most_frames, sampled, skippable_frames
+from intrasplat.clip.sampling import LEAST_FRAMES, MIN_USED_FRAMES, most_frames, sampled, skippable_frames
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from lab.phantom import Phantom, PhantomSettings, make_phantom
@@ -51,15 +51,15 @@ def nothing_new(rgb: NDArray[np.uint8], frames: Sequence[int]) -> tuple[int, ...
 
 @pytest.mark.parametrize("noise", [False, True])
 def test_of_a_clip_that_shows_each_frame_twice_half_is_left_out(noise: bool) -> None:
-    rgb = recorded([float(frame // 2) for frame in range(2 * KEPT_FRAMES)], noise)
+    rgb = recorded([float(frame // 2) for frame in range(2 * MIN_USED_FRAMES)], noise)
     assert nothing_new(rgb, range(len(rgb))) == tuple(range(1, len(rgb), 2))
 
 
 @pytest.mark.parametrize("noise", [False, True])
 def test_of_a_pause_every_nth_frame_is_used_and_all_of_what_moves(noise: bool) -> None:
-    before, after = range(60), range(60 + 3 * KEPT_FRAMES, 120 + 3 * KEPT_FRAMES)
-    moments = [*map(float, range(60)), *[59.0] * 3 * KEPT_FRAMES, *map(float, range(60, 120))]
-    longest = len(moments) // KEPT_FRAMES
+    before, after = range(60), range(60 + 3 * MIN_USED_FRAMES, 120 + 3 * MIN_USED_FRAMES)
+    moments = [*map(float, range(60)), *[59.0] * 3 * MIN_USED_FRAMES, *map(float, range(60, 120))]
+    longest = len(moments) // MIN_USED_FRAMES
     unused = set(nothing_new(recorded(moments, noise), range(len(moments))))
     used = [frame for frame in range(len(moments)) if frame not in unused]
     assert not unused & {*before, *after}
@@ -67,7 +67,7 @@ def test_of_a_pause_every_nth_frame_is_used_and_all_of_what_moves(noise: bool) -
 
 
 def test_of_slow_tissue_frames_are_used_at_even_steps() -> None:
-    moments = [frame / 80 for frame in range(4 * KEPT_FRAMES)]
+    moments = [frame / 80 for frame in range(4 * MIN_USED_FRAMES)]
     unused = nothing_new(recorded(moments), range(len(moments)))
     used = np.setdiff1d(range(len(moments)), unused)
     assert len(moments) / 4 <= len(used) < len(moments) / 1.8
@@ -75,18 +75,20 @@ def test_of_slow_tissue_frames_are_used_at_even_steps() -> None:
 
 
 def test_no_frame_of_moving_tissue_is_left_out() -> None:
-    assert nothing_new(recorded([float(frame) for frame in range(2 * KEPT_FRAMES)]), range(2 * KEPT_FRAMES)) == ()
+    assert (
+        nothing_new(recorded([float(frame) for frame in range(2 * MIN_USED_FRAMES)]), range(2 * MIN_USED_FRAMES)) == ()
+    )
 
 
 def test_no_frame_is_left_out_while_a_small_part_moves() -> None:
-    rgb = recorded([0.0] * 2 * KEPT_FRAMES)
-    moving = recorded([float(frame) for frame in range(2 * KEPT_FRAMES)])
+    rgb = recorded([0.0] * 2 * MIN_USED_FRAMES)
+    moving = recorded([float(frame) for frame in range(2 * MIN_USED_FRAMES)])
     rgb[:, 40:72, 60:92] = moving[:, 40:72, 60:92]
     assert nothing_new(rgb, range(len(rgb))) == ()
 
 
 def test_a_short_clip_keeps_every_frame() -> None:
-    count = 2 * KEPT_FRAMES - 1
+    count = 2 * MIN_USED_FRAMES - 1
     assert nothing_new(recorded([0.0] * count), range(count)) == ()
 
 
@@ -94,12 +96,12 @@ def test_a_short_clip_keeps_every_frame() -> None:
 def test_a_still_clip_keeps_a_number_of_frames(count: int) -> None:
     rgb = np.broadcast_to(recorded([0.0]), (count, HEIGHT, WIDTH, 3))
     used = count - len(nothing_new(rgb, range(count)))
-    assert KEPT_FRAMES <= used < 1.6 * KEPT_FRAMES
+    assert MIN_USED_FRAMES <= used < 1.6 * MIN_USED_FRAMES
 
 
 @pytest.mark.parametrize("holdout", ["every8", "blocks8", "5,6,77"])
 def test_held_out_frames_decide_nothing_and_are_not_left_out(holdout: str) -> None:
-    rgb = recorded([min(float(frame), 30.0) for frame in range(2 * KEPT_FRAMES)])
+    rgb = recorded([min(float(frame), 30.0) for frame in range(2 * MIN_USED_FRAMES)])
     held_out, train = held_out_frames(len(rgb), holdout), training_frames(len(rgb), holdout)
     unused = nothing_new(rgb, train)
     assert len(unused) > 30
@@ -111,7 +113,7 @@ def test_held_out_frames_decide_nothing_and_are_not_left_out(holdout: str) -> No
 @pytest.mark.parametrize("holdout", ["every8", "blocks8", "none"])
 def test_a_split_trains_on_no_frame_that_is_left_out_and_times_stay(holdout: str) -> None:
     clip = phantom_clip(frames=48, width=WIDTH, height=HEIGHT, tools=False)
-    index = np.minimum(np.arange(2 * KEPT_FRAMES), 47)
+    index = np.minimum(np.arange(2 * MIN_USED_FRAMES), 47)
     arrays = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera")
     long = dataclasses.replace(
         clip, **{name: getattr(clip, name)[index] for name in arrays}, frame_times_s=np.arange(len(index)) / 25

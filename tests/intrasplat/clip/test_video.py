@@ -86,9 +86,9 @@ def test_pairs_start_again_from_the_first_frame() -> None:
 def test_frames_that_were_kept_are_those_that_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = list(open_video(SBS_H264, "clip", ClipLimits()).frames())
     for most_bytes in (0, kept[0].nbytes * 3):
-        monkeypatch.setattr(video, "MAX_KEPT_BYTES", most_bytes)
+        monkeypatch.setattr(video, "MAX_CACHE_BYTES", most_bytes)
         anew = open_video(SBS_H264, "clip", ClipLimits())
-        assert anew.kept is None
+        assert anew.cached is None
         for frame, other in zip(kept, anew.frames(), strict=True):
             np.testing.assert_array_equal(frame, other)
 

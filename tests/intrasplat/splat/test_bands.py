@@ -11,7 +11,7 @@ import torch
 from intrasplat.splat.camera import Camera
 from intrasplat.splat.cpu import Rasterizer
 from intrasplat.splat.cpu.bins import TILE_ROWS
-from intrasplat.splat.cpu.model import SIZES_KEPT, CpuModel
+from intrasplat.splat.cpu.model import MAX_CACHED_SIZES, CpuModel
 from intrasplat.splat.model import BAND_PIXELS, bands_of
 from intrasplat.splat.step import camera_vector
 from tests.intrasplat.splat.scenes import random_scene
@@ -83,7 +83,7 @@ def test_buffers_are_used_again_and_those_of_few_sizes_are_kept() -> None:
     second = model.projected(camera_vector(camera), 0.5)
     assert model.rasterizer is buffers
     second.close()
-    for width in range(20, 20 + 2 * SIZES_KEPT):
+    for width in range(20, 20 + 2 * MAX_CACHED_SIZES):
         model.projected(camera_vector(resized(camera, width, 16)), 0.5).close()
     model.projected(camera_vector(camera), 0.5).close()
     assert model.rasterizer is not buffers

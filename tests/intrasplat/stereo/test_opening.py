@@ -73,7 +73,7 @@ def test_frames_that_show_nothing_new_get_no_depth_and_change_no_bit_of_the_othe
 def test_of_a_long_clip_with_depth_frames_are_left_out_unless_all_are_asked_for(
     use_frames: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("intrasplat.clip.sampling.KEPT_FRAMES", 4)
+    monkeypatch.setattr("intrasplat.clip.sampling.MIN_USED_FRAMES", 4)
     write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=12, motion="still", tools=())), tmp_path)
     options = ReconstructionOptions.model_validate({"use_frames": use_frames, "mask_polarity": "tool"})
     clip = open_with_depth(ClipPaths(tmp_path), options, Hooks(), Timings())

@@ -211,7 +211,7 @@ def whole(pairs: list[Pair]) -> DepthClip:
 def test_frames_that_are_left_out_are_not_matched_and_the_others_have_the_same_depth(
     pairs: list[Pair], whole: DepthClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("intrasplat.clip.sampling.KEPT_FRAMES", 2)
+    monkeypatch.setattr("intrasplat.clip.sampling.MIN_USED_FRAMES", 2)
     sampled = estimate_depth(clip_of(pairs), skip_redundant=True, device="cuda")
     assert (whole.skipped, sampled.skipped) == ((), (1, 3))
     assert np.array_equal(sampled.depth_mm[::2], whole.depth_mm[::2])

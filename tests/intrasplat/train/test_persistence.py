@@ -12,7 +12,7 @@ import pytest
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.machine.hooks import Progress
 from intrasplat.methods.registry import PRESETS
-from intrasplat.names import KEPT, PREPARED
+from intrasplat.names import PREPARED, RESUME_STATE
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import make
 from intrasplat.scene.checkpoint import load_scene
@@ -128,9 +128,9 @@ def test_what_is_kept_stays_until_its_owner_removes_it_and_an_own_folder_is_left
     clip: Path, tmp_path: Path
 ) -> None:
     make(request_of(clip), tmp_path / "scene", TrainingHooks(), tmp_path / "kept")
-    assert {path.name for path in (tmp_path / "kept").iterdir()} == set(KEPT)
+    assert {path.name for path in (tmp_path / "kept").iterdir()} == set(RESUME_STATE)
     make(request_of(clip), tmp_path / "own", TrainingHooks())
-    assert not set(KEPT) & {path.name for path in (tmp_path / "own").iterdir()}
+    assert not set(RESUME_STATE) & {path.name for path in (tmp_path / "own").iterdir()}
     assert bits(tmp_path / "own") == bits(tmp_path / "scene")
 
 
@@ -181,4 +181,4 @@ def test_an_error_leaves_what_an_earlier_run_has_kept(clip: Path, tmp_path: Path
 def test_a_stop_before_training_leaves_nothing_but_what_goes_on(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         make(request_of(clip), tmp_path, TrainingHooks(should_stop=lambda: True))
-    assert {path.name for path in tmp_path.iterdir()} <= set(KEPT)
+    assert {path.name for path in tmp_path.iterdir()} <= set(RESUME_STATE)

@@ -16,7 +16,7 @@ from intrasplat.errors import InputError, SceneError
 from intrasplat.picture import RecordedMasks
 from intrasplat.report import Masks
 from intrasplat.scene.recorded_file import MAX_FRAME_BYTES
-from intrasplat.view.recorded import EYES, MARK, MAX_KEPT, MAX_WIDTH, kept_frames, live_frame, stored_frame
+from intrasplat.view.recorded import EYES, MARK, MAX_MOMENTS, MAX_WIDTH, kept_frames, live_frame, stored_frame
 
 FRAMES = 40
 
@@ -114,11 +114,11 @@ def test_a_mask_is_white_on_instruments_and_of_its_own_eye(tmp_path: Path) -> No
 
 
 def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Path) -> None:
-    count = 3 * MAX_KEPT
+    count = 3 * MAX_MOMENTS
     long = clip(frames=count, width=16, height=12, masks=Masks(source="given", share=0.33))
     content, told = kept_frames(long, EYES[:1])
     assert kept_frames(long, EYES[:1]) == (content, told)
-    assert len(told.frames) == MAX_KEPT
+    assert len(told.frames) == MAX_MOMENTS
     assert (told.frames[0], told.frames[-1]) == (0, count - 1)
     assert max(np.diff(told.frames)) <= 4
     assert (told.eyes, told.width, told.height, told.masks, told.size_bytes) == (("left",), 16, 12, True, len(content))
