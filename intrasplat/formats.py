@@ -33,11 +33,14 @@ class ExportOptions(BaseModel):
         description="the moment: 0 is the first frame, 1 the end of the clip (default: 0)",
     )
     every: int | None = Field(
-        default=None, ge=1, le=1000, description="of formats over time: one of so many frames (default: 1, all)"
+        default=None,
+        ge=1,
+        le=1000,
+        description="for formats over time: export one of so many frames (default: 1, all)",
     )
     view: VideoView | None = Field(
         default=None,
-        description="of a video: endoscope: as it saw the clip; orbit: circling about it, about one moment if t is "
+        description="for a video: endoscope: as it saw the clip; orbit: circling about it, about one moment if t is "
         "given; stereo: both eyes side by side (default: endoscope)",
     )
     baseline_mm: float | None = Field(

@@ -70,7 +70,7 @@ class MeasuredDistance(BaseModel):
     t: tuple[float, ...] = Field(description="times of the frames")
     time_s: tuple[float, ...] = Field(description="seconds of the frames, from the first one")
     distances_mm: tuple[float | None, ...] = Field(description="at every frame")
-    uncertainties_mm: tuple[float | None, ...] = Field(description="of distances_mm")
+    uncertainties_mm: tuple[float | None, ...] = Field(description="those of distances_mm")
     first_mm: tuple[Place, ...] = Field(description="where the first point is in the world at every frame")
     second_mm: tuple[Place, ...] = Field(description="where the second point is in the world at every frame")
 
@@ -83,12 +83,12 @@ class Measurement(BaseModel):
     t: float = Field(description="the time that is shown")
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = Field(
-        default=None, description="of two points; null of other numbers of points, and where one is refused"
+        default=None, description="the distance of two points; null for one point, and where a point is refused"
     )
     depth_range_mm: Ends = Field(
         description="depths of the brightest and the darkest false colour of layer=depth from this pose"
     )
-    warnings: tuple[Notice, ...] = Field(description="why the scene is in doubt; every view repeats them")
+    warnings: tuple[Notice, ...] = Field(description="reasons not to rely on the scene; every view repeats them")
     notice: str = RESEARCH_ONLY
 
 

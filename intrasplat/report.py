@@ -71,12 +71,14 @@ class RightEye(BaseModel):
     )
     offset: tuple[float, ...] = Field(min_length=3, max_length=3, description="in levels of 255")
     colour_correlation: float | None = Field(
-        ge=-1.001, le=1.001, description="of the eyes where they match, the least of channels; None: too little matches"
+        ge=-1.001,
+        le=1.001,
+        description="that of the eyes' matching pixels, worst channel; None: too few match",
     )
 
 
 class Masks(BaseModel):
-    """How instruments were told from tissue."""
+    """How instruments were distinguished from tissue."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -84,12 +86,12 @@ class Masks(BaseModel):
         description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
         "pixel counts as tissue"
     )
-    share: float = Field(default=0.0, ge=0, le=1, description="of the left eye's pixels that are no tissue")
+    share: float = Field(default=0.0, ge=0, le=1, description="share of the left eye's pixels that are no tissue")
     sure: float | None = Field(
         default=None,
         ge=0,
         le=1,
-        description="how clearly instruments were told from tissue, where masks were found; None: they were not",
+        description="how clearly found instruments were distinguished from tissue; None: no masks were found",
     )
 
     @property
@@ -112,7 +114,7 @@ class CameraPoses(BaseModel):
         default=None, ge=0, description="length of the path; None: it was not estimated, or the camera is fixed"
     )
     extent_mm: float | None = Field(default=None, ge=0, description="largest distance between two frames' cameras")
-    extent_deg: float | None = Field(default=None, ge=0, description="largest turn between two frames' cameras")
+    extent_deg: float | None = Field(default=None, ge=0, description="largest rotation between two frames' cameras")
     steadied_mm: float | None = Field(
         default=None,
         ge=0,
@@ -121,14 +123,14 @@ class CameraPoses(BaseModel):
     sigma_mm: float | None = Field(
         default=None, ge=0, description="standard deviation that is expected of the path, laid on the true one"
     )
-    sigma_deg: float | None = Field(default=None, ge=0, description="the same of the turn")
+    sigma_deg: float | None = Field(default=None, ge=0, description="the same of the rotation")
     rigid_fit_mm: float | None = Field(
         default=None, ge=0, description="median distance at the tissue by which matches miss what the path predicts"
     )
     tissue_mm: float | None = Field(
         default=None, ge=0, description="root mean square of the common motion that was taken to be the tissue's"
     )
-    tissue_period_s: float | None = Field(default=None, ge=0, description="of that motion, if it has one")
+    tissue_period_s: float | None = Field(default=None, ge=0, description="period of that motion, if it has one")
     unsure_frames: tuple[int, ...] = Field(default=(), description="frames whose pose is not to be relied on")
 
 
@@ -138,9 +140,9 @@ class Recorded(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     frames: tuple[int, ...] = Field(min_length=1, description="the clip's frames that are kept, rising")
-    eyes: tuple[Eye, ...] = Field(min_length=1, description="of which they are kept")
-    width: int = Field(gt=0, description="of a picture, in pixels")
-    height: int = Field(gt=0, description="the same")
+    eyes: tuple[Eye, ...] = Field(min_length=1, description="the eyes whose frames are kept")
+    width: int = Field(gt=0, description="width of a picture in pixels")
+    height: int = Field(gt=0, description="height of a picture in pixels")
     masks: bool = Field(description="whether masks are kept with them; False: every pixel counts as tissue")
     size_bytes: int = Field(ge=0, description="what they take on the disk")
 
@@ -153,7 +155,7 @@ class Imported(BaseModel):
     scene_id: str | None = Field(
         default=None, pattern=JOB_ID_PATTERN, description="its id there; None: it was exported from a folder"
     )
-    version: VersionText = Field(description="of the intrasplat that exported it")
+    version: VersionText = Field(description="version of intrasplat that exported it")
     exported_at_s: float = Field(ge=0, description="when it was exported, UNIX s, by the clock there")
     imported_at_s: float = Field(ge=0, description="when it was imported, UNIX s")
 
@@ -202,8 +204,8 @@ class Report(BaseModel):
     right_eye: RightEye | None = Field(
         default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
     )
-    masks: Masks | None = Field(default=None, description="of instruments; None: a report of version 0.2")
-    poses: CameraPoses | None = Field(default=None, description="of the endoscope; None: a report of version 0.2")
+    masks: Masks | None = Field(default=None, description="how instruments were masked; None: a report of version 0.2")
+    poses: CameraPoses | None = Field(default=None, description="the endoscope's path; None: a report of version 0.2")
     recorded: Recorded | None = Field(
         default=None, description="recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"
     )

@@ -69,7 +69,7 @@ class SceneSearch(BaseModel):
     )
     limit: int = Field(default=MAX_LISTED, ge=1, le=MAX_LISTED, description="maximum number of entries")
     cursor: str | None = Field(
-        default=None, max_length=200, description=f"of the page before: its header {NEXT_HEADER}"
+        default=None, max_length=200, description=f"where the page starts: the header {NEXT_HEADER} of the page before"
     )
 
 

@@ -25,8 +25,8 @@ class MeasureQuery(ViewQuery):
 
     points: str = Field(
         max_length=1000,
-        description=f"1 to {MAX_POINTS} points x,y;x,y in pixels from the picture's upper left; of two the distance "
-        "is told, too",
+        description=f"1 to {MAX_POINTS} points x,y;x,y in pixels from the picture's upper left; for two points "
+        "the answer has their distance, too",
         examples=["320,256", "300,200;360.5,240"],
     )
 

@@ -71,7 +71,7 @@ Result = TypeVar("Result")
 ModelTime = Annotated[
     float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
 ]
-Pixels = Annotated[int | None, Field(ge=8, le=8192, description="of the image, in pixels; default: the clip's")]
+Pixels = Annotated[int | None, Field(ge=8, le=8192, description="size of the image in pixels; default: the clip's")]
 FocalLength = Annotated[
     float | None,
     Field(gt=0, le=1e5, allow_inf_nan=False, description="focal length, in pixels; default: the clip's"),

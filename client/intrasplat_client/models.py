@@ -178,19 +178,19 @@ class CameraPoses(Model):
     extent_mm: float | None = None
     """largest distance between two frames' cameras"""
     extent_deg: float | None = None
-    """largest turn between two frames' cameras"""
+    """largest rotation between two frames' cameras"""
     steadied_mm: float | None = None
     """how far given poses jumped at the tissue before they were steadied; None: they were not"""
     sigma_mm: float | None = None
     """standard deviation that is expected of the path, laid on the true one"""
     sigma_deg: float | None = None
-    """the same of the turn"""
+    """the same of the rotation"""
     rigid_fit_mm: float | None = None
     """median distance at the tissue by which matches miss what the path predicts"""
     tissue_mm: float | None = None
     """root mean square of the common motion that was taken to be the tissue's"""
     tissue_period_s: float | None = None
-    """of that motion, if it has one"""
+    """period of that motion, if it has one"""
     unsure_frames: tuple[int, ...] = ()
     """frames whose pose is not to be relied on"""
 
@@ -222,7 +222,7 @@ class Delivery(Model):
     forgiven_tries: int = 0
     """how many of them no longer count, because a caller had the webhook sent again since"""
     next_try_at_s: float | None = None
-    """when it is tried next, UNIX s; None: of one that is owed, a try is under way"""
+    """time of the next try, UNIX s; None: a try is in progress, or there is none to come"""
 
 
 class DeliveryTry(Model):
@@ -260,7 +260,7 @@ class Imported(Model):
     scene_id: str | None = None
     """its id there; None: it was exported from a folder"""
     version: str
-    """of the intrasplat that exported it"""
+    """version of intrasplat that exported it"""
     exported_at_s: float
     """when it was exported, UNIX s, by the clock there"""
     imported_at_s: float
@@ -355,16 +355,16 @@ class JobView(Model):
 
 
 class Masks(Model):
-    """How instruments were told from tissue."""
+    """How instruments were distinguished from tissue."""
 
     source: str
     """given with the clip; found by colour and depth; by this installation's segmenter; none: every pixel counts
     as tissue
     """
     share: float = 0.0
-    """of the left eye's pixels that are no tissue"""
+    """share of the left eye's pixels that are no tissue"""
     sure: float | None = None
-    """how clearly instruments were told from tissue, where masks were found; None: they were not"""
+    """how clearly found instruments were distinguished from tissue; None: no masks were found"""
 
 
 class MeasuredDistance(Model):
@@ -384,7 +384,7 @@ class MeasuredDistance(Model):
     distances_mm: tuple[float | None, ...]
     """at every frame"""
     uncertainties_mm: tuple[float | None, ...]
-    """of distances_mm"""
+    """those of distances_mm"""
     first_mm: tuple[tuple[float, ...], ...]
     """where the first point is in the world at every frame"""
     second_mm: tuple[tuple[float, ...], ...]
@@ -418,11 +418,11 @@ class Measurement(Model):
     """the time that is shown"""
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = None
-    """of two points; null of other numbers of points, and where one is refused"""
+    """the distance of two points; null for one point, and where a point is refused"""
     depth_range_mm: tuple[float, ...]
     """depths of the brightest and the darkest false colour of layer=depth from this pose"""
     warnings: tuple[Notice, ...]
-    """why the scene is in doubt; every view repeats them"""
+    """reasons not to rely on the scene; every view repeats them"""
     notice: str = "Research use only. Not a medical device; it must not guide treatment."
 
 
@@ -440,11 +440,11 @@ class Recorded(Model):
     frames: tuple[int, ...]
     """the clip's frames that are kept, rising"""
     eyes: tuple[str, ...]
-    """of which they are kept"""
+    """the eyes whose frames are kept"""
     width: int
-    """of a picture, in pixels"""
+    """width of a picture in pixels"""
     height: int
-    """the same"""
+    """height of a picture in pixels"""
     masks: bool
     """whether masks are kept with them; False: every pixel counts as tissue"""
     size_bytes: int
@@ -509,9 +509,9 @@ class Report(Model):
     right_eye: RightEye | None = None
     """how it was registered; None for a clip of one eye, or whose depth was given"""
     masks: Masks | None = None
-    """of instruments; None: a report of version 0.2"""
+    """how instruments were masked; None: a report of version 0.2"""
     poses: CameraPoses | None = None
-    """of the endoscope; None: a report of version 0.2"""
+    """the endoscope's path; None: a report of version 0.2"""
     recorded: Recorded | None = None
     """recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"""
     measurements: dict[str, float] = Field(default={})
@@ -581,7 +581,7 @@ class RightEye(Model):
     offset: tuple[float, ...]
     """in levels of 255"""
     colour_correlation: float | None
-    """of the eyes where they match, the least of channels; None: too little matches"""
+    """that of the eyes' matching pixels, worst channel; None: too few match"""
 
 
 class SceneCameras(Model):
@@ -589,7 +589,7 @@ class SceneCameras(Model):
 
     intrinsics: ClipCamera
     frame_times_s: tuple[float, ...]
-    """of the T frames, from the first one"""
+    """times of the T frames, from the first one"""
     world_from_camera: tuple[tuple[tuple[float, ...], ...], ...]
     """the endoscope's poses: T row-major 4x4, mm"""
     trained_t: tuple[float, ...]

@@ -35,7 +35,7 @@ class SceneCameras(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     intrinsics: ClipCamera
-    frame_times_s: tuple[float, ...] = Field(description="of the T frames, from the first one")
+    frame_times_s: tuple[float, ...] = Field(description="times of the T frames, from the first one")
     world_from_camera: tuple[Rows, ...] = Field(description="the endoscope's poses: T row-major 4x4, mm")
     trained_t: tuple[float, ...] = Field(description="times of the K frames that taught the scene, i / T")
     units_per_mm: float = Field(gt=0, description="60 / the median depth in mm")

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pydantic import BaseModel, ConfigDict, Field
 
 HEAD_BYTES = 32
-"""Of a file, at most."""
+"""How many bytes from a file's start a check may send."""
 MAX_TEXT_CHARACTERS = 250_000
 
 

@@ -176,23 +176,23 @@ class WorkerReply(BaseModel):
     """Share of a render's pixels that no training frame saw, in [0, 1]."""
     render_ms: float = 0.0
     gaussians: int = 0
-    """Of the scene that is shown; 0: not known."""
+    """Number of Gaussians of the scene that is shown; 0: not known."""
     clip_size: tuple[int, int] | None = None
     """Width and height of the clip in pixels: the image's where the request names none."""
     camera: PictureCamera | None = None
-    """Of a render."""
+    """The camera of a render; None for other answers."""
     more: bool = False
     """More parts of the export follow."""
     depth_range_mm: tuple[float, float] | None = None
-    """Of depth in false colours: the depths of the brightest and the darkest colour, the same throughout the clip."""
+    """The depths of the brightest and the darkest colour, for depth in false colours; the same throughout the clip."""
 
 
 TYPICAL_GAUSSIANS, TYPICAL_SIZE = 50_000, (640, 512)
-"""What a scene is taken to have of which nothing is known yet."""
+"""Assumed number of Gaussians and picture size of a scene about which nothing is known yet."""
 
 
 def render_cost(pixels: int, gaussians: int) -> float:
-    """What a render takes, in pixels x Gaussians. Work on each Gaussian counts as GAUSSIAN_PIXELS more pixels."""
+    """The cost of a render, in pixels x Gaussians. Work on each Gaussian counts as GAUSSIAN_PIXELS more pixels."""
     return float(pixels + GAUSSIAN_PIXELS) * gaussians
 
 

@@ -77,7 +77,7 @@ class Delivery(BaseModel):
         default=0, description="how many of them no longer count, because a caller had the webhook sent again since"
     )
     next_try_at_s: float | None = Field(
-        default=None, description="when it is tried next, UNIX s; None: of one that is owed, a try is under way"
+        default=None, description="time of the next try, UNIX s; None: a try is in progress, or there is none to come"
     )
 
     @property

@@ -31,7 +31,8 @@ MAX_BRIGHTNESS_DRIFT = 0.25
 ANALYSED_WIDTH = 640
 """Larger pictures are shrunk to this width first: those of 4K endoscopes are soft at the pixel scale even in focus."""
 DARK_PERCENTILE, MAX_DARK_LEVEL = 5.0, 85.0
-"""Of each pixel's weakest colour (of 255): at most 68 in clean clips, and 90 behind a veil that takes a quarter."""
+"""A percentile of each pixel's weakest colour, and its limit of 255: clean clips have at most 68; a veil that takes a
+quarter of the contrast gives 90."""
 FOCUS_SIGMAS_PX = (1.0, 2.0)
 MIN_FINE_DETAIL = 0.62
 """Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
