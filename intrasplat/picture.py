@@ -37,7 +37,7 @@ class Unseen(StrEnum):
 
 
 class Highlights(StrEnum):
-    """Whether a render's colours show the highlights that both eyes of a stereo clip told apart."""
+    """Whether a render's colours show the highlights that were separated by comparing both eyes of a stereo clip."""
 
     ON = "on"
     OFF = "off"

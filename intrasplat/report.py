@@ -73,7 +73,7 @@ class RightEye(BaseModel):
     colour_correlation: float | None = Field(
         ge=-1.001,
         le=1.001,
-        description="that of the eyes' matching pixels, worst channel; None: too few match",
+        description="correlation of the eyes' colours at matches, in the worst channel; None: too few matches",
     )
 
 

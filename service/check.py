@@ -64,7 +64,7 @@ class Findings(BaseModel):
     },
 )
 async def check_clip(request: Request, services: Services, caller: AnyCaller) -> Findings:
-    """What speaks against a clip, told before it is sent. Send what its files are, and the calibration's text."""
+    """The problems of a clip, found before it is sent. Send a description of its files, and the calibration's text."""
     caller.require(KeyScope.RECONSTRUCT)
     described = await read_json(request, services, DescribedClip, MAX_BODY_BYTES, REMEDY)
     return Findings(findings=await run_in_threadpool(lambda: list(_findings(services, caller, described))))

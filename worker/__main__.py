@@ -40,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     consume.add_argument(
         "--renders-only", action="store_true", help="claim no jobs, only answer renders of finished scenes"
     )
-    add_command(commands, "device", "what consume starts for itself: train and render as it is told on stdin", _device)
+    add_command(commands, "device", "started by consume: train and render on orders from stdin", _device)
     return parser
 
 

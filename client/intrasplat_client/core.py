@@ -201,8 +201,8 @@ class Core:
         layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
         unseen: mark (the default) hatches what no training frame saw, and makes it transparent in png and webp; guess
             shows what the model draws there.
-        highlights: off shows rgb without the highlights that both eyes of a stereo clip told apart; a scene of one eye
-            knows none and is shown as it is. on is the default.
+        highlights: off shows rgb without the highlights that were separated by comparing both eyes of a stereo clip; a
+            scene of one eye has none and is shown as it is. on is the default.
         known: an earlier view; it is returned if it is still what the service would send.
         camera: width, height, fx, fy, cx, cy in pixels.
         """

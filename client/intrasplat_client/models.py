@@ -581,7 +581,7 @@ class RightEye(Model):
     offset: tuple[float, ...]
     """in levels of 255"""
     colour_correlation: float | None
-    """that of the eyes' matching pixels, worst channel; None: too few match"""
+    """correlation of the eyes' colours at matches, in the worst channel; None: too few matches"""
 
 
 class SceneCameras(Model):

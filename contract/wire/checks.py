@@ -33,7 +33,7 @@ class Finding(BaseModel):
 
     Attributes:
         field: the file or option at fault, such as calibration or options.budget_s.
-        refused: POST /reconstruct would refuse it. Otherwise the job may fail, or the caller's numbers are in doubt.
+        refused: POST /reconstruct would refuse it. Otherwise the job may fail, or the caller's numbers may be wrong.
         problem: what is wrong, in words.
         remedy: what to do.
     """

@@ -1,4 +1,4 @@
-"""Webhooks: what a caller is told when its job has ended, and the log of how that went.
+"""Webhooks: the message that a caller gets when its job has ended, and the log of its delivery.
 
 The body and its headers follow Standard Webhooks (standardwebhooks.com). It names the job and nothing of its content:
 whoever receives it asks for the rest with a key.

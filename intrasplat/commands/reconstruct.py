@@ -167,7 +167,7 @@ def _print_report(report: Report, out: Path) -> None:
             print(notice.text)
     if report.masks is not None and report.masks.sure is not None:
         masks = report.masks
-        print(f"instruments: in {masks.share:.1%} of the picture; {masks.sure:.0%} of what may be one told clearly")
+        print(f"instruments: in {masks.share:.1%} of the picture; {masks.sure:.0%} of what may be one is clear")
     if (kept := report.recorded) is not None:
         eyes = " and ".join(kept.eyes)
         print(f"recorded: {len(kept.frames)} frames ({eyes} eye) kept with the scene, {kept.size_bytes / 1e6:.1f} MB")

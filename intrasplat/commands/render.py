@@ -57,8 +57,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--highlights",
         choices=[each.value for each in Highlights],
         default=Highlights.ON.value,
-        help="off: colours without the highlights that both eyes of a stereo clip told apart; a scene of one eye knows "
-        "none and is shown as it is (default: on)",
+        help="off: colours without the highlights that were separated by comparing both eyes of a stereo clip; a "
+        "scene of one eye has none and is shown as it is (default: on)",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="a .png, .jpg or .npy file; with --frames a folder"

@@ -319,7 +319,7 @@ def test_parameters_may_be_written_between_two_steps(device: str) -> None:
 def test_more_frames_than_there_was_room_for_and_frames_of_another_size(
     three_steps: dict[str, Tensor], device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("intrasplat.splat.cuda.frames.FIRST_ROOM", 1)
+    monkeypatch.setattr("intrasplat.splat.cuda.frames.FIRST_CAPACITY", 1)
     crowded = model(device)
     train(crowded, frames())
     assert_same_bits(stored(crowded), three_steps)
