@@ -239,16 +239,16 @@ def _only(services: Deps, caller: Caller) -> Shown:
 
 async def unless_gone(http_request: Request, work: Coroutine[Any, Any, Result]) -> Result | None:
     """The result of the work. If the caller disconnects first, cancel the work and return None."""
-    done, left = asyncio.create_task(work), asyncio.create_task(_left(http_request))
+    done, disconnected = asyncio.create_task(work), asyncio.create_task(_disconnected(http_request))
     try:
-        await asyncio.wait({done, left}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({done, disconnected}, return_when=asyncio.FIRST_COMPLETED)
         return done.result() if done.done() else None
     finally:
-        for task in (done, left):
+        for task in (done, disconnected):
             task.cancel()
 
 
-async def _left(http_request: Request) -> None:
+async def _disconnected(http_request: Request) -> None:
     """Return when the caller has disconnected."""
     while (await http_request.receive())["type"] != "http.disconnect":
         pass

@@ -90,7 +90,7 @@ class Sweep:
             elif record.state is JobState.CANCELLED:  # service or worker died before it removed the clip
                 self._store.purge(job_id)
             elif record.state is JobState.DONE:  # its worker died before it removed its work
-                if self._store.has_left_work(job_id):
+                if self._store.has_unfinished_work(job_id):
                     self._store.remove_other_attempts(job_id, record.attempt)
             elif record.state is JobState.FAILED:  # its last worker died before it removed its work
                 self._store.remove_failed(job_id, record.attempt)

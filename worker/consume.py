@@ -34,7 +34,7 @@ from worker.heartbeat import Heartbeat
 from worker.job_errors import describe
 from worker.job_spans import StageSpans, attempt_span
 from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
-from worker.scores import AwaitedScores, LeftScores
+from worker.scores import AwaitedScores, InterruptedScores
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""
@@ -83,7 +83,7 @@ class Consumer:
         self._name = name
         self._owner = owner
         self._end = end
-        self._left = LeftScores(queue, store, name, end)
+        self._interrupted_scores = InterruptedScores(queue, store, name, end)
         self.claim_file = ClaimFile(store.run_dir / f"{name}.claim")
         self.job_id: str | None = None
 
@@ -120,7 +120,7 @@ class Consumer:
                     # Also while a job waits: scoring the scene later takes several times as long.
                     scores.take(child, stop=self._end.is_set)
             else:
-                self._left.make_up(child)
+                self._interrupted_scores.make_up(child)
 
 
 def run_job(
@@ -158,7 +158,7 @@ def run_job(
     if outcome == DONE:
         return scores
     if outcome != UNSETTLED:  # if unsettled, the queue may still have accepted the end
-        with contextlib.suppress(UnavailableError):  # if this fails, LeftScores removes it
+        with contextlib.suppress(UnavailableError):  # if this fails, InterruptedScores removes it
             store.expect_no_scores(name, claim.job_id, claim.attempt)
     scores.take(child, stop=lambda: True)
     return None

@@ -85,7 +85,7 @@ class AwaitedScores:
         return True
 
 
-class LeftScores:
+class InterruptedScores:
     """Scores scenes whose scoring a death or the end of this worker interrupted. name: the worker's name."""
 
     def __init__(self, queue: Queue, store: Store, name: str, end: threading.Event) -> None:

@@ -325,7 +325,7 @@ class Store:
                 if entry.attempt is not None and entry.attempt <= attempt:
                     self._shelf.remove(area, job_id, entry.attempt)
 
-    def has_left_work(self, job_id: str) -> bool:
+    def has_unfinished_work(self, job_id: str) -> bool:
         """Whether this machine has work on the job, or a state from which an attempt could resume."""
         return any(self._here.folders(area, job_id) for area in (Area.WORK, Area.KEPT))
 

@@ -32,7 +32,7 @@ MIN_FRAMES_A_BASIS = 2
 """Each basis has more training frames than this. With fewer, the model overfits: held-out frames get worse."""
 USUAL_BASES, LONG_FRAMES_A_BASIS = 33, 4
 """Beyond USUAL_BASES, each basis needs this many training frames: a model's memory grows with its bases."""
-MAX_MOTION_LEFT = 0.5
+MAX_UNEXPLAINED_MOTION = 0.5
 """No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
 MIN_GAIN_DB = 0.25
 """More bases, or more points, must lower the expected error of the picture by more than this."""
@@ -119,7 +119,7 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
     is the number of training frames.
 
     If no number follows the motion, the largest number tried is chosen: even the best leaves a motion error above the
-    floor and above MAX_MOTION_LEFT of what the smallest number leaves. Changes of illumination do not count here,
+    floor and above MAX_UNEXPLAINED_MOTION of what the smallest number leaves. Changes of illumination do not count,
     because more bases do not model a flickering lamp. Without trials, one basis for every FRAMES_A_BASIS frames.
     """
     errors = trials.tracked
@@ -131,7 +131,7 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
     smallest, limit = min(errors), _bases_limit(frames, max_bases)
     if len(errors) == 1:
         return BasisChoice(smallest, limit.reason)
-    if min(each.motion for each in errors.values()) > max(floor, MAX_MOTION_LEFT * errors[smallest].motion):
+    if min(each.motion for each in errors.values()) > max(floor, MAX_UNEXPLAINED_MOTION * errors[smallest].motion):
         return BasisChoice(
             max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames"
         )

@@ -23,7 +23,7 @@ SAMPLED_FRAMES = 32
 """Number of trained frames, evenly spread, that are checked for the Gaussians in view."""
 FADES_IN_S = 0.4
 """Time constant out of view: by then trust has lost 1 - 1/e of what it can lose."""
-LEFT_TRUST = 0.4
+REMAINING_TRUST = 0.4
 """Share of the trust that remains after a long time out of view."""
 
 
@@ -59,8 +59,8 @@ class OutOfView:
         interval = int(np.searchsorted(self.seen_s, time_s))
         away_s = np.minimum(time_s - self.before[interval], self.after[interval] - time_s)
         away_s -= self._gap_s(interval)
-        kept = LEFT_TRUST + (1 - LEFT_TRUST) * np.exp(-np.maximum(away_s, 0) / np.float32(FADES_IN_S))
-        return np.where(values > 0, values * kept, values).astype(np.float32)
+        remaining = REMAINING_TRUST + (1 - REMAINING_TRUST) * np.exp(-np.maximum(away_s, 0) / np.float32(FADES_IN_S))
+        return np.where(values > 0, values * remaining, values).astype(np.float32)
 
     def _gap_s(self, interval: int) -> float:
         """The length of an interval: a Gaussian in view at either end was not out of view for longer."""

@@ -21,7 +21,7 @@ from tests.worker.standin import REPORT
 from worker import scores
 from worker.child import DeviceChild, JobReport
 from worker.orders import DeviceOrder, Scored, ScoreScene, StopJob, Stopped
-from worker.scores import LeftScores
+from worker.scores import InterruptedScores
 
 
 class Child:
@@ -60,7 +60,7 @@ class Unscored(Jobs):
 
     def __init__(self, data_dir: Path) -> None:
         super().__init__(Queue(), Store(data_dir))
-        self.left = LeftScores(self.queue, self.store, "worker-1", threading.Event())
+        self.left = InterruptedScores(self.queue, self.store, "worker-1", threading.Event())
 
     def published(self) -> str:
         job_id = self.submit("publish")

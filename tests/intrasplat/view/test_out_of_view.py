@@ -10,7 +10,7 @@ import torch
 
 from intrasplat.scene.model import model_of
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.view.out_of_view import FADES_IN_S, LEFT_TRUST, OutOfView
+from intrasplat.view.out_of_view import FADES_IN_S, REMAINING_TRUST, OutOfView
 from intrasplat.view.render import render_frame
 from tests.intrasplat.scenes import random_scene
 
@@ -50,7 +50,7 @@ def test_trust_falls_with_the_time_out_of_view_and_to_a_rest() -> None:
     np.testing.assert_allclose(trust[: FRAMES // 2, 0], 0.8, rtol=1e-6)
     later = trust[FRAMES // 2 :, 0]
     assert (np.diff(later) < 0).all()
-    assert later[-1] == pytest.approx(0.8 * LEFT_TRUST, rel=0.05)
+    assert later[-1] == pytest.approx(0.8 * REMAINING_TRUST, rel=0.05)
     assert (trust[:, 1] == values[1]).all(), "what was never seen stays so"
 
 
