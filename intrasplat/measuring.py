@@ -83,7 +83,8 @@ class Measurement(BaseModel):
     t: float = Field(description="the time that is shown")
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = Field(
-        default=None, description="the distance of two points; null for one point, and where a point is refused"
+        default=None,
+        description="the distance of two points; null for any other number of points, and where a point is refused",
     )
     depth_range_mm: Ends = Field(
         description="depths of the brightest and the darkest false colour of layer=depth from this pose"

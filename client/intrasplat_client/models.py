@@ -418,7 +418,7 @@ class Measurement(Model):
     """the time that is shown"""
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = None
-    """the distance of two points; null for one point, and where a point is refused"""
+    """the distance of two points; null for any other number of points, and where a point is refused"""
     depth_range_mm: tuple[float, ...]
     """depths of the brightest and the darkest false colour of layer=depth from this pose"""
     warnings: tuple[Notice, ...]
