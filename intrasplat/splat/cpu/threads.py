@@ -21,6 +21,7 @@ from typing import TypeVar
 import torch
 
 from intrasplat.errors import InputError
+from intrasplat.machine.cores import cores
 from intrasplat.machine.parts import Parts
 
 THREADS_VARIABLE = "INTRASPLAT_THREADS"
@@ -34,10 +35,6 @@ _own = threading.local()
 """Per calling thread: elsewhere_s, the CPU seconds that its kernels used on other threads; is_alone, see alone()."""
 
 
-def _available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @cache
 def thread_count() -> int:
     """Threads a kernel is split over, for the whole life of this process: INTRASPLAT_THREADS, or the cores it may use.
@@ -47,7 +44,7 @@ def thread_count() -> int:
     """
     given = os.environ.get(THREADS_VARIABLE)
     if not given:
-        return _available_cores()
+        return cores()
     if not given.isdecimal() or int(given) == 0:
         remedy = "Set it to a whole number above 0, or leave it unset to use every core."
         raise InputError(THREADS_VARIABLE, f"{given!r} is no number of threads.", remedy)
