@@ -32,7 +32,7 @@ from intrasplat.pipeline import reconstruct as run_pipeline
 from intrasplat.pose import MatrixPose, OrbitPose, parse_pose
 from intrasplat.recording import Clip, FilePath
 from intrasplat.report import Report
-from intrasplat.scene.checkpoint import load_scene
+from intrasplat.scene.checkpoint import check_is_scene, load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import installed_dashboard, stored_parts
 from intrasplat.splat.backend import choose_device
@@ -317,8 +317,7 @@ def load(folder: FilePath, *, device: str = "auto") -> Scene:
         True
     """
     path = Path(folder)
-    if not (path / MANIFEST).is_file():
-        raise InputError("folder", f"{os.fspath(folder)} holds no scene.", "Name a folder that reconstruct wrote.")
+    check_is_scene(path, "folder")
     scene = Scene(path, device)
     _ = scene.trained  # raises here if a file is damaged, not at the first render
     return scene

@@ -10,7 +10,6 @@ from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode, flag_of
 from intrasplat.errors import InputError
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
-from intrasplat.names import MANIFEST
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,10 +32,10 @@ def run_cli(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in ExportOptions.model_fields}
     try:
         check_export(options.format, given)
-        if not (options.scene / MANIFEST).is_file():
-            raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that reconstruct --out wrote.")
         from intrasplat.reconstruction import Scene
+        from intrasplat.scene.checkpoint import check_is_scene
 
+        check_is_scene(options.scene, "SCENE")
         folder = options.scene.resolve()
         path = options.out or folder.with_name(folder.name + EXPORT_FORMATS[options.format].suffix)
         print(Scene(options.scene, options.device).export(path, format=options.format, **given))

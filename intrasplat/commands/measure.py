@@ -8,9 +8,7 @@ from pathlib import Path
 from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
-from intrasplat.errors import InputError
 from intrasplat.measuring import parse_points
-from intrasplat.names import MANIFEST
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,14 +35,13 @@ def run_cli(options: argparse.Namespace) -> int:
         UnavailableError: the device is missing.
     """
     from intrasplat.pose import parse_pose
-    from intrasplat.scene.checkpoint import load_scene
+    from intrasplat.scene.checkpoint import check_is_scene, load_scene
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import pose_of
     from intrasplat.view.measured import measured
 
     points, device = parse_points(options.points), choose_device(options.device)
-    if not (options.scene / MANIFEST).is_file():
-        raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
+    check_is_scene(options.scene, "SCENE")
     scene = load_scene(options.scene)
     pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
     print(measured(scene, options.t, pose, scene.intrinsics, points, device).model_dump_json(indent=2))

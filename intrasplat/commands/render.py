@@ -12,7 +12,6 @@ from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
-from intrasplat.names import MANIFEST
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 SUFFIX_FORMATS = {
@@ -84,15 +83,14 @@ def run_cli(options: argparse.Namespace) -> int:
         UnavailableError: the device is missing.
     """
     from intrasplat.pose import parse_pose
-    from intrasplat.scene.checkpoint import load_scene
+    from intrasplat.scene.checkpoint import check_is_scene, load_scene
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
     from intrasplat.view.encode import encode_layer
     from intrasplat.view.render import render_frame, renderer_of
 
     device = choose_device(options.device)
-    if not (options.scene / MANIFEST).is_file():
-        raise InputError("SCENE", f"{options.scene} holds no scene.", "Name a folder that `reconstruct --out` wrote.")
+    check_is_scene(options.scene, "SCENE")
     scene = load_scene(options.scene)
     layer = Layer(options.layer)
     highlights = Highlights(options.highlights).shown_in(layer)

@@ -20,7 +20,7 @@ import numpy as np
 from torch import Tensor
 
 from intrasplat.camera import Intrinsics
-from intrasplat.errors import SceneError
+from intrasplat.errors import InputError, SceneError
 from intrasplat.files.durable import FOR_ALL, replace_file
 from intrasplat.names import MANIFEST, SCENE
 from intrasplat.scene.compact import unpack
@@ -80,6 +80,12 @@ def save_scene(directory: Path, scene: TrainedScene, beside: Mapping[str, bytes]
 def _listed(content: bytes) -> dict[str, Any]:
     """The manifest's entry of a file."""
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def check_is_scene(directory: Path, argument: str) -> None:
+    """Raise InputError, which names the caller's argument, if the directory contains no scene."""
+    if not (directory / MANIFEST_FILE).is_file():
+        raise InputError(argument, f"{directory} holds no scene.", "Name a folder that reconstruct wrote.")
 
 
 def load_scene(directory: Path) -> TrainedScene:
