@@ -29,12 +29,13 @@ _PARTS = ("mean", "quaternion", "scale", "opacity", "colour")
 
 @cache
 def check(memory: str, name: str) -> None:
-    """Compare both once. memory: torch's name of the device; name: the GPU's product name.
+    """Compare both once, in any grad mode. memory: torch's name of the device; name: the GPU's product name.
 
     Raises:
         UnavailableError: they differ by more than LIMIT, so nothing that this device computes can be trusted.
     """
-    with one_at_a_time:  # the first render may run while the first job starts
+    # inference_mode(False) enables gradients, also inside a caller's no_grad().
+    with torch.inference_mode(False), one_at_a_time:  # the first render may run while the first job starts
         worst, part = disagreement(torch.device(memory))
     if not worst <= LIMIT:  # so that NaN is wrong, too
         raise UnavailableError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,14 @@ def test_the_device_agrees_with_the_reference(device: str) -> None:
     worst, _ = agreement.disagreement(torch.device(device))
     assert worst < 1e-4
     agreement.check(device, "a GPU")
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_the_device_is_checked_in_a_caller_without_gradients(
+    mode: Callable[[], AbstractContextManager[None]], device: str
+) -> None:
+    with mode():
+        agreement.check(device, f"a GPU in {mode.__name__}")
 
 
 def render_brighter(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
