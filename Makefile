@@ -97,6 +97,7 @@ check: setup $(DEV_STAMP) ## style, types, the import rules and the containers' 
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@cd client && ../$(BIN)/mypy --config-file ../pyproject.toml --cache-dir ../.mypy_cache --package intrasplat_client
 	@$(BIN)/python -m pytest tests/test_layers.py tests/test_docker.py
 
 bench: setup ## every lab/benchmarks/bm_*.py, one after the other

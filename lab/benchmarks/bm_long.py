@@ -26,6 +26,7 @@ from typing import TypeAlias
 
 from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Hooks
+from intrasplat.names import PresetName
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import Made, judge, make
@@ -87,7 +88,7 @@ def _alone(path: Path, options: argparse.Namespace, parts: Sequence[range] = ())
         return pool.submit(measured, path, options.preset, options.steps_a_frame, parts).result()
 
 
-def measured(path: Path, preset: str, steps_a_frame: int, parts: Sequence[range]) -> tuple[Row, list[Score]]:
+def measured(path: Path, preset: PresetName, steps_a_frame: int, parts: Sequence[range]) -> tuple[Row, list[Score]]:
     """Reconstruct and score a clip. Returns its row, and the scores of the held-out frames in each part."""
     iterations = steps_a_frame * len(list(path.glob("*l.png")))
     memory = StageMemory()

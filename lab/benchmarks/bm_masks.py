@@ -26,6 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -119,7 +120,7 @@ def _from(*port_mm: float) -> NDArray[np.float64]:
     return np.vstack([port_mm, instrument.PORTS_MM[1:]])
 
 
-PLACES: Mapping[str, Callable[[PhantomSettings], dict[str, object]]] = {
+PLACES: Mapping[str, Callable[[PhantomSettings], dict[str, Any]]] = {
     "moving": lambda _: {"HOVER_MM": instrument.HOVER_MM},
     "rests": lambda _: {"_tip_and_opening": _at(4.0, 3.0, 3.0)},
     "lies": lambda _: {"_tip_and_opening": _at(8.0, -2.0, 1.0), "PORTS_MM": _from(110.0, 60.0, 68.0)},

@@ -60,7 +60,8 @@ def main() -> None:
     options = parser.parse_args()
     compile_kernels()
     opened = open_source(source_of(options.clip), HOLDOUT, Hooks())
-    scenes = {eyes: trained(opened, eyes, options.iterations) for eyes in ("left", "both")}
+    both: tuple[Eyes, ...] = ("left", "both")
+    scenes = {eyes: trained(opened, eyes, options.iterations) for eyes in both}
     if opened.phantom is not None:
         split = split_frames(opened.clip, HOLDOUT)
         truth = Truth(opened.phantom, opened.tissue, split.train, split.held_out, opened.tissue_right)

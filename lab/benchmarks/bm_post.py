@@ -74,7 +74,7 @@ def main() -> None:
         print(_line(_medians([row for row in rows if (row["preset"], row["way"]) == (preset, way)])))
 
 
-def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Path]]:
+def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
     """A video of both eyes, and its calibration and masks."""
     if name.startswith("phantom"):
         drawn = make_clip(folder, frames=89)
@@ -84,10 +84,10 @@ def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Path]]:
     return source.clip, {"calibration": source.files["calibration"], "masks": source.files["masks"]}
 
 
-def _sent(client: Client, clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | None) -> Row:
+def _sent(client: Client, clip: Path, files: Mapping[str, Any], preset: str, budget_s: float | None) -> Row:
     """Send the clip over HTTP to the warm worker."""
     row: Row = {"preset": preset, "budget_s": budget_s or "", "way": "http", "load_1min": round(os.getloadavg()[0], 2)}
-    chosen = {"preset": preset, **({"budget_s": budget_s} if budget_s else {})}
+    chosen: dict[str, Any] = {"preset": preset, **({"budget_s": budget_s} if budget_s else {})}
     start_s = time.perf_counter()
     job = client.reconstruct(clip, **files, **chosen)
     viewer = threading.Thread(target=_look, args=(client.url, job.id, start_s, row))
@@ -124,7 +124,7 @@ def _look(url: str, job_id: str, start_s: float, row: Row) -> None:
                 row["first_view_s"] = round(time.perf_counter() - start_s, 2)
 
 
-def _run(clip: Path, files: Mapping[str, Path], preset: str, budget_s: float | None, out: Path) -> Row:
+def _run(clip: Path, files: Mapping[str, Any], preset: str, budget_s: float | None, out: Path) -> Row:
     """Reconstruct the clip by the command line."""
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     given += ["--preset", preset, *(["--budget-s", str(budget_s)] if budget_s else [])]

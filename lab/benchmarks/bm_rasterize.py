@@ -26,6 +26,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from types import ModuleType
@@ -136,9 +137,9 @@ def measure(scene: Scene, renderers: dict[str, Render], repeats: int, origin: di
             break
         for name, render in renderers.items():
             with torch.no_grad():
-                forward_s = timed(lambda render=render: render(scene))
+                forward_s = timed(partial(render, scene))
             stand_ins_s = render.stand_ins_s if isinstance(render, GsplatTorch) else 0.0
-            both_s = timed(lambda render=render: image_and_gradients(render, scene, cotangent))
+            both_s = timed(partial(image_and_gradients, render, scene, cotangent))
             seconds[name].append((forward_s, stand_ins_s, both_s))
     print(f"  {'renderer':22} {'forward (least)':>22} {'stand-ins':>10} {'with gradients (least)':>28}  differs by")
     rows = []

@@ -30,10 +30,9 @@ from statistics import linear_regression, median
 from typing import Any
 from urllib.parse import urlsplit
 
-from bm_service import PhantomClip, make_clip
-
 from intrasplat_client import Client, Conflict, IntrasplatError
 from intrasplat_client.models import JobState
+from lab.benchmarks.bm_service import PhantomClip, make_clip
 from lab.demo import started_service
 from lab.evaluate.rows import commit, machine
 

@@ -20,6 +20,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import StereoClip
 from intrasplat.clip.calibration import RectifiedClip, rectify
 from intrasplat.fusion import CLEAR_CONFIDENCE
-from intrasplat.intake.calibration.types import RawCalibration, RawEye, parse_calibration
+from intrasplat.intake.calibration.types import RawCalibration, RawEye
 from intrasplat.stereo import estimate_depth
 from intrasplat.stereo.matching import SATURATED_LEVEL
 from lab.evaluate.rows import commit, machine, read_rows, write_rows
@@ -123,10 +124,10 @@ def synthetic(flaws: frozenset[str], seed: int) -> Judged:
     dry = make_phantom(replace(DRAWN, seed=seed, motion="cut" if "masked" in flaws else DRAWN.motion))
     albedo, film = dry.paint.albedo, dry.paint.film
     if "wet" in flaws:
-        film = film * np.float32([ROUGHNESS, ROUGHNESS, 1])
+        film = film * np.array([ROUGHNESS, ROUGHNESS, 1], np.float32)
         film[..., 2] = np.clip(film[..., 2], 0.5, 1) * WETNESS
     if "flat" in flaws:
-        film = film * np.float32([1 - FLAT_SHARE, 1 - FLAT_SHARE, 1])
+        film = film * np.array([1 - FLAT_SHARE, 1 - FLAT_SHARE, 1], np.float32)
         albedo = albedo + np.float32(FLAT_SHARE) * (albedo.mean(axis=(0, 1)) - albedo)
     drawn = replace(dry, paint=replace(dry.paint, albedo=albedo, film=film)).frame(FRAME)
     burnt_out = cv2.cvtColor(drawn.left, cv2.COLOR_RGB2GRAY) >= SATURATED_LEVEL
@@ -157,7 +158,7 @@ def _calibration(distorted: bool) -> RawCalibration:
             strict=True,
         )
     ]
-    return parse_calibration(
+    return RawCalibration.model_validate(
         {
             "model": "raw",
             "width": WIDTH,
@@ -182,21 +183,21 @@ def _recorded(drawn: Rgb, eye: RawEye, dark: bool, random: np.random.Generator) 
         None,
         (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-7),
     ).reshape(HEIGHT, WIDTH, 2)
-    at = (rays * DRAWN.intrinsics.fx + np.float32([DRAWN.width / 2 - 0.5, DRAWN.height / 2 - 0.5])).astype(np.float32)
+    centre = np.array([DRAWN.width / 2 - 0.5, DRAWN.height / 2 - 0.5], np.float32)
+    at = (rays * DRAWN.intrinsics.fx + centre).astype(np.float32)
     light = cv2.remap(drawn, at, None, cv2.INTER_CUBIC).astype(np.float32) / 255
     if dark:
         away = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) / np.hypot(WIDTH / 2, HEIGHT / 2)
         light *= np.clip((BLACK_FROM - away) / (BLACK_FROM - DARK_FROM), 0, 1)[..., None] ** 1.5
-    return np.clip(255 * add_noise(light, random) + 0.5, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(255 * add_noise(light, random) + 0.5, 0, 255), np.uint8)
 
 
 def _as_recorded(drawn: NDArray[np.generic]) -> Floats:
     """Resample a drawn picture of the left eye to a lens without distortion; nearest neighbour."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     maps = x + (DRAWN.width - WIDTH) / 2, y + (DRAWN.height - HEIGHT) / 2
-    return np.asarray(
-        cv2.remap(drawn.astype(np.float32), *(each.astype(np.float32) for each in maps), cv2.INTER_NEAREST)
-    )
+    to_x, to_y = (each.astype(np.float32) for each in maps)
+    return np.asarray(cv2.remap(drawn.astype(np.float32), to_x, to_y, cv2.INTER_NEAREST))
 
 
 def _as_rectified(drawn: NDArray[np.generic], camera: Intrinsics) -> Floats:
@@ -208,7 +209,7 @@ def _as_rectified(drawn: NDArray[np.generic], camera: Intrinsics) -> Floats:
     return np.asarray(cv2.remap(drawn.astype(np.float32), *maps, cv2.INTER_NEAREST, borderValue=0), np.float32)
 
 
-def _scores(judged: Judged, device: str) -> dict[str, str]:
+def _scores(judged: Judged, device: Literal["cpu", "cuda"]) -> dict[str, str]:
     clip, truth_px = judged.clip, judged.truth_px
     depth = estimate_depth(clip, device=device)
     depth_mm, confidence = depth.depth_mm[0], depth.depth_confidence[0]

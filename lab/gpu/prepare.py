@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +84,8 @@ def _corner(clip: DepthClip, size: int) -> DepthClip:
 
 def save_clip(path: Path, clip: DepthClip) -> None:
     """The clip's arrays; its camera goes with what is said of it."""
-    np.savez(path, **{name: np.asarray(getattr(clip, name)) for name in ARRAYS})
+    arrays: dict[str, Any] = {name: np.asarray(getattr(clip, name)) for name in ARRAYS}
+    np.savez(path, **arrays)
 
 
 def load_clip(path: Path, camera: dict[str, float]) -> DepthClip:

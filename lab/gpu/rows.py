@@ -148,14 +148,16 @@ class Stamp:
     """A moment on the device's own clock; the host's where there is no device."""
 
     def __init__(self, device: str) -> None:
-        self._event = torch.cuda.Event(enable_timing=True) if device == "cuda" else None
+        self._event = (
+            torch.cuda.Event(enable_timing=True) if device == "cuda" else None  # type: ignore[no-untyped-call]
+        )
         self._at = time.perf_counter()
         if self._event is not None:
             self._event.record()
 
     def ms_until(self, later: Stamp) -> float:
         """Milliseconds; the device has to be done with both."""
-        if self._event is None:
+        if self._event is None or later._event is None:
             return 1e3 * (later._at - self._at)
         elapsed: float = self._event.elapsed_time(later._event)
         return elapsed
