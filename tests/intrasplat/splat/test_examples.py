@@ -20,7 +20,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *ar
     return [float(each) for each in re.findall(r"PSNR ([\d.]+) dB", capsys.readouterr().out)]
 
 
-def test_it_fits_the_picture_that_it_draws(
+def test_it_fits_the_landscape(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "fit.png"
