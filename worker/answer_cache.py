@@ -13,10 +13,9 @@ MAX_CACHE_BYTES = 32 * 2**20
 
 
 class ReplyCache:
-    """The most recently used replies by request, of at most max_bytes in all."""
+    """The most recently used replies by request, of at most MAX_CACHE_BYTES in all."""
 
-    def __init__(self, max_bytes: int = MAX_CACHE_BYTES) -> None:
-        self._max_bytes = max_bytes
+    def __init__(self) -> None:
         self._bytes = 0
         self._replies: OrderedDict[RenderRequest, Reply] = OrderedDict()
 
@@ -33,10 +32,10 @@ class ReplyCache:
     def keep(self, request: RenderRequest, reply: Reply) -> None:
         """Store a reply; drop the least recently used ones to make space."""
         self.drop(lambda each: each == request)
-        if len(reply.body) <= self._max_bytes // 4:
+        if len(reply.body) <= MAX_CACHE_BYTES // 4:
             self._replies[request] = dataclasses.replace(reply, is_untimed=True)
             self._bytes += len(reply.body)
-        while self._bytes > self._max_bytes:
+        while self._bytes > MAX_CACHE_BYTES:
             self._bytes -= len(self._replies.popitem(last=False)[1].body)
 
     def drop(self, is_out: Callable[[RenderRequest], bool]) -> None:

@@ -18,8 +18,8 @@ _KEEP_SIZE = 1
 """FALLOC_FL_KEEP_SIZE of linux/falloc.h: allocate blocks without changing the length of the file."""
 
 
-def fill_reserve(folder: Path, reserve_bytes: int = RESERVE_BYTES) -> bool:
-    """Allocate reserve_bytes behind the newest log in the server's folder; call it often.
+def fill_reserve(folder: Path) -> bool:
+    """Allocate RESERVE_BYTES behind the newest log in the server's folder; call it often.
 
     Does nothing while at least half of them are left. False: there is no log, the disk has no free space, or its file
     system or this operating system cannot do it.
@@ -27,11 +27,11 @@ def fill_reserve(folder: Path, reserve_bytes: int = RESERVE_BYTES) -> bool:
     try:
         newest = max((folder / LOG_FOLDER).glob("*.incr.aof"), key=_sequence)
         status = newest.stat()
-        if status.st_blocks * 512 - status.st_size >= reserve_bytes // 2:
+        if status.st_blocks * 512 - status.st_size >= RESERVE_BYTES // 2:
             return True
         descriptor = os.open(newest, os.O_WRONLY | os.O_CLOEXEC)
         try:
-            return _allocate(descriptor, status.st_size, reserve_bytes)
+            return _allocate(descriptor, status.st_size, RESERVE_BYTES)
         finally:
             os.close(descriptor)
     except (OSError, ValueError):  # no log yet, or the server has just replaced it

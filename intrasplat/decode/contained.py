@@ -16,7 +16,6 @@ import tempfile
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -228,20 +227,6 @@ def take_decoder() -> Decoder:
     """The waiting process, or a new one."""
     decoder = _ready.pop() if _ready else Decoder()
     return decoder if decoder.is_alive else Decoder()
-
-
-def run_contained(
-    request: dict[str, Any],
-    allowance: Allowance,
-    on_report: OnReport = lambda share: None,
-    should_stop: Callable[[], bool] = lambda: False,
-    program: Sequence[str] = PROGRAM,
-    patience: Patience = Patience(),
-) -> dict[str, Any]:
-    """The result of a decoding process. Raises as Decoder.until_ended."""
-    with closing(Decoder(program)) as decoder:
-        decoder.ask(request, allowance, on_report, should_stop, patience)
-        return decoder.until_ended()
 
 
 def _end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:

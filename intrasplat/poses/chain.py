@@ -34,13 +34,11 @@ class Chain:
     frames             [K]       indices in the clip, rising
     world_from_camera  [K, 4, 4] mm; the world is the first one's camera
     links                        a and b are indices in the clip
-    keys                         the keyframes' indices
     """
 
     frames: Sequence[int]
     world_from_camera: Reals
     links: list[FrameLink]
-    keys: list[int]
 
 
 def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
@@ -74,9 +72,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
             flow = None
         on_progress(train.index(i) / (len(train) - 1))
     links += _loops(frames, keys, poses)
-    return Chain(
-        train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP], keys
-    )
+    return Chain(train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP])
 
 
 def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:

@@ -127,13 +127,11 @@ class Aligned:
 
     residual_px [M]     length of each match's residual
     weight      [M]     robust weight of each match
-    information [6, 6]  inverse covariance of the motion's twist, from the residuals' own size
     """
 
     motion: Reals
     residual_px: Reals
     weight: Reals
-    information: Reals
 
 
 def align(camera: StereoCamera, before: Reals, after: Reals, trust: Reals, start: Reals) -> Aligned:
@@ -162,10 +160,9 @@ def align(camera: StereoCamera, before: Reals, after: Reals, trust: Reals, start
         motion = exp(step) @ motion
         if np.linalg.norm(step * [1, 1, 1, 100, 100, 100]) < CONVERGED:
             break
-    spread = float((weight * squared).sum() / max(3 * weight.sum(), 1e-9))
     u, _, vt = np.linalg.svd(motion[:3, :3])
     motion[:3, :3] = u @ vt  # re-orthonormalise: rounding errors would double from frame to frame
-    return Aligned(motion, np.sqrt(squared), weight, normal / max(spread, 1e-4))
+    return Aligned(motion, np.sqrt(squared), weight)
 
 
 def weighted_median(values: Reals, weight: Reals) -> float:

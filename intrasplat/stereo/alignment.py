@@ -40,10 +40,9 @@ RANGE_MARGIN_PX, RANGE_MARGIN = 3.0, 0.1  # the sampled frames do not show every
 
 @dataclass(frozen=True)
 class RowShift:
-    """Median dy of the inlier matches, median |dy| after removing it, and the number of inliers."""
+    """Median dy of the inlier matches, and their number."""
 
     shift_px: float
-    residual_px: float
     matches: int
 
 
@@ -93,17 +92,13 @@ def measure_row_shift(matches: NDArray[np.float64], infinity_px: float, equal_ro
     dy = matches[:, 3] - matches[:, 1]
     disparity_px = matches[:, 0] - matches[:, 2]
     if len(dy) < MIN_MATCHES:
-        return RowShift(0.0, 0.0, 0)
+        return RowShift(0.0, 0)
     centre = _densest(dy)
     spread = np.median(np.abs(dy[np.abs(dy - centre) < 3.0] - centre))
     inliers = np.abs(dy - centre) < max(1.5, 4 * float(spread))
-    shift = RowShift(
-        shift_px=float(np.median(dy[inliers])),
-        residual_px=float(np.median(np.abs(dy[inliers] - np.median(dy[inliers])))),
-        matches=int(inliers.sum()),
-    )
+    shift = RowShift(shift_px=float(np.median(dy[inliers])), matches=int(inliers.sum()))
     if shift.matches < max(MIN_MATCHES, len(dy) // 4):
-        return RowShift(0.0, 0.0, 0)
+        return RowShift(0.0, 0)
     _check_recorded(shift.shift_px, equal_rows_px)
     _check_eyes(disparity_px[inliers] - infinity_px)
     if abs(shift.shift_px) > MAX_CORRECTION_PX:

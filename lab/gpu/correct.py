@@ -214,9 +214,9 @@ class Checks:
             worst[kind] = _relative(got - gaussians.mean, wanted - exact.mean)
         return worst
 
-    def _train(self, model: CudaModel | CpuModel, steps: int, sh_degree: int = 0, first: int = 1) -> None:
+    def _train(self, model: CudaModel | CpuModel, steps: int, sh_degree: int = 0) -> None:
         frames = self._frames(4)
-        for iteration in range(first, first + steps):
+        for iteration in range(1, 1 + steps):
             if isinstance(model, CudaModel) and 1 < iteration < 4:  # while the launches are captured, and replayed
                 model.wait()
                 poison(model._training.rasterizer)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lab.evaluate.rows import Row, read_rows
-from lab.pages.markdown import median_of, origin, source, table
+from lab.pages.markdown import origin, source, table
 
 _RASTER = """
 ## Splatting on the CPU
@@ -55,10 +55,6 @@ _LONG_COLUMNS = {
     "whole_psnr_db": "whole", "train_mib": "MiB in training", "finish_mib": "in finishing",
 }  # fmt: skip
 _SERVICE_FIGURES = {"p50_ms": "p50 ms", "p99_ms": "p99 ms", "per_s": "a second", "slower": "training slower by"}
-
-
-def _score(rows: list[Row], clip: str, holdout: str) -> str:
-    return median_of([row for row in rows if (row["clip"], row["holdout"]) == (clip, holdout)], "psnr_tissue_db", 2)
 
 
 def raster_sections(folder: Path) -> list[str]:

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pytest
 from intrasplat.clip import ClipLimits, DepthClip, open_clip
 from intrasplat.clip.calibration import load_calibration, rectify
 from intrasplat.decode import StereoRecording, decode_clip
-from intrasplat.decode.contained import DecoderKilledError, Patience, keep_decoder_ready, run_contained
+from intrasplat.decode.contained import Decoder, DecoderKilledError, Patience, keep_decoder_ready
 from intrasplat.decode.guard import PROTECTIONS, Allowance
 from intrasplat.errors import Cancelled, InputError, LimitError
 from intrasplat.machine.hooks import Hooks, Progress
@@ -206,6 +207,13 @@ def test_the_report_says_what_protected_the_worker(studio: Studio) -> None:
         assert word in decoded.assumptions[-1].text  # as held, or as what the kernel did not grant
 
 
+def run_contained(script: Path, request: dict[str, Any], allowance: Allowance, **asked: Any) -> dict[str, Any]:
+    """The result of a script that runs where the decoder would."""
+    with closing(Decoder((str(script),))) as decoder:
+        decoder.ask(request, allowance, **asked)
+        return decoder.until_ended()
+
+
 def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
     """The result of a process that does `work` where the decoder would be."""
     script = tmp_path / "stand_in.py"
@@ -216,7 +224,7 @@ def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
         "serve(lambda: work)\n"
     )
     request = {"readable": more.pop("readable", [])}
-    return run_contained(request, more.pop("allowance", ALLOWANCE), program=(str(script),), **more)
+    return run_contained(script, request, more.pop("allowance", ALLOWANCE), **more)
 
 
 @pytest.mark.parametrize(
@@ -336,7 +344,7 @@ def test_a_decoder_with_a_thread_that_is_not_confined_reads_nothing(tmp_path: Pa
     thread = "import threading, time; threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
     script.write_text(f"{thread}from intrasplat.decode.child import serve\nserve(lambda: lambda *given: {{}})\n")
     with pytest.raises(InputError, match="crashed"):
-        run_contained({"readable": []}, ALLOWANCE, program=(str(script),))
+        run_contained(script, {"readable": []}, ALLOWANCE)
 
 
 @linux
