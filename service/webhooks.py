@@ -9,12 +9,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+import re
 import ssl
 import time
 import uuid
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 
 import httpx
@@ -31,7 +34,6 @@ from contract.wire.webhooks import Delivery, DeliveryStatus, DeliveryTry, JobEnd
 from intrasplat.errors import UnavailableError
 from intrasplat.version import version
 from service.callbacks import LookUps, is_allowed, permitted_addresses
-from service.retry_after import asked_wait_s
 
 LOOK_PERIOD_S = 0.5
 MAX_AT_ONCE, MAX_OF_TENANT = 64, 4
@@ -46,6 +48,7 @@ MAX_TRIES = 11
 FIRST_WAIT_S, WAIT_GROWS, MAX_WAIT_S, JITTER = 5.0, 4.0, 6 * 3600.0, 0.2
 """Waits of 5 s after the first attempt, 20 s after the second, ... 6 h before the last: 26 h in total, unless receivers
 request longer waits."""
+ASKS_TO_WAIT = frozenset({httpx.codes.TOO_MANY_REQUESTS, httpx.codes.SERVICE_UNAVAILABLE})
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -269,3 +272,18 @@ def _is_of_tls(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def asked_wait_s(answer: httpx.Response, most_s: float) -> float | None:
+    """The wait that an answer's Retry-After (RFC 9110) requests, at most most_s; None if it has no readable one."""
+    text = answer.headers.get("retry-after", "")
+    if answer.status_code not in ASKS_TO_WAIT:
+        return None
+    if re.fullmatch(r"\d+", text, re.ASCII):
+        return min(float(text), most_s)
+    try:
+        at = parsedate_to_datetime(text)
+    except (ValueError, OverflowError):
+        return None
+    at = at if at.tzinfo else at.replace(tzinfo=UTC)  # HTTP dates are UTC, even without a zone
+    return max(0.0, min((at - datetime.now(UTC)).total_seconds(), most_s))

@@ -32,9 +32,9 @@ from worker.disk_space import FreeSpace
 from worker.hang import HangDetector
 from worker.heartbeat import Heartbeat
 from worker.job_errors import describe
-from worker.job_spans import StageSpans, attempt_span
 from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
 from worker.scores import AwaitedScores, InterruptedScores
+from worker.spans import StageSpans, attempt_span
 
 CLAIM_TIMEOUT_S = 1.0
 """How soon an idle worker notices that it should end, or that its child has."""

@@ -20,7 +20,7 @@ from intrasplat.view.encode import FOR_EYES
 from worker.pace import RenderPace
 from worker.reply import Reply
 from worker.request_queue import COARSEST, RequestQueue, WaitingRequest
-from worker.request_spans import answer_span, shared_span
+from worker.spans import answer_span, shared_span
 
 SMALL_SHARE = 0.25
 """An answer that takes less than this share of a larger one's time is computed between the parts of that one."""

@@ -13,8 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.retry_after import asked_wait_s
-from service.webhooks import FIRST_WAIT_S, JITTER, MAX_TRIES, MAX_WAIT_S, WAIT_GROWS, wait_after
+from service.webhooks import FIRST_WAIT_S, JITTER, MAX_TRIES, MAX_WAIT_S, WAIT_GROWS, asked_wait_s, wait_after
 from tests.receiver import Receiver
 from tests.service.telling import cancelled, log_of, telling
 from tests.test_operations import PAGE

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from intrasplat.methods.registry import PRESETS
-from intrasplat.train import tensor_copy
+from intrasplat.train import average
 from intrasplat.train.average import PREFIX, RunningMean
 from tests.intrasplat.phantoms import phantom_clip, prepared
 
@@ -42,8 +42,8 @@ def test_what_is_put_is_the_mean_of_what_was_added(models: list[Parameters]) -> 
 
 def test_a_mean_in_files_has_the_same_bits(models: list[Parameters], monkeypatch: pytest.MonkeyPatch) -> None:
     means, stored = [], []
-    for large in (tensor_copy.LARGE_BYTES, 0):
-        monkeypatch.setattr(tensor_copy, "LARGE_BYTES", large)
+    for large in (average.LARGE_BYTES, 0):
+        monkeypatch.setattr(average, "LARGE_BYTES", large)
         first, mean = RunningMean(), RunningMean()
         for model in models[:3]:
             first.add(model)

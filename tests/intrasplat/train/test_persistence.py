@@ -105,7 +105,7 @@ def test_a_long_clips_run_keeps_no_first_moments_and_goes_on_to_the_same_bits(
     monkeypatch.setattr("intrasplat.methods.method.USUAL_BASES", 1)  # what a long clip has more of
     monkeypatch.setattr(persistence, "PERIOD_S", 0.0)
     monkeypatch.setattr(persistence, "MAX_SHARE", 1e9)
-    monkeypatch.setattr("intrasplat.train.tensor_copy.LARGE_BYTES", 1 << 12)
+    monkeypatch.setattr("intrasplat.train.average.LARGE_BYTES", 1 << 12)
     monkeypatch.setattr("intrasplat.scene.resume_file._AT_MOST_BYTES", 1 << 12)
 
     def stop(progress: Progress) -> None:

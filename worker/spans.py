@@ -1,7 +1,11 @@
-"""Trace spans of a job in a worker: its wait, each attempt, and its stages (contract/runtime/traces.py)."""
+"""Trace spans of a worker (contract/runtime/traces.py).
+
+A job has spans of its wait, of each attempt and of its stages; a request of its time since arrival and of its wait.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,6 +13,7 @@ from opentelemetry.trace import INVALID_SPAN, Span, SpanKind
 
 from contract.runtime import traces
 from contract.wire.job import JobRecord
+from worker.request_queue import WaitingRequest
 
 
 @contextmanager
@@ -44,3 +49,22 @@ class StageSpans:
             traces.fail(self._span, failed)
         self._span.end()
         self._stage, self._span = "", INVALID_SPAN
+
+
+@contextmanager
+def answer_span(queued: WaitingRequest) -> Iterator[None]:
+    """The span of an answer in progress; spans that start in the context become its children."""
+    came_s = _came_s(queued)
+    with traces.span(queued.request.kind, queued.trace or traces.NEW, since_s=came_s, job_id=queued.request.scene_id):
+        traces.begin("wait for turn", since_s=came_s).end()
+        yield
+
+
+def shared_span(queued: WaitingRequest) -> None:
+    """The span of a request that shares the answer to another, equal request."""
+    attributes = traces.Attributes(job_id=queued.request.scene_id, shared=True)
+    traces.begin(queued.request.kind, queued.trace or traces.NEW, since_s=_came_s(queued), **attributes).end()
+
+
+def _came_s(queued: WaitingRequest) -> float:
+    return time.time() - (time.monotonic() - queued.arrived_s)
