@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from intrasplat.fusion import FusionSettings
-from intrasplat.methods.method import Departure, Preset, departing, leaving_out
+from intrasplat.methods.method import Departure, departing
 from intrasplat.methods.paper import PAPER
 from intrasplat.names import BUDGETS_S
 from intrasplat.splat.deformation import SharedBasis
@@ -123,12 +123,6 @@ DEPARTURES = (
 """The differences of `fast` from `paper`. No two departures set the same value."""
 
 FAST = departing(PAPER, DEPARTURES, "fast")
-
-
-def fast_without(name: str) -> Preset:
-    """`fast` without the departure of this name and without those that need it. Raises KeyError if there is none."""
-    return departing(PAPER, leaving_out(DEPARTURES, name), f"fast without {name}")
-
 
 INSTANT = replace(
     FAST,

@@ -184,18 +184,3 @@ def departing(preset: Preset, departures: Iterable[Departure], name: str) -> Pre
         rates.update(each.rates)
         loss.update(each.loss)
     return replace(preset, name=name, rates=replace(preset.rates, **rates), loss=replace(preset.loss, **loss), **fields)
-
-
-def leaving_out(departures: Iterable[Departure], name: str) -> tuple[Departure, ...]:
-    """The departures without the one of this name and without those that need it, in their order.
-
-    Raises:
-        KeyError: none has this name.
-    """
-    listed = tuple(departures)
-    gone = {each.name for each in listed if each.name == name}
-    if not gone:
-        raise KeyError(name)
-    while more := {each.name for each in listed if gone & {*each.needs}} - gone:
-        gone |= more
-    return tuple(each for each in listed if each.name not in gone)

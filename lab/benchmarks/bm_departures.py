@@ -29,8 +29,8 @@ import torch
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
-from intrasplat.methods.fast import DEPARTURES, FAST, fast_without
-from intrasplat.methods.method import Preset
+from intrasplat.methods.fast import DEPARTURES, FAST
+from intrasplat.methods.method import Departure, Preset, departing
 from intrasplat.methods.paper import PAPER
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.cpu import compile_kernels
@@ -112,6 +112,26 @@ class PlannedRun:
     iterations: int
     seed: int
     stops_early: bool = False
+
+
+def fast_without(name: str) -> Preset:
+    """`fast` without the departure of this name and without those that need it. Raises KeyError if there is none."""
+    return departing(PAPER, leaving_out(DEPARTURES, name), f"fast without {name}")
+
+
+def leaving_out(departures: Iterable[Departure], name: str) -> tuple[Departure, ...]:
+    """The departures without the one of this name and without those that need it, in their order.
+
+    Raises:
+        KeyError: none has this name.
+    """
+    listed = tuple(departures)
+    gone = {each.name for each in listed if each.name == name}
+    if not gone:
+        raise KeyError(name)
+    while more := {each.name for each in listed if gone & {*each.needs}} - gone:
+        gone |= more
+    return tuple(each for each in listed if each.name not in gone)
 
 
 def planned(names: Iterable[str], iterations: int, seeds: int) -> list[PlannedRun]:

@@ -7,8 +7,8 @@ from itertools import chain
 
 import pytest
 
-from intrasplat.methods.fast import DEPARTURES, FAST, fast_without
-from intrasplat.methods.method import Departure, departing, leaving_out
+from intrasplat.methods.fast import DEPARTURES, FAST
+from intrasplat.methods.method import Departure, departing
 from intrasplat.methods.paper import PAPER
 from lab.benchmarks.bm_departures import (
     CSV,
@@ -17,7 +17,9 @@ from lab.benchmarks.bm_departures import (
     PAGE,
     UNMEASURED,
     clips_of,
+    fast_without,
     gains_of,
+    leaving_out,
     read,
     with_gains,
     with_table,
