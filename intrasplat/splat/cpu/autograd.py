@@ -3,66 +3,33 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from intrasplat.splat.autograd import (
-    MAX_LOGIT,
-    logit_of,
-    opacity_gradient,
-    pose_gradient,
-    rasterize_by,
-    refuse_second_derivatives,
-    scale_gradient,
-    stacked,
-)
+from intrasplat.splat.autograd import MAX_LOGIT, KernelGradients, rasterize_by
 from intrasplat.splat.camera import Camera, Rendered
 from intrasplat.splat.cpu.rasterizer import Floats, Rasterizer, padded
-from intrasplat.splat.layout import LOG_SCALE, MEAN, QUATERNION
 from intrasplat.splat.step import camera_vector
 
 
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        mean: Tensor,
-        quaternion: Tensor,
-        scale: Tensor,
-        opacity: Tensor,
-        colour: Tensor,
-        camera_from_world: Tensor,
-        camera: Camera,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        count = padded(max(1, mean.shape[0]))
-        logit = logit_of(opacity)
-        state = np.concatenate([_rows(mean, count), _rows(quaternion, count, 1.0), _rows(scale.log(), count)])
-        rasterizer = Rasterizer(camera.width, camera.height)
-        rasterizer.project(camera_vector(camera), state, _rows(logit, count, -MAX_LOGIT)[0], _rows(colour, count))
-        image = torch.from_numpy(rasterizer.render().copy())
-        ctx.rasterizer, ctx.count = rasterizer, mean.shape[0]
-        ctx.save_for_backward(scale, logit, camera_from_world)
-        return image[:3].permute(1, 2, 0), image[3], image[4]
+def _kernels(
+    mean: Tensor, quaternion: Tensor, scale: Tensor, logit: Tensor, colour: Tensor, camera: Camera
+) -> tuple[Tensor, KernelGradients]:
+    columns = padded(max(1, len(mean)))
+    state = np.concatenate([_rows(mean, columns), _rows(quaternion, columns, 1.0), _rows(scale.log(), columns)])
+    rasterizer = Rasterizer(camera.width, camera.height)
+    rasterizer.project(camera_vector(camera), state, _rows(logit, columns, -MAX_LOGIT)[0], _rows(colour, columns))
+    count = len(mean)  # not mean itself, which the closure would keep
 
-    @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        refuse_second_derivatives()
-        scale, logit, camera_from_world = ctx.saved_tensors
-        gradients = ctx.rasterizer.cotangent_backward(stacked(*cotangents).numpy())
-        state = torch.from_numpy(gradients.state[:, : ctx.count].T.copy())
-        v_logit = torch.from_numpy(gradients.opacity_logit[: ctx.count].copy())
-        return (
-            state[:, MEAN],
-            state[:, QUATERNION],
-            scale_gradient(state[:, LOG_SCALE], scale),
-            opacity_gradient(v_logit, logit),
-            torch.from_numpy(gradients.colour[:, : ctx.count].T.copy()),
-            pose_gradient(torch.from_numpy(gradients.pose.sum(0)), camera_from_world),
-            None,
-        )
+    def gradients(cotangents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        found = rasterizer.cotangent_backward(cotangents.numpy())
+        state, colour = (torch.from_numpy(each[:, :count].T.copy()) for each in (found.state, found.colour))
+        logit = torch.from_numpy(found.opacity_logit[:count].copy())
+        return state, logit, colour, torch.from_numpy(found.pose.sum(0))
+
+    return torch.from_numpy(rasterizer.render().copy()), gradients
 
 
 def _rows(tensor: Tensor, count: int, fill: float = 0.0) -> Floats:
@@ -81,4 +48,4 @@ def rasterize(
     Raises:
         ValueError: shapes that do not belong together.
     """
-    return rasterize_by(_Rasterize, mean, quaternion, scale, opacity, colour, camera)
+    return rasterize_by(_kernels, mean, quaternion, scale, opacity, colour, camera)
