@@ -201,7 +201,7 @@ const list = new JobList(
   },
 );
 const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "";
-const jobs = new Jobs(showJobs, showConnection, isWatched);
+export const jobs = new Jobs(showJobs, showConnection, isWatched);
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);

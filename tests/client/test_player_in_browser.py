@@ -283,7 +283,7 @@ def test_two_tabs_draw_the_same_scene_and_both_lose_it(site: Site, page: Drawn) 
     page.driver.switch_to.window(first)
 
 
-STILL_S, SETTLED_S = 12.0, 3.0
+STILL_S, SETTLED_S = 8.0, 2.0
 MAX_STILL_BYTES_S = 1000
 
 
@@ -330,7 +330,7 @@ def test_opening_and_playing_again_and_again_leaves_nothing_behind(site: Site, p
         page.open()
         scenes = [view_here(site, page), site.scene(model=scattered(10, moves=False))]
         counts = []
-        for _ in range(4):
+        for _ in range(2):
             for scene in reversed(scenes):
                 site.announce()  # else the worker counts as gone after a while
                 page.press(scene, "View")
@@ -341,7 +341,7 @@ def test_opening_and_playing_again_and_again_leaves_nothing_behind(site: Site, p
             counts.append(page.script("return window.alive()"))
         assert counts[0]["textures"] > 0
         assert counts[0]["workers"] == 1
-        assert counts[1:] == counts[:1] * 3
+        assert counts[1] == counts[0]
     finally:
         page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
 
