@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -11,25 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
-from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, scenes, write_recording
-from lab.conditions import clean as clean_module
-from lab.phantom import PhantomSettings, make_phantom
+from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
+from lab.phantom import PhantomSettings
+
+pytestmark = pytest.mark.usefixtures("each_phantom_once")
 
 CLEAN_FRAMES = 12
 OF_THE_SAME_CLIP = [name for name in CONDITIONS if not name.startswith(("tiny", "large", "cutting", "fast_pull"))]
 SLOW = ("large", "tiny")  # a phantom of its own for each severity
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _each_phantom_is_made_once() -> Iterator[None]:
-    """That it is the same each time is checked where phantoms are."""
-    with pytest.MonkeyPatch.context() as patched:
-        for module in (clean_module, scenes):
-            patched.setattr(module, "make_phantom", made)
-        yield
-
-
-made = cache(make_phantom)
 
 
 @cache

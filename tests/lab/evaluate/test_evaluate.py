@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from intrasplat.errors import Cancelled, InputError, UnavailableError
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from lab.__main__ import main
-from lab.evaluate import charts, sources, style
+from lab.evaluate import charts, style
 from lab.evaluate.cells import Cell, plan
 from lab.evaluate.command import SUMMARY, measure_all
 from lab.evaluate.measure import Bench, Values, _OnTheWay, command_of, seconds_of
@@ -28,19 +27,14 @@ from lab.evaluate.sources import DATA_VARIABLE, open_source, source_of
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.intrasplat.phantoms import phantom_clip
 
+pytestmark = pytest.mark.usefixtures("each_phantom_once", "few_renders_timed")
+
 CLIP = "phantom:pull:64x48:12frames"
 NAME = "phantom-pull-64x48-12frames"
 
 
 def evaluate(out: Path, *options: str) -> int:
     return main(["evaluate", CLIP, "--out", str(out), "--iterations", "12", "--holdout", "every8", *options])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _each_phantom_is_made_once() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(sources, "make_phantom", cache(make_phantom))
-        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,6 +10,8 @@ from lab.benchmarks.bm_two_eyes import FIELDS, main
 from lab.evaluate.rows import read_rows
 from lab.pages.right_eye import TWO_EYES, two_eyes_sections
 
+pytestmark = pytest.mark.usefixtures("each_phantom_once", "few_renders_timed")
+
 TINY = ["--clips", "phantom:breathing:96x80:9frames:stereo", "--holdout", "every8", "--iterations", "5"]
 
 
