@@ -62,7 +62,7 @@ class Sizes:
 
 
 REAL = Sizes(1500, 96, 80, 4000, 160, 128, 70, 640, 512, 0.1)
-SMALL = Sizes(16, 9, 7, 12, 9, 8, 2, 64, 24, 0.25)
+SMALL = Sizes(16, 9, 7, 12, 9, 8, 2, 48, 16, 0.25)
 """Sizes for Triton's interpreter; the width ends within a tile."""
 
 

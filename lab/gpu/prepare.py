@@ -67,7 +67,7 @@ def _clip(part: Part) -> dict[str, object]:
     else:
         settings = SMALL_PHANTOM if part.interpret else PHANTOM
         clip, name = make_phantom(settings).depth_clip(), f"phantom-{settings.motion}"
-        clip = _corner(clip, 16) if part.interpret else clip
+        clip = _corner(clip, 8) if part.interpret else clip
     save_clip(part.work / CLIP, clip)
     return {"name": name, "seconds": time.perf_counter() - start, "camera": clip.intrinsics.numbers()}
 

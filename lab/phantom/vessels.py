@@ -65,7 +65,7 @@ def _draw(
     # thin ones first, so that a trunk covers where its branches begin
     for width_mm, line_mm in sorted(_grow(rng, trunks), key=lambda piece: piece[0]):
         width = width_mm / texel_mm
-        points = np.round(line_mm / texel_mm * 2**SUBPIXEL_BITS).astype(np.int32)
+        points = (line_mm / texel_mm * 2**SUBPIXEL_BITS).round().astype(np.int32)
         shade = int(255 * min(1.0, width) * min(1.0, 0.45 + 0.8 * width_mm / trunk_mm[1]))
         cv2.polylines(canvas, [points], False, shade, max(1, round(width)), cv2.LINE_AA, SUBPIXEL_BITS)
     blurred = cv2.GaussianBlur(canvas.astype(np.float32) / 255, (0, 0), max(0.45, blur_mm / texel_mm))
@@ -79,13 +79,15 @@ def _grow(rng: np.random.Generator, sprouts: list[_Sprout]) -> Iterator[tuple[fl
             return
         sprout = sprouts.pop()
         turns = rng.normal(rng.normal(0, CURL_RAD), WANDER_RAD, PIECE_STEPS)
-        directions = sprout.direction_rad + np.cumsum(turns)
-        steps = STEP_MM * np.stack([np.cos(directions), np.sin(directions)], -1)
-        line = np.concatenate([sprout.place_mm[None], sprout.place_mm + np.cumsum(steps, 0)])
+        directions = sprout.direction_rad + turns.cumsum()
+        line = np.empty((PIECE_STEPS + 1, 2))
+        line[0], line[1:, 0], line[1:, 1] = 0, np.cos(directions), np.sin(directions)
+        line[1:] = (STEP_MM * line[1:]).cumsum(0)
+        line += sprout.place_mm
         yield sprout.width_mm, line
         width = TAPER * sprout.width_mm
         if rng.random() < FORK_CHANCE:
-            side = rng.choice((-1.0, 1.0)) * rng.uniform(0.45, 1.1)
+            side = (-1.0, 1.0)[rng.integers(2)] * rng.uniform(0.45, 1.1)
             share = FORK_SHARE * rng.uniform(0.6, 1.0)
             if share * width > MIN_WIDTH_MM:
                 sprouts.append(_Sprout(line[-1], directions[-1] + side, share * width))

@@ -122,10 +122,12 @@ def test_a_wrong_kernel_casts_doubt_on_what_follows_and_a_part_without_end_is_ki
         "correct": "sys.exit(1)",
         "speed": "open(sys.argv[0] + '.doubt', 'w').write(sys.argv[sys.argv.index('--doubt') + 1])",
         "train": "time.sleep(60)",
+        "prepare": "time.sleep(60)",
     }
     for name, text in programs.items():
         (tmp_path / f"{name}.py").write_text(f"import sys, time\n{text}\n")
     monkeypatch.setattr(check, "GRACE_S", 0.2)
+    monkeypatch.setattr(check, "HERE", tmp_path)
     # a part gets what those before it left over; the last one has all but two seconds of that taken away
     parts = [
         check.CheckPart(name, seconds, tmp_path) for name, seconds in (("correct", 20), ("speed", 20), ("train", -38))

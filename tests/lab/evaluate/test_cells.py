@@ -20,6 +20,9 @@ from lab.evaluate.cells import (
     plan,
     preset_of,
 )
+from lab.evaluate.variants import register_variants
+
+register_variants()
 
 
 def test_a_series_is_a_preset_with_its_changes_made() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 
+from lab.evaluate import charts
 from lab.evaluate.charts import draw_all
 from lab.evaluate.published import LABEL
 from lab.evaluate.rows import CURVE_FIELDS, CURVES, RUN_FIELDS, RUNS, Results, write_rows
@@ -37,6 +40,37 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+Files = dict[str, bytes]
+DrawSome = Callable[..., tuple[list[str], Files]]
+
+
+@pytest.fixture
+def draw_some(monkeypatch: pytest.MonkeyPatch) -> DrawSome:
+    """Draws all charts of a folder's rows, but writes only the files named, which is what takes long; returns the names
+    of all charts, and what these files hold."""
+    import matplotlib as mpl
+
+    written = charts.save
+
+    def draw(folder: Path, *files: str) -> tuple[list[str], Files]:
+        def save(figure: Any, folder: Path, name: str) -> None:
+            if f"{name}.png" in files:
+                written(figure, folder, name)
+            elif f"{name}.svg" in files:
+                figure.savefig(folder / f"{name}.svg")
+
+        monkeypatch.setattr(charts, "save", save)
+        with mpl.rc_context({"svg.fonttype": "none"}):  # text stays text
+            names = draw_all(Results(folder), folder)
+        return names, {name: (folder / name).read_bytes() for name in files}
+
+    return draw
+
+
+def texts(files: Files) -> dict[str, str]:
+    return {name.removesuffix(".svg"): held.decode() for name, held in files.items()}
+
+
 @pytest.mark.parametrize("name", CHARTS)
 def test_every_chart_is_drawn_as_png_and_svg(name: str, drawn: Path) -> None:
     picture = cv2.imread(str(drawn / f"{name}.png"))
@@ -45,13 +79,11 @@ def test_every_chart_is_drawn_as_png_and_svg(name: str, drawn: Path) -> None:
     assert (drawn / f"{name}.svg").read_text().startswith("<?xml")
 
 
-def test_the_same_rows_give_the_same_bytes(drawn: Path, tmp_path: Path) -> None:
-    import matplotlib as mpl
-
-    with mpl.rc_context({"svg.fonttype": "none"}):
-        draw_all(results_in(tmp_path), tmp_path)
-    for name in ("pareto.svg", "curves.svg", "curves.png"):
-        assert (tmp_path / name).read_bytes() == (drawn / name).read_bytes()
+def test_the_same_rows_give_the_same_bytes(drawn: Path, tmp_path: Path, draw_some: DrawSome) -> None:
+    results_in(tmp_path)
+    _, files = draw_some(tmp_path, "curves.png", "curves.svg")
+    for name, held in files.items():
+        assert held == (drawn / name).read_bytes()
 
 
 def test_a_chart_names_what_is_missing_what_failed_and_what_others_published(drawn: Path) -> None:
@@ -62,40 +94,39 @@ def test_a_chart_names_what_is_missing_what_failed_and_what_others_published(dra
     assert text.count(">copying: flow<") == 2
 
 
-def test_the_clock_of_the_user_has_charts_of_its_own_that_name_who_lacks_it(tmp_path: Path) -> None:
-    import matplotlib as mpl
-
+def test_the_clock_of_the_user_has_charts_of_its_own_that_name_who_lacks_it(
+    tmp_path: Path, draw_some: DrawSome
+) -> None:
     fast, paper = run_row("fast", 39.0, t_post_s=75.0), run_row("paper", 38.0)
     points = [(5.0, 200, 35.0), (60.0, 2900, 39.0)]
     other = run_row("fast", 33.0, clip="other")
     write_rows(tmp_path / RUNS, RUN_FIELDS, [fast, paper, other])
     curves = [*curve_rows(fast, points, 9.0), *curve_rows(paper, points), *curve_rows(other, points)]
     write_rows(tmp_path / CURVES, CURVE_FIELDS, curves)
-    with mpl.rc_context({"svg.fonttype": "none"}):
-        assert set(draw_all(Results(tmp_path), tmp_path)) == {*CHARTS, "curves-post", "pareto-post"}
-    charts = {name: (tmp_path / f"{name}.svg").read_text() for name in (*CHARTS, "curves-post", "pareto-post")}
-    assert ("other, every8" in charts["curves"], "other, every8" in charts["curves-post"]) == (True, False)
+    read = ("curves", "curves-post", "pareto", "pareto-post", "pareto-one-clip")
+    names, files = draw_some(tmp_path, *(f"{name}.svg" for name in read))
+    assert set(names) == {*CHARTS, "curves-post", "pareto-post"}
+    shown = texts(files)
+    assert ("other, every8" in shown["curves"], "other, every8" in shown["curves-post"]) == (True, False)
     for name in ("curves-post", "pareto-post"):
-        assert charts[name].count(">seconds since the request (log)<") == 1
-        assert charts[name].count("without t_post_s: paper<") == 1
-        assert LABEL not in charts[name], "papers print seconds of training"
-    alone = charts["pareto-one-clip"]
+        assert shown[name].count(">seconds since the request (log)<") == 1
+        assert shown[name].count("without t_post_s: paper<") == 1
+        assert LABEL not in shown[name], "papers print seconds of training"
+    alone = shown["pareto-one-clip"]
     assert (alone.count(">seconds of training (log)<"), alone.count(">seconds since the request (log)<")) == (1, 1)
-    assert "without t_" not in charts["curves"] + charts["pareto"]
+    assert "without t_" not in shown["curves"] + shown["pareto"]
 
 
-def test_left_and_right_eye_stand_beside_each_other_where_a_clip_has_two(tmp_path: Path) -> None:
-    import matplotlib as mpl
-
+def test_left_and_right_eye_stand_beside_each_other_where_a_clip_has_two(tmp_path: Path, draw_some: DrawSome) -> None:
     stereo = {"clip": "d4d-a-stereo", "copy_blend_db": "", "warp_db": 30.7}
     runs = [run_row("fast", 37.5, psnr_right_db=36.0, **stereo), run_row("fast", 40.0)]
     runs.append(run_row("fast:eyes=left", 38.6, psnr_right_db=30.6, **stereo))
     curves = [row for run in runs for row in curve_rows(run, [(5.0, 200, 35.0), (60.0, 2900, 39.0)])]
     write_rows(tmp_path / RUNS, RUN_FIELDS, runs)
     write_rows(tmp_path / CURVES, CURVE_FIELDS, [row | {"psnr_right_db": "33"} for row in curves])
-    with mpl.rc_context({"svg.fonttype": "none"}):
-        assert draw_all(Results(tmp_path), tmp_path) == [*CHARTS, "curves-eyes", "pareto-right"]
-    eyes, pareto = ((tmp_path / f"{name}.svg").read_text() for name in ("curves-eyes", "pareto-right"))
+    names, files = draw_some(tmp_path, "curves-eyes.svg", "pareto-right.svg")
+    assert names == [*CHARTS, "curves-eyes", "pareto-right"]
+    eyes, pareto = texts(files).values()
     assert (eyes.count(">left eye<"), eyes.count(">right eye<")) == (1, 1), "the clip of one eye has no panel"
     assert ">held-out psnr_right, dB<" in eyes
     assert ">fast:eyes=left<" in pareto

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from intrasplat.errors import Cancelled, InputError, UnavailableError
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from lab.__main__ import main
+from lab.evaluate import charts, style
 from lab.evaluate.cells import Cell, plan
 from lab.evaluate.command import SUMMARY, measure_all
 from lab.evaluate.measure import Bench, Values, _OnTheWay, command_of, seconds_of
@@ -26,28 +27,43 @@ from lab.evaluate.sources import DATA_VARIABLE, open_source, source_of
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.intrasplat.phantoms import phantom_clip
 
-CLIP = "phantom:pull:96x80:12frames"
-NAME = "phantom-pull-96x80-12frames"
+pytestmark = pytest.mark.usefixtures("each_phantom_once", "few_renders_timed")
+
+CLIP = "phantom:pull:64x48:12frames"
+NAME = "phantom-pull-64x48-12frames"
 
 
 def evaluate(out: Path, *options: str) -> int:
     return main(["evaluate", CLIP, "--out", str(out), "--iterations", "12", "--holdout", "every8", *options])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _charts_are_files_without_a_picture() -> Iterator[None]:
+    """Writing them takes longer than all else. One test does write them, and test_charts.py looks at them."""
+
+    def save(_: object, folder: Path, name: str) -> None:
+        for ending in ("png", "svg"):
+            (folder / f"{name}.{ending}").touch()
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(charts, "save", save)
+        yield
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("evaluate")
-    assert evaluate(out, "--series", "fast", "hexplane") == ExitCode.OK
+    assert evaluate(out, "--series", "fast", "pfs") == ExitCode.OK
     return out
 
 
 def test_a_run_becomes_a_row_with_every_figure(measured: Path) -> None:
-    fast, hexplane = read_rows(measured / RUNS)
-    assert (fast["clip"], fast["series"], fast["limit"], hexplane["series"]) == (
+    fast, pfs = read_rows(measured / RUNS)
+    assert (fast["clip"], fast["series"], fast["limit"], pfs["series"]) == (
         NAME,
         "fast",
         "12 iterations",
-        "hexplane",
+        "pfs",
     )
     empty = {name for name in RUN_FIELDS if not fast[name]}
     of_the_right_eye = {"psnr_right_db", "psnr_right_clear_db", "warp_db", "warp_clear_db"}
@@ -93,7 +109,7 @@ def test_a_phantom_s_name_tells_paths_instruments_and_missing_masks() -> None:
 
 
 def test_a_phantom_without_masks_is_judged_by_the_true_ones() -> None:
-    for spelling in ("phantom:breathing:96x80:3frames", "phantom:breathing:96x80:3frames:stereo"):
+    for spelling in ("phantom:breathing:64x48:2frames", "phantom:breathing:64x48:2frames:stereo"):
         given, bare = (open_source(source_of(each), "none", Hooks()) for each in (spelling, f"{spelling}:nomasks"))
         np.testing.assert_array_equal(given.clip.tissue, given.tissue)
         np.testing.assert_array_equal(bare.tissue, given.tissue)
@@ -102,11 +118,11 @@ def test_a_phantom_without_masks_is_judged_by_the_true_ones() -> None:
 
 def test_a_moving_phantom_gives_its_poses_with_true_depth_and_none_with_stereo() -> None:
     one, both = (
-        open_source(source_of(f"phantom:breathing+pan:96x80:9frames{end}"), "none", Hooks()) for end in ("", ":stereo")
+        open_source(source_of(f"phantom:breathing+pan:64x48:3frames{end}"), "none", Hooks()) for end in ("", ":stereo")
     )
     assert one.phantom is not None
-    np.testing.assert_array_equal(one.clip.world_from_camera[8], one.phantom.world_from_camera(8))
-    np.testing.assert_array_equal(both.clip.world_from_camera, np.tile(np.eye(4), (9, 1, 1)))
+    np.testing.assert_array_equal(one.clip.world_from_camera[2], one.phantom.world_from_camera(2))
+    np.testing.assert_array_equal(both.clip.world_from_camera, np.tile(np.eye(4), (3, 1, 1)))
 
 
 def test_the_right_eye_judges_what_either_number_of_eyes_taught(both_eyes: Path) -> None:
@@ -157,9 +173,9 @@ def test_the_curve_of_a_row_has_the_clock_of_a_run_that_nobody_evaluates() -> No
 
 
 def test_a_recording_is_shrunk_by_a_whole_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=9)), tmp_path / "d4d_endonerf")
+    write_endonerf(make_phantom(PhantomSettings(width=64, height=48, frames=2)), tmp_path / "d4d_endonerf")
     monkeypatch.setenv("INTRASPLAT_DATA", str(tmp_path))
-    whole, half = (open_source(source_of(f"d4d_endonerf{size}"), "every8", TrainingHooks()) for size in ("", ":32x24"))
+    whole, half = (open_source(source_of(f"d4d_endonerf{size}"), "none", TrainingHooks()) for size in ("", ":32x24"))
     assert source_of("d4d_endonerf:32x24").name == "d4d-a-32x24"
     np.testing.assert_allclose(half.clip.rgb[0, 0, 0], whole.clip.rgb[0, :2, :2].mean((0, 1)), atol=0.51)
     assert half.tissue[0, 5, 5] == whole.tissue[0, 10:12, 10:12].all()
@@ -167,7 +183,7 @@ def test_a_recording_is_shrunk_by_a_whole_number(tmp_path: Path, monkeypatch: py
     assert half.clip.intrinsics == whole.clip.intrinsics.resized(32, 24)
     for size in (":30x24", ":640x480"):
         with pytest.raises(InputError, match="no whole number"):
-            open_source(source_of(f"d4d_endonerf{size}"), "every8", TrainingHooks())
+            open_source(source_of(f"d4d_endonerf{size}"), "none", TrainingHooks())
     for unknown in ("d4d_endonerf:half", "d4d_stereo:337x256"):
         with pytest.raises(InputError, match="is not known"):
             source_of(unknown)
@@ -195,12 +211,15 @@ def test_a_curve_ends_where_its_run_does(measured: Path) -> None:
 
 def test_what_has_its_row_is_not_measured_again(measured: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (measured / RUNS).read_bytes()
-    assert evaluate(measured, "--series", "fast", "hexplane") == ExitCode.OK
+    assert evaluate(measured, "--series", "fast", "pfs") == ExitCode.OK
     assert "2 of them have their rows already" in capsys.readouterr().out
     assert (measured / RUNS).read_bytes() == before
 
 
-def test_rows_alone_are_enough_to_draw_also_while_others_are_added(measured: Path, tmp_path: Path) -> None:
+def test_rows_alone_are_enough_to_draw_also_while_others_are_added(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(charts, "save", style.save)
     for name in (RUNS, CURVES):
         (tmp_path / name).write_bytes((measured / name).read_bytes())
     with adding_alone(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,21 @@ from numpy.typing import NDArray
 from lab.evaluate.seen import SeenPoints, seen_points, share_covered
 from lab.evaluate.truth import Truth
 from lab.phantom import CameraPath, Phantom, PhantomSettings, make_phantom
+from lab.phantom import tissue as painted
 
 FRAMES = 13
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _without_vessels() -> Iterator[None]:
+    """Which take most of the time of making a phantom, and hide nothing."""
+
+    def none(*given: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return np.zeros(given[-1], np.float32), np.zeros(given[-1], np.float32)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(painted, "draw_vessels", none)
+        yield
 
 
 @cache

@@ -33,6 +33,8 @@ from lab.evaluate.stability import (
 from lab.pages.stability import stability_sections
 from tests.test_repository import REPOSITORY
 
+pytestmark = pytest.mark.usefixtures("each_phantom_once")
+
 SMALL = Grid(width=96, height=80, frames=12, iterations=15)
 
 

@@ -5,17 +5,26 @@ look.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lab.phantom import CAMERA_PATHS, CameraPath, Motion, Phantom, PhantomSettings, make_phantom
+from lab.phantom import CAMERA_PATHS, CameraPath, Motion, Phantom, PhantomSettings, make_phantom, scene
 from lab.phantom.camera import endoscope_pose, farther_mm
 from lab.phantom.settings import MEAN_DEPTH_MM
 
 FRAMES = 65
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_is_painted() -> Iterator[None]:
+    """Only the tissue's shape matters here, and its paint takes ten times as long."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(scene, "paint_tissue", lambda *_: None)
+        yield
 
 
 def settings(*camera: CameraPath, frames: int = FRAMES, motion: Motion = "breathing") -> PhantomSettings:
@@ -82,13 +91,13 @@ def test_paths_are_followed_at_once_in_whatever_order_they_are_named() -> None:
     np.testing.assert_array_equal(both, poses("shake", "pan"))
 
 
-def corners(scene: Phantom) -> list[float]:
+def corners(made: Phantom) -> list[float]:
     """The least depth that the right and the left eye see in the four corners and the middle of first, middle and last
     frames: 0 where there is no tissue."""
     found = []
-    for frame in np.linspace(0, scene.settings.frames - 1, 7):
-        for pose in (scene.world_from_camera(frame), scene.world_from_right(frame)):
-            found.append(float(scene.surface_pixels(frame, pose).depth_mm.min()))
+    for frame in np.linspace(0, made.settings.frames - 1, 7):
+        for pose in (made.world_from_camera(frame), made.world_from_right(frame)):
+            found.append(float(made.surface_pixels(frame, pose).depth_mm.min()))
     return found
 
 
@@ -109,11 +118,11 @@ def test_a_fixed_and_a_swinging_endoscope_need_no_more_tissue_than_the_usual() -
 
 
 def test_points_that_come_into_view_have_their_way_too() -> None:
-    scene = make_phantom(settings("pan"))
-    late = scene.trajectories(stride_px=4, shown_in=FRAMES - 1)
+    panned = make_phantom(settings("pan"))
+    late = panned.trajectories(stride_px=4, shown_in=FRAMES - 1)
     assert late.points_mm.shape[0] == FRAMES
     row, column = late.pixels.T
-    pose = scene.world_from_camera(FRAMES - 1)
+    pose = panned.world_from_camera(FRAMES - 1)
     z_mm = ((late.points_mm[-1] - pose[:3, 3]) @ pose[:3, :3])[:, 2]
-    np.testing.assert_allclose(z_mm, scene.surface_pixels(FRAMES - 1).depth_mm[row, column], rtol=1e-5)
+    np.testing.assert_allclose(z_mm, panned.surface_pixels(FRAMES - 1).depth_mm[row, column], rtol=1e-5)
     assert (late.points_mm[0, :, 0] > 60).all(), "frame 0 does not show them"

@@ -16,6 +16,7 @@ from intrasplat.machine.timing import Stopwatch
 from intrasplat.splat.backend import choose_device
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
+from lab.evaluate.thinned import thinned
 from lab.rivals.fields import drawn_pixels
 from lab.rivals.rival import Rival, Seen
 from lab.rivals.run import Length, Make, run_rival, train_rival
@@ -108,9 +109,10 @@ def check_gradient(rival: Rival, parameters: Iterable[torch.Tensor], step: float
         assert math.isclose(measured, slope, rel_tol=1e-4), (tuple(each.shape), measured, slope)
 
 
-def check_overfit(make: Make, iterations: int) -> None:
-    """After so many iterations on one frame it is learnt above 30 dB, its depth to 1 mm."""
-    clip = small_clip(2)
+def check_overfit(make: Make, iterations: int, *, step_px: int = 1) -> None:
+    """After so many iterations on one frame, or on every step_px-th pixel of it, it is learnt above 30 dB, its depth to
+    1 mm."""
+    clip = thinned(small_clip(2), step_px)
     rival = fitted(make, clip, [1], iterations)
     assert score_db(rival, clip, 1) > 30
     assert depth_error_mm(rival, clip, 1) < 1
@@ -127,14 +129,22 @@ def check_step(rival: Rival) -> None:
         assert int(changed.sum()) >= 0.9 * int(has_gradient.sum())
 
 
-def check_what_counts(make: Make) -> None:
+def check_what_counts(make: Make, iterations: int = 40, *, step_px: int = 1) -> None:
     """Time and the seed change what is learnt; a frame that is held out and pixels of instruments do not."""
-    clip, split, device = small_clip(9), FrameSplit([0, 8], [4], []), choose_device("cpu")
+    clip, split, device = thinned(small_clip(9), step_px), FrameSplit([0, 8], [4], []), choose_device("cpu")
     assert not clip.tissue[[0, 8]].all()
 
     def rival_of(clip: DepthClip, seed: int) -> Rival:
         return run_rival(
-            "rival", make, clip, split, Length(40, None), seed=seed, device=device, waited_s=0, hooks=TrainingHooks()
+            "rival",
+            make,
+            clip,
+            split,
+            Length(iterations, None),
+            seed=seed,
+            device=device,
+            waited_s=0,
+            hooks=TrainingHooks(),
         ).rival
 
     first, spoilt = rival_of(clip, 0), rival_of(spoilt_where_unseen(clip, 4), 0)
@@ -146,9 +156,10 @@ def check_what_counts(make: Make) -> None:
     assert numbers_of(rival_of(clip, 1)) != numbers_of(first)
 
 
-def check_moving_camera(make: Make, iterations: int) -> None:
+def check_moving_camera(make: Make, iterations: int, *, step_px: int = 1) -> None:
     """What it learns from an endoscope that moves, a tenth of its depth missing, fits the pose it is seen from."""
     clip = phantom_clip("still", frames=9, width=64, height=48, moving_camera=True, tools=False, noise=False)
+    clip = thinned(clip, step_px)
     depth_mm = clip.depth_mm.copy()
     depth_mm[np.random.default_rng(0).random(depth_mm.shape) < 0.1] = 0
     rival = fitted(make, dataclasses.replace(clip, depth_mm=depth_mm), [0, 2, 4, 6, 8], iterations)

@@ -73,15 +73,15 @@ def test_encodings_are_sines_and_cosines_of_octaves() -> None:
 
 
 def test_it_overfits_one_frame_above_30_db() -> None:
-    check_overfit(small, 400)
+    check_overfit(small, 140, step_px=2)
 
 
 def test_it_learns_from_a_camera_that_moves_and_from_depth_with_holes() -> None:
-    check_moving_camera(small, 100)
+    check_moving_camera(small, 100, step_px=2)
 
 
 def test_time_matters_held_out_frames_do_not_and_a_seed_gives_the_same_numbers() -> None:
-    check_what_counts(small)
+    check_what_counts(small, step_px=2)
 
 
 def test_it_learns_from_the_start_whatever_the_seed() -> None:

@@ -17,12 +17,12 @@ from intrasplat.machine.timing import Stopwatch
 from intrasplat.methods.registry import PRESETS
 from intrasplat.splat.backend import choose_device
 from intrasplat.train.hooks import TrainingHooks
-from lab.evaluate import stability
+from lab.evaluate import measure, stability
 from lab.evaluate.cells import Cell, capacity_grid, options_of, plan, preset_of
 from lab.evaluate.measure import OF_WHOLE_PICTURES, OPAQUE, Bench
 from lab.evaluate.rows import CURVE_FIELDS, KEY, RUN_FIELDS, TRUTH
 from lab.evaluate.sources import source_of
-from lab.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, scored_step_px
+from lab.rivals import RIVAL_BUDGET_S, RIVAL_SYSTEMS, run, scored_step_px
 from lab.rivals.endogaussian import EndoGaussian
 from lab.rivals.endonerf import EndoNerf
 from lab.rivals.lerplane import LerPlane
@@ -59,8 +59,9 @@ OF_EACH_RIVAL = pytest.mark.parametrize("make", [tiny_nerf, tiny_gaussians, tiny
     ],
 )
 def test_a_rival_s_row_has_every_figure_but_those_it_cannot_have_and_says_why(
-    series: str, make: Make, not_measured: tuple[str, ...]
+    series: str, make: Make, not_measured: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(measure, "TIMED_RENDERS", 2)
     source = source_of(CLIP)
     made: list[Rival] = []
 
@@ -97,20 +98,21 @@ def test_a_step_changes_the_numbers_that_have_a_gradient(make: Make) -> None:
     check_step(make(Seen.of(small_clip(2), [0, 1]), 0))
 
 
-def test_a_budget_ends_the_training_and_scoring_takes_none_of_it() -> None:
+def test_a_budget_ends_the_training_and_scoring_takes_none_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "SCORED_SECONDS", (0.1,))
     rival, clock = tiny_nerf(Seen.of(small_clip(2), [1]), 0), Stopwatch()
     scored: list[int] = []
 
     def score(made: int) -> float:
         scored.append(made)
-        time.sleep(1.0)
+        time.sleep(0.4)
         return 20.0
 
     reports: list[float] = []
     hooks = TrainingHooks(on_progress=lambda now: reports.append(now.fraction))
-    made = train_rival(rival, Length(None, 1.3), clock, hooks, score)
-    assert clock.elapsed_s >= 1.3, "all of the budget is used"
-    assert scored == sorted({*scored, made}), "a second of scoring at the mark of 1 s would have ended it"
+    made = train_rival(rival, Length(None, 0.3), clock, hooks, score)
+    assert clock.elapsed_s >= 0.3, "all of the budget is used"
+    assert scored == sorted({*scored, made}), "0.4 s of scoring at the mark of 0.1 s would have ended it"
     assert reports == sorted(reports)
 
 
