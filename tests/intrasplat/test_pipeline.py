@@ -49,7 +49,7 @@ from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepa
 
 SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv", RECORDED}
 ITERATIONS = 20
-STEREO = PhantomSettings(width=192, height=160, frames=10, period_frames=12)
+STEREO = PhantomSettings(width=128, height=112, frames=10, period_frames=12)
 Drawn = Callable[..., Path]
 Opened = Callable[..., DepthClip]
 Whole = Callable[[str], tuple[Report, Path]]
@@ -481,7 +481,7 @@ def test_recorded_frames_of_the_eyes_that_taught_are_kept_with_the_scene(
     shown: list[DepthClip] = []
     files_of_clip = {"calibration": stereo / "calibration.json", "masks": stereo / "masks.zip"}
     given = request(stereo / "stereo.webm", iterations=2, eyes=eyes, **files_of_clip)
-    report = reconstruct(given, tmp_path, TrainingHooks(on_clip=shown.append))  # type: ignore[arg-type]
+    report = reconstruct(given, tmp_path, TrainingHooks(on_clip=shown.append))
     told = report.recorded
     assert told is not None
     assert (told.eyes, told.frames, told.masks) == (kept, tuple(range(STEREO.frames)), True)

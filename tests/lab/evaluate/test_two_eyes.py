@@ -10,7 +10,7 @@ from lab.benchmarks.bm_two_eyes import FIELDS, main
 from lab.evaluate.rows import read_rows
 from lab.pages.right_eye import TWO_EYES, two_eyes_sections
 
-TINY = ["--clips", "phantom:breathing:160x128:12frames:stereo", "--holdout", "every8", "--iterations", "5"]
+TINY = ["--clips", "phantom:breathing:96x80:9frames:stereo", "--holdout", "every8", "--iterations", "5"]
 
 
 def test_a_benchmark_of_both_eyes_goes_on_where_it_was_stopped_and_the_page_has_a_section_of_its_rows(
@@ -30,7 +30,7 @@ def test_a_benchmark_of_both_eyes_goes_on_where_it_was_stopped_and_the_page_has_
     assert main([*asked, "--eyes", "both", "--again"]) == 0
     assert [row["series"] for row in read_rows(tmp_path / TWO_EYES)] == ["fast:eyes=left", "fast"]
     page = "".join(two_eyes_sections(tmp_path))
-    assert "| phantom-breathing-160x128-12frames-stereo | every8 | fast:eyes=left | 5 iterations |" in page
+    assert "| phantom-breathing-96x80-9frames-stereo | every8 | fast:eyes=left | 5 iterations |" in page
     assert "| clip | held out | series | limit | left, dB | right, dB | warp, dB | 10 degrees |" in page
 
 
