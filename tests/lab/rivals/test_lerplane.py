@@ -27,7 +27,7 @@ from tests.lab.rivals.cases import (
 )
 
 SMALL = LerPlaneSettings(
-    rays=512, samples=8, cells=(16, 64), features=8, time_cells=4, proposal_samples=(16, 12), proposal_cells=(32,),
+    rays=256, samples=8, cells=(16, 64), features=8, time_cells=4, proposal_samples=(16, 12), proposal_cells=(32,),
     proposal_features=4, hidden=32, rate=2e-2,
 )  # fmt: skip
 """What learns 64x48 pixels in seconds."""
