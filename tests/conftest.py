@@ -10,6 +10,7 @@ import pytest
 from intrasplat.machine.cores import keep_libraries_to_one_thread
 
 keep_libraries_to_one_thread()  # as every program of ours does, before NumPy is imported
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's threads wait for each other without using a core
 
 import numpy as np  # noqa: E402
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,10 +39,27 @@ class _Sprout:
 def draw_vessels(
     rng: np.random.Generator, extent_mm: tuple[float, float], texel_mm: float, shape: tuple[int, int]
 ) -> tuple[Image32, Image32]:
-    """(arteries, veins) [rows, columns] in [0, 1]: share of a texel's depth that the vessel fills."""
+    """(arteries, veins) [rows, columns] in [0, 1], to be read: share of a texel's depth that the vessel fills.
+
+    The last ones are remembered: phantoms of one seed and size have the same, whatever their motion.
+    """
+    arteries, veins, after = _remembered(pickle.dumps(rng.bit_generator.state), extent_mm, texel_mm, shape)
+    rng.bit_generator.state = after
+    return arteries, veins
+
+
+@lru_cache(maxsize=8)
+def _remembered(
+    state: bytes, extent_mm: tuple[float, float], texel_mm: float, shape: tuple[int, int]
+) -> tuple[Image32, Image32, Any]:
+    """The same, and the generator's state afterwards."""
+    rng = np.random.default_rng()
+    rng.bit_generator.state = pickle.loads(state)
     arteries = _draw(rng, extent_mm, texel_mm, shape, MM2_PER_ARTERY, ARTERY_MM, ARTERY_BLUR_MM)
     veins = _draw(rng, extent_mm, texel_mm, shape, MM2_PER_VEIN, VEIN_MM, VEIN_BLUR_MM)
-    return arteries, veins
+    for each in (arteries, veins):
+        each.flags.writeable = False
+    return arteries, veins, rng.bit_generator.state
 
 
 def _draw(

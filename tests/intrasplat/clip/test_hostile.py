@@ -5,29 +5,89 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from intrasplat.clip import DepthClip
 from intrasplat.decode import StereoRecording, decode_clip
+from intrasplat.decode.contained import run_contained
+from intrasplat.decode.decoding import allowance_of
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
 from intrasplat.intake.sniff import check_file
+from intrasplat.options import ClipOptions
 from tests.intrasplat.clip.hostile import CALIBRATION, CORPUS, VIDEO, Hostile, endonerf, npy
 
 AT_ONCE = 2
 """Decoding processes: most of a refusal is the time that one takes to start."""
+READ_ALL = """
+from intrasplat.decode.child import _described, serve
+
+
+def work_of():
+    from intrasplat.decode.reading import read_clip
+
+    def read_all(request, folder, reports):
+        errors = {}
+        for name, paths in request["files"].items():
+            own = folder / str(len(errors))
+            own.mkdir()
+            try:
+                errors[name] = {"read": read_clip(request | {"paths": paths}, own, reports)}
+            except Exception as error:
+                errors[name] = _described(error)
+        return errors
+
+    return read_all
+
+
+serve(work_of)
+"""
+"""A decoder that reads one clip after the other, confined as ever, and answers with what is wrong with each."""
 
 
 @pytest.fixture(scope="module")
-def decoded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[StereoRecording | DepthClip]]]:
-    """What becomes of every file of the corpus."""
+def refused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[object]]]:
+    """What becomes of every file of the corpus: of those that a look at their bytes or directory refuses, in one
+    decoder, to which that look is left; of each other in a decoder of its own.
+    """
+    program = tmp_path_factory.mktemp("program") / "read_all.py"
+    program.write_text(READ_ALL)
+    files = {name: given(tmp_path_factory.mktemp("hostile"), hostile) for name, hostile in CORPUS.items()}
+    early = [name for name, hostile in CORPUS.items() if hostile.refused_at == "upload"]
     with ThreadPoolExecutor(AT_ONCE) as threads:
+        answers = threads.submit(read_all, program, {name: files[name] for name in early})
         yield {
-            name: threads.submit(read_whole, **given(tmp_path_factory.mktemp("hostile"), hostile))
-            for name, hostile in CORPUS.items()
+            name: threads.submit(answer, answers, name) if name in early else threads.submit(read_whole, **files[name])
+            for name in CORPUS
         }
+
+
+def read_all(program: Path, files: dict[str, dict[str, Path]]) -> dict[str, Any]:
+    """What one decoder says of each of these clips."""
+    limits = ClipLimits()
+    paths = {
+        name: {"path" if part == "clip" else part: str(path) for part, path in each.items()}
+        for name, each in files.items()
+    }
+    request = {
+        "files": paths,
+        "options": ClipOptions().model_dump(include=set(ClipOptions.model_fields)),
+        "layouts": [],
+        "readable": sorted({path for each in paths.values() for path in each.values()}),
+        "limits": limits.numbers(),
+    }
+    return run_contained(request, allowance_of(limits), program=(str(program),))
+
+
+def answer(answers: Future[dict[str, Any]], name: str) -> None:
+    """Raises what a decoder of its own would."""
+    answered = answers.result()[name]
+    assert "kind" in answered, f"{name} is read"
+    assert answered["kind"] in ("input", "limit"), answered
+    raise InputError(*(answered[each] for each in ("field", "problem", "remedy")))
 
 
 def read_whole(**files: Path) -> StereoRecording | DepthClip:
@@ -46,12 +106,10 @@ def given(tmp_path: Path, hostile: Hostile) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", CORPUS)
-def test_a_hostile_file_is_refused_with_its_field_and_a_remedy(
-    decoded: dict[str, Future[StereoRecording | DepthClip]], name: str
-) -> None:
+def test_a_hostile_file_is_refused_with_its_field_and_a_remedy(refused: dict[str, Future[object]], name: str) -> None:
     hostile = CORPUS[name]
     with pytest.raises(InputError, match=hostile.problem) as caught:
-        decoded[name].result()
+        refused[name].result()
     assert caught.value.field == hostile.part
     assert caught.value.remedy
     assert "crashed" not in caught.value.problem

@@ -214,12 +214,22 @@ def run_contained(script: Path, request: dict[str, Any], allowance: Allowance, *
         return decoder.until_ended()
 
 
+WITHOUT_LIBRARIES = (
+    "import sys, types\n"
+    "from importlib.util import find_spec\n"
+    "package = types.ModuleType('intrasplat.decode')\n"
+    "package.__path__ = find_spec('intrasplat').submodule_search_locations[0] + '/decode',\n"
+    "sys.modules[package.__name__] = package\n"
+)
+"""What a stand-in begins with: the package is there, without NumPy and OpenCV, which take most of a decoder's start."""
+
+
 def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
     """The result of a process that does `work` where the decoder would be."""
     script = tmp_path / "stand_in.py"
     lines = "\n    ".join(work.splitlines())
     script.write_text(
-        "from intrasplat.decode.child import serve\n"
+        f"{WITHOUT_LIBRARIES}from intrasplat.decode.child import serve\n"
         f"def work(request, folder, reports):\n    {lines}\n    return {{}}\n"
         "serve(lambda: work)\n"
     )

@@ -44,7 +44,7 @@ def short_cycles() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def clip() -> DepthClip:
-    return phantom_clip(frames=34)
+    return phantom_clip(frames=34, width=64, height=48)
 
 
 @pytest.fixture(scope="module")
