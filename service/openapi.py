@@ -92,7 +92,7 @@ class DescribedApp(FastAPI):
     _document: ClassVar[dict[str, Any] | None] = None
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document, built once a process, in 0.6 s: every app of create_app has the same routes."""
+        """The OpenAPI document, built once a process: every app of create_app has the same routes."""
         if DescribedApp._document is None:
             DescribedApp._document = _completed(super().openapi())
         return DescribedApp._document
