@@ -45,10 +45,10 @@ def test_compiling_ahead_leaves_no_kernel_to_be_compiled_later() -> None:
 
 
 def test_two_processes_that_compile_at_once_leave_a_cache_that_serves_a_third(tmp_path: Path) -> None:
-    both = [start("-c", SORT, cache=tmp_path) for _ in range(2)]
+    both = [start("-c", MEAN, cache=tmp_path) for _ in range(2)]
     answers = [answer_of(process) for process in both]
-    answers.append(answer_of(start("-c", SORT, cache=tmp_path)))
-    assert [answer["order"] for answer in answers] == [[1, 2, 0]] * 3
+    answers.append(answer_of(start("-c", MEAN, cache=tmp_path)))
+    assert [answer["mean"] for answer in answers] == [4] * 3
     assert [answers[0][key] + answers[1][key] for key in ("loaded", "compiled")] in ([0, 2], [1, 1])
     assert (answers[2]["loaded"], answers[2]["compiled"]) == (1, 0)
 
@@ -57,10 +57,10 @@ def test_without_a_folder_to_keep_them_in_kernels_are_compiled_into_a_temporary_
     in_the_way = tmp_path / "file"
     in_the_way.touch()
     out, err = finish(start("-c", WHERE, cache=in_the_way))
-    temporary, total = out.split()
+    mean, temporary = out.split()
+    assert mean == "4"
     assert str(in_the_way) in err
     assert "set INTRASPLAT_CACHE to a folder that can be written" in err
-    assert total == "0.0"
     assert "intrasplat-kernels-" in temporary
     assert not Path(temporary).exists(), "the temporary folder is left behind"
 
@@ -72,24 +72,17 @@ def test_declaring_kernels_touches_no_file(tmp_path: Path) -> None:
 
 
 WHERE = """
-import numba, numpy
-from intrasplat.splat.cpu import bins, Rasterizer
-none, scratch = numpy.zeros((0, 12), numpy.float32), (numpy.zeros(0, numpy.int32), numpy.zeros(0, numpy.uint32))
-assert bins.depth_order(none, none[:, 0].copy(), *scratch, *scratch)[0] == 0
-print(numba.config.CACHE_DIR, Rasterizer(8, 8).statistics.sum())
+import numba
+from intrasplat.scene.differences import _mean
+print(_mean(2, 6, 0, 0, 1), numba.config.CACHE_DIR)
 """
 """Compiles one small kernel, so that the folder is really used."""
 
-SORT = """
-import json, numpy
-from intrasplat.splat.cpu import bins
+MEAN = """
+import json
+from intrasplat.scene.differences import _mean
 
-splats = numpy.zeros((3, 12), numpy.float32)
-splats[:, 9] = 3, 1, 2  # depth
-order, other = numpy.zeros((2, 3), numpy.int32)
-keys, other_keys = numpy.zeros((2, 3), numpy.uint32)
-visible, in_order = bins.depth_order(splats, splats[:, 9].copy(), order, keys, other, other_keys)
-found, stats = (order if in_order else other)[:visible].tolist(), bins.depth_order.stats
-print(json.dumps({"order": found, "loaded": stats.cache_hits.total(), "compiled": stats.cache_misses.total()}))
+mean, stats = _mean(2, 6, 0, 0, 1), _mean.stats
+print(json.dumps({"mean": mean, "loaded": stats.cache_hits.total(), "compiled": stats.cache_misses.total()}))
 """
-"""Uses the kernel that sorts by depth, and says whether it was loaded or compiled."""
+"""Uses the kernel that is compiled soonest, and says whether it was loaded or compiled."""
