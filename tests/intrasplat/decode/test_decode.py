@@ -10,7 +10,6 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,18 @@ import pytest
 from intrasplat.clip import ClipLimits, DepthClip, open_clip
 from intrasplat.clip.calibration import load_calibration, rectify
 from intrasplat.decode import StereoRecording, decode_clip
-from intrasplat.decode.contained import Decoder, DecoderKilledError, Patience, keep_decoder_ready
+from intrasplat.decode.contained import DecoderKilledError, Patience, keep_decoder_ready
 from intrasplat.decode.guard import PROTECTIONS, Allowance
 from intrasplat.errors import Cancelled, InputError, LimitError
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.stereo import estimate_depth
 from tests.intrasplat.clip.conftest import Studio
+from tests.intrasplat.decode.stand_in import run_stand_in
 
 CALIBRATION = (
     '{"model": "rectified", "width": 96, "height": 80, "fx_px": 90, "fy_px": 90, "cx_px": 48, "cy_px": 40, '
     '"baseline_mm": 4}'
 )
-ALLOWANCE = Allowance(memory_bytes=1 << 30, file_bytes=1 << 20, cpu_s=60)
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's protections are Linux's")
 
 
@@ -207,36 +206,6 @@ def test_the_report_says_what_protected_the_worker(studio: Studio) -> None:
         assert word in decoded.assumptions[-1].text  # as held, or as what the kernel did not grant
 
 
-def run_contained(script: Path, request: dict[str, Any], allowance: Allowance, **asked: Any) -> dict[str, Any]:
-    """The result of a script that runs where the decoder would."""
-    with closing(Decoder((str(script),))) as decoder:
-        decoder.ask(request, allowance, **asked)
-        return decoder.until_ended()
-
-
-WITHOUT_LIBRARIES = (
-    "import sys, types\n"
-    "from importlib.util import find_spec\n"
-    "package = types.ModuleType('intrasplat.decode')\n"
-    "package.__path__ = find_spec('intrasplat').submodule_search_locations[0] + '/decode',\n"
-    "sys.modules[package.__name__] = package\n"
-)
-"""What a stand-in begins with: the package is there, without NumPy and OpenCV, which take most of a decoder's start."""
-
-
-def run_stand_in(tmp_path: Path, work: str, **more: Any) -> dict[str, Any]:
-    """The result of a process that does `work` where the decoder would be."""
-    script = tmp_path / "stand_in.py"
-    lines = "\n    ".join(work.splitlines())
-    script.write_text(
-        f"{WITHOUT_LIBRARIES}from intrasplat.decode.child import serve\n"
-        f"def work(request, folder, reports):\n    {lines}\n    return {{}}\n"
-        "serve(lambda: work)\n"
-    )
-    request = {"readable": more.pop("readable", [])}
-    return run_contained(script, request, more.pop("allowance", ALLOWANCE), **more)
-
-
 @pytest.mark.parametrize(
     ("work", "problem"),
     [
@@ -350,11 +319,9 @@ def test_no_way_of_sending_a_signal_reaches_another_process(tmp_path: Path, call
 
 @linux
 def test_a_decoder_with_a_thread_that_is_not_confined_reads_nothing(tmp_path: Path) -> None:
-    script = tmp_path / "threaded.py"
     thread = "import threading, time; threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
-    script.write_text(f"{thread}from intrasplat.decode.child import serve\nserve(lambda: lambda *given: {{}})\n")
     with pytest.raises(InputError, match="crashed"):
-        run_contained(script, {"readable": []}, ALLOWANCE)
+        run_stand_in(tmp_path, "", before=thread)
 
 
 @linux
