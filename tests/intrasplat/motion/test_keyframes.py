@@ -16,7 +16,7 @@ from intrasplat.motion.keyframes import MAX_NEW_SHARE, keyframes, track_keyframe
 from intrasplat.motion.tracks import Tracks, moved_along, track
 from lab.phantom import CameraPath, Motion, Phantom, PhantomSettings, make_phantom
 
-WIDTH, HEIGHT, FRAMES = 160, 128, 40
+WIDTH, HEIGHT, FRAMES = 160, 128, 24
 TRAIN = [index for index in range(FRAMES) if index % 8 != 1]
 
 
