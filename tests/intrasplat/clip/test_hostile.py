@@ -12,7 +12,7 @@ import pytest
 
 from intrasplat.clip import DepthClip
 from intrasplat.decode import StereoRecording, decode_clip
-from intrasplat.decode.contained import run_contained
+from  import run_contained
 from intrasplat.decode.decoding import allowance_of
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
