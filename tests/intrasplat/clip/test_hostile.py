@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 from intrasplat.clip import DepthClip
 from intrasplat.decode import StereoRecording, decode_clip
-from  import run_contained
+from intrasplat.decode.contained import Decoder
 from intrasplat.decode.decoding import allowance_of
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
@@ -79,7 +80,9 @@ def read_all(program: Path, files: dict[str, dict[str, Path]]) -> dict[str, Any]
         "readable": sorted({path for each in paths.values() for path in each.values()}),
         "limits": limits.numbers(),
     }
-    return run_contained(request, allowance_of(limits), program=(str(program),))
+    with closing(Decoder((str(program),))) as decoder:
+        decoder.ask(request, allowance_of(limits))
+        return decoder.until_ended()
 
 
 def answer(answers: Future[dict[str, Any]], name: str) -> None:
