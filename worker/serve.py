@@ -1,9 +1,9 @@
-"""Answer render and export requests: a ZeroMQ ROUTER in a thread during training (contract/wire/rendering.py).
+"""Answer the requests of contract/wire/rendering.py: a ZeroMQ ROUTER in a thread, as long as the device process lives.
 
-The thread reads all waiting messages, lets the scheduler compute one part of one answer (worker/scheduler.py), sends
-completed answers, and reads again. A request that would wait too long is refused, with the time at which to ask again.
-The permissions of its folder protect a unix socket. TCP is encrypted, and only callers who know the installation's
-secret are answered.
+The thread answers while the process trains and while it is idle. It reads all waiting messages, lets the scheduler
+compute one part of one answer (worker/scheduler.py), sends completed answers, and reads again. A request that would
+wait too long is refused, with the time at which to ask again. The permissions of its folder protect a unix socket. TCP
+is encrypted, and only callers who know the installation's secret are answered.
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
-"""Render and export finished scenes, which stay loaded between requests, and render the job in training.
+"""Answer the requests of contract/wire/rendering.py from finished scenes and from the job in training.
 
-A scene whose folder was removed leaves memory at once: a deleted patient's tissue is neither shown nor stored.
+    RenderRequest, RecordedRequest, CamerasRequest   a finished scene or the job in training
+    ExportRequest, MeasureRequest                    finished scenes only
+
+Scenes stay loaded between requests. A scene whose folder was removed leaves memory at once: a deleted patient's tissue
+is neither shown nor stored.
 """
 
 from __future__ import annotations
@@ -68,7 +72,7 @@ LARGE_PIXELS = 1 << 19
 
 
 class Views:
-    """Answers render and export requests from a store's scenes and a job's snapshots; for use in one thread.
+    """Answers requests from a store's scenes and a job's snapshots; for use in one thread.
 
     `cached` names the scenes in memory, with the last used one at the end; other threads may read it.
     """
