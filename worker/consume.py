@@ -202,7 +202,7 @@ class _Job:
         out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
-        child.send(RunJob(record=record, spool=spool, out=out, kept=resume_dir))
+        child.send(RunJob(record=record, spool=spool, out=out, resume_dir=resume_dir))
         detector, asked_s = HangDetector(), None
         while True:
             report = child.next_report(LOOK_PERIOD_S)

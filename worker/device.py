@@ -206,10 +206,10 @@ def work_on(
     snapshots.begin(job_id)
     try:
         request = request_of(order.record, order.spool, device, limits, segmenter)
-        return make_or_start_anew(request, order.out, order.kept, hooks)
+        return make_or_start_anew(request, order.out, order.resume_dir, hooks)
     except Cancelled:
         snapshots.drop(job_id)
-        return Stopped(checkpointed=(order.kept / RESUME_FILE).exists())
+        return Stopped(checkpointed=(order.resume_dir / RESUME_FILE).exists())
     except Exception as error:
         snapshots.drop(job_id)
         if gpu_is_lost():
@@ -280,14 +280,14 @@ def request_of(
     )
 
 
-def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, hooks: TrainingHooks) -> Made:
-    """Train the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
+def make_or_start_anew(request: ReconstructionRequest, out: Path, resume_dir: Path, hooks: TrainingHooks) -> Made:
+    """Train the scene, resuming the state in `resume_dir`; start again if it is damaged or of another version."""
     try:
-        return make(request, out, hooks, kept)
+        return make(request, out, hooks, resume_dir)
     except ResumeMismatch as error:
         logger.warning("training starts again, because the stored state cannot be resumed: %s", error.__cause__)
-        (kept / RESUME_FILE).unlink()
-        return make(request, out, hooks, kept)
+        (resume_dir / RESUME_FILE).unlink()
+        return make(request, out, hooks, resume_dir)
 
 
 def _socket_endpoint(store: Store, name: str) -> str:

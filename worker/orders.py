@@ -29,13 +29,13 @@ class _Message(BaseModel):
 
 
 class RunJob(_Message):
-    """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `kept`."""
+    """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `resume_dir`."""
 
     kind: Literal["run"] = "run"
     record: JobRecord
     spool: Path
     out: Path
-    kept: Path
+    resume_dir: Path
 
 
 class ScoreScene(_Message):
@@ -48,7 +48,7 @@ class ScoreScene(_Message):
 
 
 class StopJob(_Message):
-    """Stop what runs; an unfinished job stores its state in `kept`. Ignored while nothing runs."""
+    """Stop what runs; an unfinished job stores its state in `resume_dir`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
@@ -89,7 +89,7 @@ class Scored(_Message):
 
 
 class Stopped(_Message):
-    """The work stopped as ordered. checkpointed: training had started, and its state is in `kept`."""
+    """The work stopped as ordered. checkpointed: training had started, and its state is in `resume_dir`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
