@@ -16,7 +16,18 @@ from pathlib import Path
 from typing import TypeAlias
 
 from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
-from worker.orders import Advanced, DeviceOrder, Failed, Finished, Holding, Ready, Scored, Stopped, line_of, read_report
+from worker.orders import (
+    Advanced,
+    CachedScenes,
+    DeviceOrder,
+    Failed,
+    Finished,
+    Ready,
+    Scored,
+    Stopped,
+    line_of,
+    read_report,
+)
 
 MAX_START_S = 240.0
 """Time to import torch and compile all kernels on a slow machine with an empty cache."""
@@ -92,7 +103,7 @@ class DeviceChild:
                     logger.warning("the device process printed a line of %d bytes that is not a report", len(line))
                 elif isinstance(report, Ready):
                     self.ready = report
-                elif isinstance(report, Holding):
+                elif isinstance(report, CachedScenes):
                     self.scenes = report.scenes
                 else:
                     self._reports.put(report)

@@ -42,9 +42,9 @@ from worker.job_errors import describe
 from worker.orders import (
     FETCHING,
     Advanced,
+    CachedScenes,
     Failed,
     Finished,
-    Holding,
     Ready,
     RunJob,
     Scored,
@@ -118,7 +118,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 
     def report_cached_scenes() -> None:
         views.forget_purged()
-        channel.send_if_new(Holding(scenes=views.cached))
+        channel.send_if_new(CachedScenes(scenes=views.cached))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     scheduler = Scheduler(

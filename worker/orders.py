@@ -1,7 +1,7 @@
 """The messages between the supervisor and its device process, one JSON document per line.
 
     supervisor -> child   on the child's stdin    RunJob, ScoreScene, StopJob; when stdin closes, the child ends at once
-    child -> supervisor   on the child's stdout   Ready once; Holding at any time; for each order any number of
+    child -> supervisor   on the child's stdout   Ready once; CachedScenes at any time; for each order any number of
                                                   Advanced, then its end
 
 RunJob ends with Stopped or Failed, or with Finished followed by Scored or Stopped. ScoreScene ends with Scored or
@@ -61,10 +61,10 @@ class Ready(_Message):
     device: str
 
 
-class Holding(_Message):
+class CachedScenes(_Message):
     """The scenes in the child's memory."""
 
-    kind: Literal["holding"] = "holding"
+    kind: Literal["cached_scenes"] = "cached_scenes"
     scenes: tuple[str, ...]
 
 
@@ -105,7 +105,7 @@ class Failed(_Message):
 
 
 DeviceOrder: TypeAlias = RunJob | ScoreScene | StopJob
-DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Scored | Stopped | Failed
+DeviceReport: TypeAlias = Ready | CachedScenes | Advanced | Finished | Scored | Stopped | Failed
 
 _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
 _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])

@@ -125,7 +125,7 @@ def main() -> None:
         Path(os.environ["INTRASPLAT_LAST_WORDS"]).write_text(json.dumps(lack))
         sys.exit(5)
     tell("ready", endpoint="ipc:///nowhere", device="cpu")
-    tell("holding", scenes=["a" * 32])
+    tell("cached_scenes", scenes=["a" * 32])
     stop = threading.Event()
     for line in sys.stdin:
         order: dict[str, Any] = json.loads(line)
