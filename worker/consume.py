@@ -26,13 +26,12 @@ from contract.store.store import Store
 from contract.wire.job import JobProgress, JobRecord, JobState
 from intrasplat.errors import ErrorCode, IntrasplatError, UnavailableError
 from intrasplat.files.disk_errors import StoreFullError
-from worker.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
+from worker.child import ChildKeeper, DeviceChild, Ended, watch
 from worker.claim_file import ClaimFile
 from worker.disk_space import FreeSpace
-from worker.hang import HangDetector
 from worker.heartbeat import Heartbeat
 from worker.job_errors import describe
-from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.orders import FETCHING, Failed, Finished, RunJob, Scored, Stopped
 from worker.scores import AwaitedScores, InterruptedScores
 from worker.spans import StageSpans, attempt_span
 
@@ -203,26 +202,12 @@ class _Job:
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
         child.send(RunJob(record=record, spool=spool, out=out, resume_dir=resume_dir))
-        detector, asked_s = HangDetector(), None
-        while True:
-            report = child.next_report(LOOK_PERIOD_S)
-            if isinstance(report, Finished | Stopped | Failed):
-                self.is_scoring = isinstance(report, Finished)
-                return report
-            if isinstance(report, Ended):
-                return Died(report.cause, excused=asked_s is not None)
-            if isinstance(report, Advanced):
-                detector.observe(report.progress)
-                self._report(report.progress)
-            if asked_s is None and self._is_to_stop():
-                child.send(StopJob())
-                asked_s = time.monotonic()
-            if asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S:
-                child.kill()
-                return Died(f"did not stop within {MAX_STOP_S:g} s and was killed", excused=True)
-            if detector.is_hung():
-                child.kill()
-                return Died(f"hung in stage {detector.stage!r} and was killed", excused=asked_s is not None)
+        report = watch(child, self._is_to_stop, self._report)
+        if isinstance(report, Ended):
+            return Died(report.cause, excused=report.was_stopping)
+        assert not isinstance(report, Scored)  # follows Finished
+        self.is_scoring = isinstance(report, Finished)
+        return report
 
     def _report(self, progress: JobProgress) -> None:
         self._heart.report(progress)
