@@ -212,9 +212,7 @@ def work_on(
         return Stopped(checkpointed=(order.resume_dir / RESUME_FILE).exists())
     except Exception as error:
         snapshots.drop(job_id)
-        if gpu_is_lost():
-            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
-            raise SystemExit(1) from error
+        exit_if_gpu_is_lost(error)
         return Failed(error=describe(error), fault=type(error).__name__)
 
 
@@ -234,15 +232,24 @@ def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stoppe
         logger.warning("a scene cannot be scored now: %s", error)
         return Stopped(checkpointed=False)
     except Exception as error:
-        if gpu_is_lost():
-            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
-            raise SystemExit(1) from error
+        exit_if_gpu_is_lost(error)
         logger.error("a scene could not be scored: %s", type(error).__name__, exc_info=error)
         try:
             report = first if isinstance(first, Report) else Report.model_validate_json(first.read_bytes())
         except (OSError, ValidationError):  # it was purged, or is damaged
             return Stopped(checkpointed=False)
         return Scored(report=without_scores(report, type(error).__name__))
+
+
+def exit_if_gpu_is_lost(error: Exception) -> None:
+    """End this process if it has lost the GPU, which only another process can use again.
+
+    Raises:
+        SystemExit: the GPU is lost.
+    """
+    if gpu_is_lost():
+        logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
+        raise SystemExit(1) from error
 
 
 class _Reporter:
