@@ -51,7 +51,7 @@ from intrasplat.view.lenses import Lenses
 from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
 from intrasplat.view.recorded import live_frame, stored_frame
-from intrasplat.view.render import ROUNDING, ViewRequest, frame_in_parts, renderer_of
+from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts, renderer_of
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.reply import NotYetError, Reply
@@ -230,7 +230,7 @@ class Views:
         pose, lens = self._standing(scene, request)
         camera = camera_of(lens, request.camera, request.max_pixels)
         size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
-        own = endoscope_pose(scene, shown_time(scene, request.t)) if pose is None else pose
+        own = endoscope_pose(scene, clamped_to_clip(scene, request.t)[0]) if pose is None else pose
         pose_rows = tuple(own[:3].flatten().tolist())
         taken_by = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
         detail = LEVELS[level]
@@ -269,7 +269,7 @@ class Views:
         if registration is None:
             problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
             raise InputError("eye", problem, "Ask for eye=left.")
-        return right_eye(scene, shown_time(scene, request.t), registration)
+        return right_eye(scene, clamped_to_clip(scene, request.t)[0], registration)
 
     def _measured(self, scene: TrainedScene, request: MeasureRequest) -> Reply:
         """A Measurement as JSON. Its time does not predict that of renders."""
@@ -283,7 +283,7 @@ class Views:
             request, lambda: export_parts(scene, request.format, request.options, self._device)
         )
         known, t = EXPORT_FORMATS.get(request.format), request.options.t or 0.0
-        shown, warnings = shown_time(scene, t), scene.pose_warnings
+        shown, warnings = clamped_to_clip(scene, t)[0], scene.pose_warnings
         if t > shown + ROUNDING:
             outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
             warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside), *warnings)
@@ -323,7 +323,7 @@ def _reply(scene: TrainedScene, frame: View, request: RenderRequest, snapshot: S
             # One moment is shown at every time, and no eye has trained the scene.
             unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
         warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
-    shown = shown_time(scene, request.t)
+    shown, _ = clamped_to_clip(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
     return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
@@ -343,8 +343,3 @@ def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:
     )
     iteration = None if snapshot is None else snapshot.iteration
     return Reply(cameras.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, 0.0, iteration=iteration, is_untimed=True)
-
-
-def shown_time(scene: TrainedScene, t: float) -> float:
-    """The model time that is shown for t: at most that of the last frame."""
-    return min(t, (scene.frame_count - 1) / scene.frame_count)
