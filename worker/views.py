@@ -123,7 +123,7 @@ class Views:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
             yield  # loading the scene may have taken long
         else:
-            snapshot = self._trained(request.scene_id)
+            snapshot = self._newest_snapshot(request.scene_id)
             scene = snapshot.scene
         if isinstance(request, CamerasRequest):
             return _cameras(scene, snapshot)
@@ -193,7 +193,7 @@ class Views:
         shown = index / clip.frame_count
         return Reply(picture, media_type, shown, iteration=iteration, is_untimed=True)
 
-    def _trained(self, job_id: str) -> Snapshot:
+    def _newest_snapshot(self, job_id: str) -> Snapshot:
         """The newest snapshot; may wait for training, without slowing it."""
         snapshot = self._snapshots.newest(job_id)
         if snapshot is None:
@@ -227,12 +227,12 @@ class Views:
         self, scene: TrainedScene, request: RenderRequest, snapshot: Snapshot | None, level: int
     ) -> Parts[Reply]:
         """One render. snapshot: the one that the scene comes from; None: the scene is finished. level: of detail."""
-        pose, lens = self._standing(scene, request)
+        pose, lens = self._pose_and_lens(scene, request)
         camera = camera_of(lens, request.camera, request.max_pixels)
         size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
         own = endoscope_pose(scene, clamped_to_clip(scene, request.t)[0]) if pose is None else pose
         pose_rows = tuple(own[:3].flatten().tolist())
-        taken_by = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
+        picture_camera = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
         detail = LEVELS[level]
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         drawn = thinned(scene, detail.gaussians)
@@ -249,9 +249,9 @@ class Views:
         frame = frame.enlarged(*size) if level else frame
         body = yield from _encoded(frame, request, range_mm)
         reply = _reply(scene, frame, request, snapshot, body)
-        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=taken_by)
+        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=picture_camera)
 
-    def _standing(self, scene: TrainedScene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
+    def _pose_and_lens(self, scene: TrainedScene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
         """The pose of the caller's camera (None: the endoscope's left eye), and its lens before the caller's overrides.
 
         Raises:
