@@ -48,10 +48,10 @@ class Intake:
         own, share = sum(place.tenant == tenant for place in self._places), self._settings.tenant_share
         if own and own + 1 > self._settings.max_uploads * share:
             detail = f"{own} of your uploads are being received, as many as one tenant may send at once."
-            raise Problem(429, detail, field="uploads", remedy="Come back when one of them is through.")
+            raise Problem(429, detail, field="uploads", remedy="Send this one when one of them has ended.")
         if len(self._places) >= self._settings.max_uploads:
-            detail = f"{len(self._places)} uploads are being received, as many as may be."
-            raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
+            detail = f"{len(self._places)} uploads are being received, the most at once (INTRASPLAT_MAX_UPLOADS)."
+            raise Problem(503, detail, field="uploads", remedy="Send this one when one of them has ended.")
         if declared_bytes:
             self.check(tenant, declared_bytes, part)
         place = UploadSlot(declared_bytes, tenant)
@@ -75,9 +75,9 @@ class Intake:
         own_bytes = self._reserved_bytes(tenant)
         allowed_bytes = self._settings.tenant_share * (available_bytes + own_bytes)
         if own_bytes and own_bytes + declared_bytes > allowed_bytes:
-            detail = f"Your uploads have been promised {own_bytes} bytes that have not come, and {declared_bytes} more "
-            detail += f"are beyond the {allowed_bytes:.0f} of one tenant."
-            raise Problem(429, detail, field="uploads", remedy="Send them, or give some up: DELETE /uploads/{id}.")
+            detail = f"Your uploads have {own_bytes} bytes of the disk reserved; {declared_bytes} more would exceed the "
+            detail += f"{allowed_bytes:.0f} of one tenant."
+            raise Problem(429, detail, field="uploads", remedy="Finish these uploads, or delete some: DELETE /uploads/{id}.")
 
     def has_free_space(self) -> bool:
         """Whether the disk has more than the minimum free space; otherwise no clip is accepted."""

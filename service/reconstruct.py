@@ -187,7 +187,7 @@ def _make_job_of(
         Problem: 507: the disk is full; the uploads stay.
     """
     if not services.intake.has_free_space():
-        raise disk_full("The disk has too little room; the uploads are kept.", services.intake.space_remedy())
+        raise disk_full("The disk has too little free space; the uploads stay on it.", services.intake.space_remedy())
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:

@@ -96,7 +96,7 @@ class Consumer:
         while (child := self._keeper.child(self._end)) is not None:
             was_short, short = short, self._free_space.is_short()
             if short != was_short:
-                logger.warning("jobs wait for room on the disk" if short else "the disk has room for jobs again")
+                logger.warning("jobs wait for free space on the disk" if short else "the disk has enough free space for jobs again")
             if short:
                 self._end.wait(claim_timeout_s)
                 continue
@@ -271,7 +271,7 @@ class _Job:
         if isinstance(result, Stopped) and result.checkpointed:
             self._store.hand_over(self._claim.job_id, self._claim.attempt)
         accepted = self._retry_queue(lambda: self._queue.release(self._claim, died=died))
-        return accepted, "handed back, its worker's death held against it" if died else "handed back"
+        return accepted, "released, counted as a death" if died else "released"
 
     def _publish(self) -> bool | None:
         """Publish the scene, then finish the record: a caller who sees that the job is done must find its scene."""

@@ -68,10 +68,10 @@ class AwaitedScores:
             try:
                 self._store.add_scores(*self._scene, scored())
             except SceneError as error:  # it was purged, or is damaged
-                self._log.warning("the scores were not kept: %s", error)
+                self._log.warning("the scores were not stored: %s", error)
                 self._store.expect_no_scores(*self._scene)
         except UnavailableError as error:
-            self._log.warning("the scores were not kept: %s", error)
+            self._log.warning("the scores were not stored: %s", error)
             return False
         return True
 
@@ -104,7 +104,7 @@ class InterruptedScores:
                 self._warn_once(job_id, attempt, error)
                 continue
             if order is not None:
-                logger.info("the scores of an earlier attempt are made up for", extra=_named(job_id, attempt))
+                logger.info("scoring a scene whose scoring was interrupted", extra=_named(job_id, attempt))
                 child.send(order)
                 scores = AwaitedScores(self._store, self._name, order.record)
                 if not scores.take(child, stop=self._is_to_stop(), gives_up=True):
