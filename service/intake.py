@@ -75,9 +75,13 @@ class Intake:
         own_bytes = self._reserved_bytes(tenant)
         allowed_bytes = self._settings.tenant_share * (available_bytes + own_bytes)
         if own_bytes and own_bytes + declared_bytes > allowed_bytes:
-            detail = f"Your uploads have {own_bytes} bytes of the disk reserved; {declared_bytes} more would exceed the "
+            detail = (
+                f"Your uploads have {own_bytes} bytes of the disk reserved; {declared_bytes} more would exceed the "
+            )
             detail += f"{allowed_bytes:.0f} of one tenant."
-            raise Problem(429, detail, field="uploads", remedy="Finish these uploads, or delete some: DELETE /uploads/{id}.")
+            raise Problem(
+                429, detail, field="uploads", remedy="Finish these uploads, or delete some: DELETE /uploads/{id}."
+            )
 
     def has_free_space(self) -> bool:
         """Whether the disk has more than the minimum free space; otherwise no clip is accepted."""
@@ -128,7 +132,7 @@ class Intake:
 
 def _silence(silence_s: float) -> Problem:
     detail = f"Fewer than {MIN_BYTES} bytes came in {silence_s:g} s."
-    return Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"})
+    return Problem(408, detail, field="body", remedy="Send it again.", headers={"Connection": "close"})
 
 
 def declared_length(request: Request) -> int:

@@ -132,7 +132,7 @@ async def receive_form(
             return await run_in_threadpool(accept, services, caller, job_id, received, key)
         except ClientDisconnect:
             detail = "The connection was closed before the upload was complete."
-            raise Problem(400, detail, remedy="Send it again.") from None
+            raise Problem(400, detail, field="body", remedy="Send it again.") from None
         finally:
             await run_in_threadpool(store.discard_incoming, job_id)
 
@@ -148,7 +148,7 @@ async def read_json(request: Request, services: Deps, model: type[Body], max_byt
     async for piece in services.intake.body(request):
         body += piece
         if len(body) > max_bytes:
-            raise Problem(413, f"The JSON body is larger than {max_bytes} bytes.", remedy=remedy)
+            raise Problem(413, f"The JSON body is larger than {max_bytes} bytes.", field="body", remedy=remedy)
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
@@ -164,8 +164,8 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     options = parse_options(JobOptions, submission.options)
     given = submission.uploads()
     partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
-    job_ids = {partial.declaration.job_id for partial in partials.values()}
-    if job_ids - {None}:
+    job_ids = {part: partial.declaration.job_id for part, partial in partials.items()}
+    if any(job_ids.values()):
         return _taken_before(services, job_ids, submission, options)
     labels = parse_labels(submission.label, submission.metadata)
     received = Received(options=options.model_dump_json(), clip_of=submission.clip_of, labels=labels)
@@ -232,17 +232,22 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
     return partial
 
 
-def _taken_before(services: Deps, job_ids: set[str | None], submission: Submission, options: JobOptions) -> JobRecord:
-    """The job that took the uploads, if one job took all of them and has the same clip and options."""
-    job_id = next(job_id for job_id in job_ids if job_id is not None)
+def _taken_before(
+    services: Deps, job_ids: Mapping[str, str | None], submission: Submission, options: JobOptions
+) -> JobRecord:
+    """The job that took the uploads, if one job took all of them and has the same clip and options.
+
+    job_ids: the job that took each part; None: no job did.
+    """
+    part, job_id = next((part, job_id) for part, job_id in job_ids.items() if job_id is not None)
     known = services.queue.get(job_id)
     record = known or services.store.labelled_submission(job_id)
     clip_of = submission.clip_of and first_job(services.store, submission.clip_of)
     asked = (options, clip_of, submission.callback_url)
     asked_before = record and (record.options, record.clip_of, record.callback_url)
-    if len(job_ids) > 1 or record is None or asked_before != asked:
-        detail = f"An upload was used for the job {job_id} already."
-        raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
+    if len(set(job_ids.values())) > 1 or record is None or asked_before != asked:
+        detail = f"The upload was used for the job {job_id} already."
+        raise Problem(409, detail, field=part, remedy="Upload the file again.", extensions={"job_id": job_id})
     # An accepted clip is never refused by a full queue that has lost its record.
     return known or services.queue.submit(record)
 
