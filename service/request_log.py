@@ -80,7 +80,9 @@ class RequestLog:
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
         if self._open > MAX_OPEN:
-            problem = Problem(503, f"The service answers {MAX_OPEN} requests already, its most at once.", remedy=RETRY_REMEDY)
+            problem = Problem(
+                503, f"The service answers {MAX_OPEN} requests already, its most at once.", remedy=RETRY_REMEDY
+            )
             await _refuse(problem, scope, receive, send)
             return
         try:

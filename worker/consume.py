@@ -96,7 +96,9 @@ class Consumer:
         while (child := self._keeper.child(self._end)) is not None:
             was_short, short = short, self._free_space.is_short()
             if short != was_short:
-                logger.warning("jobs wait for free space on the disk" if short else "the disk has enough free space for jobs again")
+                logger.warning(
+                    "jobs wait for free space on the disk" if short else "the disk has enough free space for jobs again"
+                )
             if short:
                 self._end.wait(claim_timeout_s)
                 continue

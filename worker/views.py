@@ -251,7 +251,9 @@ class Views:
         reply = _reply(scene, frame, request, snapshot, body)
         return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=picture_camera)
 
-    def _pose_and_lens(self, scene: TrainedScene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
+    def _pose_and_lens(
+        self, scene: TrainedScene, request: RenderRequest
+    ) -> tuple[NDArray[np.float64] | None, Intrinsics]:
         """The pose of the caller's camera (None: the endoscope's left eye), and its lens before the caller's overrides.
 
         Raises:
