@@ -119,15 +119,15 @@ async def receive_form(
 ) -> JobRecord:
     """Receive a multipart request and return the job that `accept` creates from it."""
     store, settings = services.store, services.settings
-    with services.intake.place(caller.tenant, declared_length(request), form.main_part) as place:
+    with services.intake.slot(caller.tenant, declared_length(request), form.main_part) as slot:
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
-            available_bytes = services.intake.available_bytes() + place.reserved_bytes
+            available_bytes = services.intake.available_bytes() + slot.reserved_bytes
             limits = UploadLimits(settings.max_upload_bytes, available_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
             with traces.span("receive"):
-                body = services.intake.body(request, place)
+                body = services.intake.body(request, slot)
                 received = await receive_upload(content_type, body, folder, limits, form)
             return await run_in_threadpool(accept, services, caller, job_id, received, key)
         except ClientDisconnect:

@@ -147,12 +147,12 @@ async def append_to_upload(
     if content_type != CONTENT_TYPE:
         raise Problem(415, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=CONTENT_TYPE)
     partial = await run_in_threadpool(_owned, services, caller, upload_id)
-    with services.intake.place(caller.tenant) as place:
+    with services.intake.slot(caller.tenant) as slot:
         file = await run_in_threadpool(_open_at, partial, upload_offset)
         try:
             left_bytes = partial.declaration.length_bytes - upload_offset
             _check_fits(declared_length(request), left_bytes)
-            new_bytes = await _write(services.intake.body(request, place), file, left_bytes)
+            new_bytes = await _write(services.intake.body(request, slot), file, left_bytes)
         except ClientDisconnect:
             detail = "The connection was closed; the bytes that came are stored."
             raise Problem(400, detail, field="body", remedy=REST_REMEDY) from None
