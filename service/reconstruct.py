@@ -201,11 +201,11 @@ def _make_job_of(
         record = _accept(services, caller, job_id, received, key)
     except Problem as problem:
         if "job_id" in problem.extensions:  # the clip is in the spool despite the error
-            _give(partials, job_id)
+            _assign(partials, job_id)
         raise
     finally:
         services.store.discard_incoming(job_id)
-    _give(partials, record.job_id)
+    _assign(partials, record.job_id)
     return record
 
 
@@ -252,9 +252,9 @@ def _taken_before(
     return known or services.queue.submit(record)
 
 
-def _give(partials: Mapping[str, Partial], job_id: str) -> None:
+def _assign(partials: Mapping[str, Partial], job_id: str) -> None:
     for partial in partials.values():
-        partial.give_to(job_id)
+        partial.assign_to(job_id)
 
 
 def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
