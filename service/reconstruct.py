@@ -340,7 +340,7 @@ def enqueue(services: Deps, record: JobRecord) -> JobRecord:
         services.store.purge(record.job_id)
         raise
     except UnavailableError as error:
-        services.sweep.owe(record.job_id)
+        services.sweep.leave(record.job_id)
         detail = f"{error.problem} The clip is safe and is queued as soon as the queue is back."
         remedy = f"Send nothing again; ask for GET /jobs/{record.job_id} later."
         raise Problem(503, detail, field="queue", remedy=remedy, extensions={"job_id": record.job_id}) from error

@@ -48,7 +48,7 @@ def test_one_tenant_holds_half_of_the_places_of_uploads_and_another_finds_one(tm
 
 def test_where_there_is_one_place_anybody_may_have_it(tmp_path: Path) -> None:
     intake = Intake(Settings(data_dir=tmp_path, max_uploads=1, min_free_bytes=0), Store(tmp_path))
-    with intake.slot("ward-3"), pytest.raises(Problem) as refused, intake.place("ward-4"):
+    with intake.slot("ward-3"), pytest.raises(Problem) as refused, intake.slot("ward-4"):
         pass
     assert refused.value.status == 503
 
