@@ -29,8 +29,8 @@ Indexes, written by the same scripts as the hashes:
     {intrasplat}:ended                  hash, jobs that ever came to each terminal state
     {intrasplat}:durations              list, seconds that the last done jobs ran
     {intrasplat}:rests                  list, those seconds less the seconds of training that the job asked for
-    {intrasplat}:owed-by                hash, how many webhooks each tenant owes; their events stand, by when they are
-                                        due, in sorted set tenant:<tenant>:owed
+    {intrasplat}:owed-by                hash, how many unfinished webhooks each tenant has; their events are, by when
+                                        they are due, in sorted set tenant:<tenant>:owed
     {intrasplat}:owed                   sorted set of those events of all tenants, which earlier versions write
     {intrasplat}:delivered              hash, webhooks that ever came to each DeliveryStatus but owed
     {intrasplat}:sequence               counter
@@ -40,7 +40,7 @@ These expire:
     {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
     {intrasplat}:yield:<id>             owner that was told to make way for that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
-    {intrasplat}:lent:<token>           event that was lent to that call
+    {intrasplat}:lent:<token>           event of the delivery that this call claimed
     {intrasplat}:trying:<event>         while a service tries to deliver it
 
 A user who may do this and nothing else:
