@@ -28,8 +28,8 @@ from intrasplat.notices import Notice
 from intrasplat.outcome import scene_of, snapshot_of, training_of
 from intrasplat.poses import placed, with_poses
 from intrasplat.quality.checks import clip_warnings
-from intrasplat.quality.judge import judged
 from intrasplat.quality.report import first_report
+from intrasplat.quality.score import score_model
 from intrasplat.report import Recorded, Report
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.compact import compile_coder
@@ -60,7 +60,7 @@ FINISHING_STEPS = 7
 
 @dataclass(eq=False)
 class Made:
-    """A finished scene, and all that judge() needs; judge() deletes the scene from it."""
+    """A finished scene, and all that score_scene() needs; score_scene() deletes the scene from it."""
 
     clip: DepthClip
     split: FrameSplit
@@ -83,7 +83,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     """
     made = make(request, out_dir, hooks)
     try:
-        report = judge(made, hooks)
+        report = score_scene(made, hooks)
     except (Cancelled, TrainingDiverged) as error:
         add_scores(out_dir, without_scores(made.report, error.code))
         raise
@@ -115,7 +115,7 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, re
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
-def judge(made: Made, hooks: Hooks) -> Report:
+def score_scene(made: Made, hooks: Hooks) -> Report:
     """The report with the scores of the scene as it is stored.
 
     Raises:
@@ -124,11 +124,11 @@ def judge(made: Made, hooks: Hooks) -> Report:
     """
     renderer = SceneRenderer(made.scene, made.device)
     del made.scene  # the renderer has the weights, and they take much memory
-    return judged(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
+    return score_model(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
 
 
-def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
-    """Like judge, for the finished scene in a directory: opens its clip again, and places it at the scene's poses.
+def score_stored_scene(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
+    """Like score_scene, for the stored scene in a directory: opens its clip again, placed at the scene's poses.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
@@ -140,7 +140,7 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
     clip = placed(clip, scene.world_from_camera)
     split = split_frames(clip, request.options.holdout)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
-    return judge(Made(clip, split, scene, report, device), hooks)
+    return score_scene(Made(clip, split, scene, report, device), hooks)
 
 
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:

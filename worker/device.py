@@ -26,7 +26,7 @@ from intrasplat.intake.limits import ClipLimits
 from intrasplat.machine.hooks import Progress
 from intrasplat.machine.processes import die_with_parent
 from intrasplat.names import REPORT
-from intrasplat.pipeline import Made, judge, judge_again, make
+from intrasplat.pipeline import Made, make, score_scene, score_stored_scene
 from intrasplat.report import Imported, Report
 from intrasplat.scene.compact import compile_coder
 from intrasplat.scene.imported import take_scene
@@ -161,7 +161,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace,
     )
     if isinstance(order, ScoreScene):
         request = request_of(order.record, order.spool, settings.device, limits, settings.segmenter)
-        channel.send(scored(lambda: judge_again(request, order.scene, hooks), order.scene / REPORT))
+        channel.send(scored(lambda: score_stored_scene(request, order.scene, hooks), order.scene / REPORT))
         return
     with pace.training():
         made = work_on(order, settings.device, limits, snapshots, hooks, settings.segmenter)
@@ -169,7 +169,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace,
         channel.send(made)
         return
     channel.send(Finished())
-    channel.send(scored(lambda: judge(made, hooks), made.report))
+    channel.send(scored(lambda: score_scene(made, hooks), made.report))
 
 
 def take_in(
@@ -216,7 +216,7 @@ def work_on(
         return Failed(error=describe(error), fault=type(error).__name__)
 
 
-def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
+def scored(score: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
     """The result of scoring a scene. After an error the scene has no scores, and its report says so.
 
     Stopped: the scene may be scored later, because of an order to stop, because something is not available now, or
@@ -225,7 +225,7 @@ def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stoppe
     first: the report without scores, or its file.
     """
     try:
-        return Scored(report=judge())
+        return Scored(report=score())
     except Cancelled:
         return Stopped(checkpointed=False)
     except UnavailableError as error:
