@@ -283,7 +283,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         idempotency_key=key,
         created_at_s=time.time(),
     )
-    with traces.span("judge"):
+    with traces.span("check"):
         _look_at(services, record, received.names, sent)
     outcome = "ok" if clip_of is None else f"ok (clip of {clip_of})"
     services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
