@@ -38,8 +38,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.deformation import motion_named
-from intrasplat.stereo import ClipPaths
-from intrasplat.stereo import open_with_depth as open_paths
+from intrasplat.stereo import ClipPaths, open_with_depth
 from intrasplat.train.first_picture import first_picture
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
@@ -136,7 +135,7 @@ def score_stored_scene(request: ReconstructionRequest, directory: Path, hooks: T
     """
     device = device_for(request.preset.deformation, request.device)
     scene, unplaced = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
-    clip = open_with_depth(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
+    clip = open_with_poses(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
     clip = placed(clip, scene.world_from_camera)
     split = split_frames(clip, request.options.holdout)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
@@ -159,7 +158,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
             timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
 
     showing = dataclasses.replace(hooks, on_first_moment=show)
-    clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
+    clip = keeper.clip(request, lambda: open_with_poses(request, showing, timings, device))
     if "t_first_view_s" not in timings.seconds:  # the clip was stored with its depth, or its first moment has none
         frames = training_frames(clip.frame_count, options.holdout)
         moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
@@ -176,7 +175,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 
 
-def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
+def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
     """The clip of a request with depth (intrasplat/stereo/opening.py) and camera poses (intrasplat/poses/posed.py).
 
     On a GPU the splatting kernels are checked before stereo matching.
@@ -191,7 +190,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
             timings.add("compile_s", examine(device))
 
     paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
-    clip = open_paths(
+    clip = open_with_depth(
         paths,
         request.options,
         hooks,
