@@ -51,7 +51,7 @@ MAX_CACHED_SIZES = 3
 class CpuModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See intrasplat/splat/model.py."""
 
-    answers_every = 1
+    steps_a_report = 1
 
     def __init__(
         self,

@@ -66,7 +66,7 @@ MAX_CACHED_SIZES = 3
 class CudaModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained on the device (intrasplat/splat/model.py)."""
 
-    answers_every = CHECK_EVERY
+    steps_a_report = CHECK_EVERY
 
     def __init__(
         self,
