@@ -50,7 +50,7 @@ from intrasplat.train.resume import resume
 from intrasplat.train.run import Run, write_curve
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup, length_of
-from intrasplat.view.recorded import EYES, kept_frames
+from intrasplat.view.recorded import EYES, zipped_frames
 from intrasplat.view.render import SceneRenderer
 
 FINISHING_STEPS = 7
@@ -249,7 +249,7 @@ def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
     if run.setup.options.keep_recorded == "off":
         return None, None
     with run.setup.timings.measure("recorded_s"):
-        return kept_frames(run.setup.clip, EYES[: len(run.eyes)])
+        return zipped_frames(run.setup.clip, EYES[: len(run.eyes)])
 
 
 def publish(
