@@ -95,9 +95,9 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, re
 
     resume_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
     """
-    length, tell = length_of(request.options, request.preset), hooks.on_progress
+    length, report_progress = length_of(request.options, request.preset), hooks.on_progress
     forecast = TimeEstimate(*length, most_frames(request.options))
-    hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
+    hooks = dataclasses.replace(hooks, on_progress=lambda progress: report_progress(forecast.completed(progress)))
     with keeping(resume_dir or out_dir, forgets=resume_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
         used = len(setup.clip.used)

@@ -181,11 +181,13 @@ def take_in(
         channel.send(scored(lambda: Report.model_validate_json(report.read_bytes()), report))
         return
 
-    def tell(fraction: float) -> None:
+    def report_fraction(fraction: float) -> None:
         channel.send(Advanced(progress=JobProgress(stage=FETCHING, fraction=fraction)))
 
     try:
-        taken = take_scene(order.spool / order.record.files.clip, order.out, imported, limits, max_bytes, tell)
+        taken = take_scene(
+            order.spool / order.record.files.clip, order.out, imported, limits, max_bytes, report_fraction
+        )
     except Exception as error:
         channel.send(Failed(error=describe(error), fault=type(error).__name__))
         return

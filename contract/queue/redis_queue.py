@@ -38,7 +38,7 @@ Indexes, written by the same scripts as the hashes:
 These expire:
     {intrasplat}:worker:<name>          JSON of WorkerAddress
     {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
-    {intrasplat}:yield:<id>             owner that was told to make way for that job
+    {intrasplat}:yield:<id>             worker that was ordered to yield to that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
     {intrasplat}:lent:<token>           event of the delivery that this call claimed
     {intrasplat}:trying:<event>         while a service tries to deliver it
