@@ -240,7 +240,7 @@ class _Job:
         if self._heart.order in (Order.CANCEL, Order.LOST):
             return self._withdraw()
         result = self._excuse(result)
-        accepted, outcome = self._tell(result)
+        accepted, outcome = self._report_end(result)
         if accepted is None:
             return UNSETTLED
         if not accepted:
@@ -261,7 +261,7 @@ class _Job:
             self._free_space.sufficed(self._claim.job_id)
         return result
 
-    def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
+    def _report_end(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
         """Whether the queue accepts the end (None: it cannot be reached), and a description of the end for the log."""
         if isinstance(result, Finished):
             return self._publish(), DONE

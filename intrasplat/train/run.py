@@ -83,7 +83,7 @@ class Run:
         return (self.frames,) if self.right is None else (self.frames, self.right)
 
     @property
-    def taught_by(self) -> Eyes:
+    def trained_eyes(self) -> Eyes:
         """The name of the eyes that are trained on."""
         return "left" if self.right is None else "both"
 
