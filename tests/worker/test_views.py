@@ -451,13 +451,13 @@ def test_no_picture_is_drawn_of_more_pixels_than_the_limit_and_a_view_costs_all_
     scene_id: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    drawn, place = list[int](), Rasterizer.place
+    drawn, project = list[int](), Rasterizer.project
 
     def noted(rasterizer: Rasterizer, *args: Any) -> None:
         drawn.append(rasterizer.width * rasterizer.height)
-        place(rasterizer, *args)
+        project(rasterizer, *args)
 
-    monkeypatch.setattr(Rasterizer, "place", noted)
+    monkeypatch.setattr(Rasterizer, "project", noted)
     views = Views(store)
     asked = {"camera": IntrinsicsOverride(**lens), "max_pixels": max_pixels, "layer": layer}
     view = request_of(scene_id, t=0.5).model_copy(update={**asked, "pose": pose and parse_pose(pose)})

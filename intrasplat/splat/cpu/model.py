@@ -121,20 +121,20 @@ class CpuModel:
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """Project the Gaussians at time t onto this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
-        self._project_state(camera, sh_degree, self._rasterizer(*image_size(camera)))
+        self._project_and_sort(camera, sh_degree, self._rasterizer(*image_size(camera)))
 
-    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
+    def _project_and_sort(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
         """Project the Gaussians of the state onto this camera's image."""
-        self._place_state(camera, sh_degree, rasterizer)
+        self._project_state(camera, sh_degree, rasterizer)
         rasterizer.sort()
 
-    def _place_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
-        """First half of _project_state, after which the state may be overwritten."""
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
+        """First half of _project_and_sort, after which the state may be overwritten."""
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        rasterizer.place(camera, self.state, self.opacity_logit, self.colour)
+        rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
         self.rasterizer = rasterizer
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -147,7 +147,7 @@ class CpuModel:
         size = image_size(camera)
         rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)
         self.motion.deform(self.canonical, t, self.state)
-        self._place_state(camera, self.sh_degree, rasterizer)
+        self._project_state(camera, self.sh_degree, rasterizer)
         if values is not None:
             rasterizer.set_values(values)
         return _Projected(rasterizer, values is not None, self._cached)
@@ -204,7 +204,7 @@ class CpuModel:
         self.motion.deform(self.canonical, t, self.state, trains=True)
         for k, frame in enumerate(frames):
             adds, adds_state = place + k > 0, k > 0
-            self._project_state(frame.camera, sh_degree, self._rasterizer(*image_size(frame.camera)))
+            self._project_and_sort(frame.camera, sh_degree, self._rasterizer(*image_size(frame.camera)))
             self.rasterizer.loss_backward(
                 frame.target, frame.loss_settings(loss), gradients, adds=adds, adds_state=adds_state
             )
