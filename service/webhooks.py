@@ -1,6 +1,6 @@
 """Webhooks: sends callers' systems a signed message when a job has ended, and retries failed deliveries.
 
-The queue stores the pending deliveries (contract/queue/deliveries.py). Each service borrows from it and attempts them.
+The queue stores the pending deliveries (contract/queue/deliveries.py). Each service claims due ones and attempts them.
 Nothing is stored here, so a service may die at any time, and the next one continues.
 """
 
