@@ -27,7 +27,7 @@ from intrasplat.machine.timing import Timings
 from intrasplat.names import Layout, MaskPolarity, MaskSource, PoseConvention
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ClipOptions, ReconstructionOptions, parse_options
-from intrasplat.pipeline import open_with_depth
+from intrasplat.pipeline import open_with_poses
 from intrasplat.report import CameraPoses, Masks
 from intrasplat.splat.backend import choose_device
 from intrasplat.stereo import ClipPaths, match_eyes
@@ -114,7 +114,7 @@ class Clip:
             options=chosen,
             segmenter=self.segmenter,
         )
-        return open_with_depth(request, hooks, timings, where)
+        return open_with_poses(request, hooks, timings, where)
 
 
 def read_clip(
