@@ -140,7 +140,7 @@ def read_clip(
     Args:
         source: a video, folder or zip of both eyes or, with `right`, of the left one; or [T, H, W, 3] uint8 RGB.
         right: the right eye, likewise.
-        calibration: of both eyes, a file or the values of our JSON (docs/conventions.md). Needed for stereo frames.
+        calibration: of both eyes, a file or the values of our JSON (docs/input.md). Needed for stereo frames.
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
         depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
         poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; None: the camera is fixed. Only with depth_mm.
