@@ -7,9 +7,9 @@ an interrupted command goes on, and a file that is moved away is measured anew. 
 docs/method.md and the lines "Gain" of intrasplat/methods/fast.py are written from the rows; --redraw does only that.
 
 The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
-of preparing and training, all cores together, without scoring. `fast` itself is trained BASELINE_RUNS times, spread over
-the others; differences no greater than between its own runs are written as 0. Early stopping alone is measured in runs
-of STOPPING_ITERATIONS planned iterations, with it and without. What concerns two eyes is measured on clips of two eyes,
+of preparing and training, all cores together, without scoring. `fast` itself is trained BASELINE_RUNS times, spread
+over the others; differences no greater than between its own runs are written as 0. Early stopping alone is measured in
+runs of STOPPING_ITERATIONS planned iterations, with it and without. What concerns two eyes is measured on clips of two eyes,
 everything else on clips of one. A missing clip is skipped.
 """
 
@@ -34,7 +34,7 @@ from intrasplat.errors import InputError
 from intrasplat.fusion import FusionSettings
 from intrasplat.machine.hooks import Hooks
 from intrasplat.methods.fast import DEPARTURES, FAST
-from intrasplat.methods.method import Departure, DensifySettings, Preset, departing
+from intrasplat.methods.method import DensifySettings, Departure, Preset, departing
 from intrasplat.methods.paper import PAPER
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.cpu import compile_kernels
@@ -65,7 +65,7 @@ OF_TWO_EYES = ("both eyes", "gloss")
 UNMEASURED = ("budget in seconds",)
 """It says when training ends and changes no step."""
 BASELINE_RUNS = 3
-"""Runs of `fast` per clip and seed: equal in decibels; their processor seconds show which differences mean something."""
+"""Runs of `fast` per clip and seed, equal in decibels: their seconds show which differences mean something."""
 KEY = ("run", "clip", "iterations", "seed")
 FIELDS = (
     *KEY, "psnr_tissue_db", "psnr_right_db", "cpu_s", "seconds", "gaussians", "bases", "load_1min", "machine", "commit",
