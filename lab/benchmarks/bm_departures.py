@@ -9,8 +9,8 @@ docs/method.md and the lines "Gain" of intrasplat/methods/fast.py are written fr
 The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
 of preparing and training, all cores together, without scoring. `fast` itself is trained BASELINE_RUNS times, spread
 over the others; differences no greater than between its own runs are written as 0. Early stopping alone is measured in
-runs of STOPPING_ITERATIONS planned iterations, with it and without. What concerns two eyes is measured on clips of two eyes,
-everything else on clips of one. A missing clip is skipped.
+runs of STOPPING_ITERATIONS planned iterations. What concerns two eyes is measured on clips of two eyes, everything
+else on clips of one. A missing clip is skipped.
 """
 
 from __future__ import annotations
@@ -72,8 +72,7 @@ FIELDS = (
 )  # fmt: skip
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#CC79A7", "#D55E00")
-BAR = 0.36
-"""The height of a bar; bars come in pairs."""
+BAR = 0.36  # the height of a bar; bars come in pairs
 
 Row = Mapping[str, str]
 
@@ -323,8 +322,7 @@ def table_of(rows: Sequence[Row]) -> str:
             continue
         line = [departure.name, changes(departure)]
         for clip, figure, _, digits in columns:
-            gain = gains[clip].get(departure.name)
-            value = None if gain is None else gain.by_figure[figure]
+            value = gains[clip][departure.name].by_figure[figure] if departure.name in gains[clip] else None
             line.append("–" if value is None else signed(value, digits))
         cells.append(line)
     length = next(row["iterations"] for row in rows if row["run"] == "fast")
