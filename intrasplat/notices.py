@@ -26,6 +26,7 @@ class NoticeCode(StrEnum):
 
     # assumptions about the input
     BASELINE = "baseline"
+    BIT_DEPTH = "bit_depth"
     CALIBRATION = "calibration"
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"

@@ -3,6 +3,7 @@
 export const DE = {
   "notice": {
     "baseline": "Alle Abstände beruhen auf dem Abstand der beiden Linsen, den die Kalibrierdatei nennt.",
+    "bit_depth": "Die Bilder nutzen weniger Bits, als ihre Dateien haben; ihre Helligkeit richtet sich danach.",
     "calibration": "Die Kalibrierdatei ließ etwas offen; es wurde angenommen.",
     "decoding": "Der Clip wurde in einem geschützten Prozess gelesen.",
     "depth_unit": "Die Tiefenbilder enthalten Millimeter.",

@@ -3,6 +3,7 @@
 export const EN = {
   "notice": {
     "baseline": "All distances rest on the distance between the two lenses that the calibration file states.",
+    "bit_depth": "The pictures use fewer bits than their files have; their brightness was scaled by that.",
     "calibration": "The calibration file left something open, and it was assumed.",
     "decoding": "The clip was read in a protected process.",
     "depth_unit": "The depth pictures hold millimetres.",

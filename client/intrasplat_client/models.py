@@ -60,6 +60,7 @@ class NoticeCode(StrEnum):
     """The kind of a notice. Two notices of one code differ in their numbers and names only."""
 
     BASELINE = "baseline"
+    BIT_DEPTH = "bit_depth"
     CALIBRATION = "calibration"
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"

@@ -21,6 +21,7 @@ from intrasplat.intake.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from intrasplat.notices import Notice
 
 MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing make grey edges
+MAX_16_BIT = (1 << 16) - 1
 _HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are no frame headers
@@ -36,6 +37,8 @@ class ImageSequence:
     width: int
     frame_times_s: NDArray[np.float64] | None = None  # images carry no time
     warnings: tuple[Notice, ...] = ()
+    white: int = MAX_16_BIT
+    """The value of white in 16-bit pictures (bit_depth.py)."""
 
     @property
     def frame_count(self) -> int:
@@ -48,7 +51,11 @@ class ImageSequence:
     def frames(self) -> Iterator[RgbFrame]:
         """The frames, RGB uint8 [H, W, 3], from the first on. InputError if an image is damaged."""
         for name in self.names:
-            yield as_rgb(self.decode(name), self.tree.field, name)
+            yield self.picture(name)
+
+    def picture(self, name: str) -> RgbFrame:
+        """One frame, RGB uint8 [H, W, 3]. InputError if it is damaged."""
+        return as_rgb(self.decode(name), self.white)
 
     def decode(self, name: str) -> NDArray[Any]:
         """The pixels as stored, with their size checked: [H, W] or [H, W, channels], uint8 or uint16, BGR order."""
@@ -89,14 +96,10 @@ def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def as_rgb(image: NDArray[Any], field: str, name: str) -> RgbFrame:
-    """A decoded image as RGB uint8 [H, W, 3]: grey is repeated, alpha dropped, 16 bit scaled to 8."""
+def as_rgb(image: NDArray[Any], white: int = MAX_16_BIT) -> RgbFrame:
+    """A decoded image as RGB uint8 [H, W, 3]: grey is repeated, alpha dropped, 16 bit scaled so that white is 255."""
     if image.dtype == np.uint16:
-        if 0 < image.max() <= 255:
-            raise InputError(
-                field, f"{name} stores 8-bit values in 16 bits (largest {image.max()}).", "Write it as 8-bit."
-            )
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        image = ((np.minimum(image, white).astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8)
     to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
     return np.asarray(cv2.cvtColor(image, to_rgb[1 if image.ndim == 2 else image.shape[2]]))
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames, tissue_from_masks
@@ -39,7 +40,7 @@ def packed_clip(
 
 def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Notice, limits: ClipLimits) -> StereoClip:
     """The clip of one sequence per eye. InputError if their lengths or sizes differ."""
-    return _stereo_clip(pair_sequences(left, right), (assumption,), limits)
+    return _stereo_clip(pair_sequences(*at_own_depth(left, right)), (assumption,), limits)
 
 
 def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:

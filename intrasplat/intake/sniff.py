@@ -62,6 +62,11 @@ def png_size(head: bytes) -> tuple[int, int] | None:
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
+def png_bits(head: bytes) -> int | None:
+    """Bits of a colour in a PNG's first 25 bytes; None if it is no PNG."""
+    return head[24] if head.startswith(PNG_MAGIC) and len(head) > 24 else None
+
+
 def check_calibration_text(text: str, field: str, label: str) -> None:
     """InputError for text with active content (XML entities, document types, code), or nested too deep for a parser."""
     small = text.lower()

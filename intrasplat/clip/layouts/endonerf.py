@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
-from intrasplat.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
+from intrasplat.clip.images import ImageSequence, as_depth_mm, open_images
 from intrasplat.clip.layouts.layout import ClipFiles, InputLayout
 from intrasplat.clip.masks import MaskFrames, TissueMasks, no_masks, tissue_from_masks
 from intrasplat.clip.naming import check_aligned
@@ -60,7 +61,8 @@ def _open(files: ClipFiles) -> DepthClip:
     )
     _check_size(images, poses)
     masks = _masks(tree, images, files)
-    rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
+    (images,) = at_own_depth(images)
+    rgb = _decode_all(images, np.uint8, (3,), images.picture)
     depth_mm = _read_depth(tree, images)
     if not ((depth_mm > 0) & masks.tissue).any():
         where = "on tissue" if (depth_mm > 0).any() else "anywhere"
@@ -84,7 +86,7 @@ def _open(files: ClipFiles) -> DepthClip:
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
         masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
         assumptions=_assumptions(masks, poses, convention),
-        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
+        warnings=(*images.warnings, *masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames
@@ -66,7 +67,7 @@ class ClipFiles:
             return open_video_in(self.tree, self.videos[0])
         if self.videos or not self.images or any(eye_of(name) for name in self.images):
             return None
-        return open_images(self.tree, self.images)
+        return at_own_depth(open_images(self.tree, self.images))[0]
 
 
 @dataclass(frozen=True)
