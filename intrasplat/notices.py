@@ -70,6 +70,7 @@ class NoticeCode(StrEnum):
     MASKS_MARK_NOTHING = "masks_mark_nothing"
     MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
+    MASK_LEVELS = "mask_levels"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
     NO_TIME = "no_time"

@@ -20,7 +20,6 @@ from intrasplat.intake.limits import MAX_IMAGE_BYTES
 from intrasplat.intake.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from intrasplat.notices import Notice
 
-MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing make grey edges
 MAX_16_BIT = (1 << 16) - 1
 _HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
@@ -104,11 +103,12 @@ def as_rgb(image: NDArray[Any], white: int = MAX_16_BIT) -> RgbFrame:
     return np.asarray(cv2.cvtColor(image, to_rgb[1 if image.ndim == 2 else image.shape[2]]))
 
 
-def as_mask(image: NDArray[Any]) -> NDArray[np.bool_]:
-    """A decoded mask as bool [H, W]: True where any colour channel reaches half of its range."""
-    threshold = MASK_THRESHOLD * 257 if image.dtype == np.uint16 else MASK_THRESHOLD
-    colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
-    return np.asarray(colours >= threshold)
+def as_levels(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """A decoded mask as uint8 [H, W] or [H, W, 3]: without alpha, 16 bit scaled to 8 unless all are below 256."""
+    levels = image if image.ndim == 2 else image[:, :, :3]
+    if image.dtype == np.uint16 and levels.max() > 255:
+        levels = levels // 257
+    return levels.astype(np.uint8)
 
 
 def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float32]:
