@@ -240,7 +240,7 @@ CORPUS: dict[str, Hostile] = {
     "deep behind comments": Hostile(
         "calibration.xml",
         fixed(_CUT_XML + b"<a><!--</-->" * 9_000 + b"</a><!--<-->" * 9_000 + b"</opencv_storage>"),
-        "left_k has 1 numbers",
+        "has 1 number,",
         "decoding",
         "calibration",
     ),
