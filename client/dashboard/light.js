@@ -7,8 +7,9 @@ import { noticeWords, words } from "./messages.js";
 /** What a warning of each code does to the light. A code that is not here, of a newer service, asks for care. */
 const WEIGHTS = {
   "bad": [
-    "depth_disagrees", "eyes_disagree", "field_of_view_unusual", "held_out_score_low", "held_out_without_tissue",
-    "little_stereo_depth", "little_tissue", "nothing_held_out", "scores_failed", "training_score_low"
+    "depth_disagrees", "depth_inverted", "eyes_disagree", "field_of_view_unusual", "held_out_score_low",
+    "held_out_without_tissue", "little_stereo_depth", "little_tissue", "nothing_held_out", "scores_failed",
+    "training_score_low"
   ],
   "care": [
     "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "camera_or_tissue", "colour_changes",

@@ -28,6 +28,7 @@ export const DE = {
     "calibration_scaled": "Die Kalibrierung gilt für eine andere Bildgröße und wurde umgerechnet.",
     "colours_unknown": "Die Farben der beiden Augen ließen sich nicht vergleichen.",
     "colour_changes": "Die Farbe des Gewebes ändert sich während des Clips.",
+    "depth_inverted": "Instrumente liegen hinter dem Gewebe um sie herum: Die Tiefenbilder enthalten vielleicht keine Abstände.",
     "depth_jumps": "Die gemessene Tiefe springt von Bild zu Bild.",
     "depth_out_of_range": "Teile liegen außerhalb des Bereichs, in dem nach Tiefe gesucht wurde.",
     "depth_unusual": "Der Abstand zum Gewebe ist für ein Endoskop ungewöhnlich; prüfen Sie die Kalibrierung.",

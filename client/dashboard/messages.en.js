@@ -28,6 +28,7 @@ export const EN = {
     "calibration_scaled": "The calibration was made for another picture size and was converted.",
     "colours_unknown": "The colours of the two eyes could not be compared.",
     "colour_changes": "The colour of the tissue changes during the clip.",
+    "depth_inverted": "Instruments lie behind the tissue around them: the depth pictures may hold something else than distance.",
     "depth_jumps": "The measured depth jumps from frame to frame.",
     "depth_out_of_range": "Parts lie outside the range in which depth was looked for.",
     "depth_unusual": "The distance to the tissue is unusual for an endoscope; check the calibration.",

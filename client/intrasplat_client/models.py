@@ -85,6 +85,7 @@ class NoticeCode(StrEnum):
     CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
+    DEPTH_INVERTED = "depth_inverted"
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"

@@ -164,8 +164,9 @@ def _classes(levels: MaskLevels, bright: BrightClass) -> str:
     if set(levels.thresholds) == {MASK_THRESHOLD}:
         return f"white is {bright}"
     tissue = levels.levels[0 if bright == "tool" else -1]
-    others = ", ".join(str(each) for each in levels.levels if each != tissue)
-    return f"{others} of 255 {'are' if ',' in others else 'is'} instrument, {tissue} is tissue"
+    others = [str(each) for each in levels.levels if each != tissue]
+    one = len(others) == 1
+    return f"level{'' if one else 's'} {', '.join(others)} {'is' if one else 'are'} instrument, {tissue} is tissue"
 
 
 def _level_warnings(levels: MaskLevels, bright: BrightClass) -> tuple[Notice, ...]:

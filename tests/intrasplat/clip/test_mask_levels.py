@@ -58,7 +58,7 @@ def test_every_level_of_an_instrument_is_instrument(
     clip = read(frames, studio.images("masks/{}.png", parts(studio, *levels)), mask_polarity=polarity)
     np.testing.assert_array_equal(clip.tissue, ~studio.tool())
     listed = ", ".join(map(str, sorted(levels)))
-    assert f"{listed} of 255 are instrument, 0 is tissue" in told(clip)[0]
+    assert f"levels {listed} are instrument, 0 is tissue" in told(clip)[0]
 
 
 @pytest.mark.parametrize("polarity", ["auto", "tissue"])
@@ -66,7 +66,7 @@ def test_where_the_highest_level_is_tissue_all_others_are_instrument(studio, fra
     masks = studio.images("masks/{}.png", parts(studio, 0, 100, 180, tissue=255))
     clip = read(frames, masks, mask_polarity=polarity)
     np.testing.assert_array_equal(clip.tissue, ~studio.tool())
-    assert "0, 100, 180 of 255 are instrument, 255 is tissue" in told(clip)[0]
+    assert "levels 0, 100, 180 are instrument, 255 is tissue" in told(clip)[0]
 
 
 @pytest.mark.parametrize("level", [1, 40, 100])
@@ -74,7 +74,7 @@ def test_one_low_level_is_the_instrument_and_no_warning(studio, frames: Path, le
     clip = read(frames, studio.images("masks/{}.png", parts(studio, level)))
     np.testing.assert_array_equal(clip.tissue, ~studio.tool())
     assert told(clip) == []
-    assert any(f"masks: {level} of 255 is instrument, 0 is tissue" in each.text for each in clip.assumptions)
+    assert any(f"masks: level {level} is instrument, 0 is tissue" in each.text for each in clip.assumptions)
 
 
 def test_labels_in_16_bits_and_in_colours_are_read(studio, frames: Path) -> None:
