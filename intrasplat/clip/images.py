@@ -23,6 +23,8 @@ from intrasplat.notices import Notice
 MAX_16_BIT = (1 << 16) - 1
 _HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
+_JPEG_END = b"\xff\xd9"  # after the start of the scan: thumbnails before it have ends of their own
+_JPEG_SCAN = 0xDA
 _JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are no frame headers
 
 
@@ -85,8 +87,8 @@ def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
 
 
 def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
-    """Pixels of a PNG or JPEG as stored (BGR order). InputError if it is cut short or damaged."""
-    whole = _PNG_END in data[-64:] if data.startswith(PNG_MAGIC) else b"\xff\xd9" in data[-64:]
+    """Pixels of a PNG or JPEG as stored (BGR order); bytes after its end do not count. InputError if damaged."""
+    whole = _PNG_END in data if data.startswith(PNG_MAGIC) else data.find(_JPEG_END, _jpeg_scan(data)) >= 0
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if image is None:
         raise InputError(field, f"{name} is damaged or cut short.", "Write the image again.")
@@ -136,10 +138,22 @@ def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """(width, height) of a JPEG; walks the marker segments up to the frame header (ITU T.81, B.2)."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
+    for at, marker in _jpeg_segments(data):
         if 0xC0 <= marker <= 0xCF and marker not in _JPEG_NOT_SIZES:
             return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return None
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Where the pixels of a JPEG start; its length if there are none."""
+    return next((at for at, marker in _jpeg_segments(data) if marker == _JPEG_SCAN), len(data))
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """(place, marker) of each segment before the pixels, which come after the marker _JPEG_SCAN."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        yield at, data[at + 1]
+        if data[at + 1] == _JPEG_SCAN:
+            return
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

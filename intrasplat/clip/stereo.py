@@ -13,7 +13,7 @@ from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames, tissue_from_masks
-from intrasplat.clip.naming import eye_of, left_eye_only, pair_names
+from intrasplat.clip.naming import eye_folders, eye_of, left_eye_only, pair_names
 from intrasplat.clip.packing import PACKING_WORDS, FrameSequence, PackedPairs, Packing, TwoSequences, pair_sequences
 from intrasplat.clip.types import StereoClip
 from intrasplat.clip.video import FALLBACK_RATE_HZ, open_video_in
@@ -45,7 +45,8 @@ def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Not
 
 def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
     """The clip of two videos in a tree whose names give the eye. InputError if there are other videos."""
-    eyes = {found[0] for name in videos if (found := eye_of(name))}
+    folders = eye_folders(videos)
+    eyes = {found[0] for name in videos if (found := eye_of(name, folders))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
             "clip",
