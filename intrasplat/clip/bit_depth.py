@@ -50,7 +50,8 @@ def _largest(images: ImageSequence) -> int:
     largest = 0
     for name in images.names:
         if png_bits(images.tree.head(name, _HEADER_BYTES)) == _DEEP:
-            largest = max(largest, int(images.decode(name).max()))
+            image = images.decode(name)
+            largest = max(largest, int(image.max() if image.ndim == 2 else image[:, :, :3].max()))  # not alpha
             if largest >> USUAL_BITS[-2]:
                 break
     return largest

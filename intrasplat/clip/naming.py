@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from pathlib import PurePosixPath
 from typing import Literal
 
-from intrasplat.clip.files import natural_key
+from intrasplat.clip.files import VIDEO_SUFFIXES, natural_key
 from intrasplat.errors import InputError
 
 Side = Literal["left", "right"]
@@ -29,16 +29,22 @@ _WORD_AT_START = re.compile(r"(?P<side>left|right|l|r)[_\-. ]?(?P<frame>\d.*|(?<
 
 
 def eye_folders(names: Iterable[str]) -> dict[str, Side]:
-    """The folders, in lower case, that are an eye's by their pair: L and R, left_rgb and right_rgb, cam0 and cam1.
+    """The folders and videos (in lower case, without ending) that are an eye's by their pair: L and R, cam0 and cam1.
 
-    left and right are eyes without a pair, too. Of numbered folders the lower one is the left eye's.
+    left and right are eyes without a pair, too. Of numbered pairs the lower one is the left eye's. Folders of masks and
+    depth count only if there are no others.
     """
-    folders = {part.lower() for name in names for part in PurePosixPath(name).parts[:-1]}
-    found: dict[str, Side] = {"left": "left", "right": "right"}
+    paths = [PurePosixPath(name) for name in names]
+    stems = {path.stem.lower() for path in paths if path.suffix.lower() in VIDEO_SUFFIXES}
+    folders = {part.lower() for path in paths for part in path.parts[:-1]} | stems
+    alone: dict[str, Side] = {"left": "left", "right": "right"}
+    return alone | _pairs({each for each in folders if not _NO_PICTURES.search(each)} or folders)
+
+
+def _pairs(folders: Set[str]) -> dict[str, Side]:
+    found: dict[str, Side] = {}
     numbered: dict[str, dict[int, str]] = {}
     for folder in sorted(folders):
-        if _NO_PICTURES.search(folder):
-            continue
         for left, right in _SWAPPED:
             if (other := left.sub(right, folder)) != folder and other in folders:
                 found |= {folder: "left", other: "right"}
@@ -61,8 +67,11 @@ def eye_of(name: str, folders: Mapping[str, Side]) -> tuple[Side, str] | None:
             others = path.parts[:depth] + path.parts[depth + 1 : -1]
             # an eye in the file name repeats that of the folder; it is not part of the frame key
             stem = _by_stem(path.stem)
-            return side, "/".join((*others, stem[1] if stem else path.stem))
+            frame = stem[1] if stem else re.sub(f"^{re.escape(part)}", "", path.stem, flags=re.IGNORECASE)
+            return side, "/".join((*others, frame))
     found = _by_stem(path.stem)
+    if found is None and path.suffix.lower() in VIDEO_SUFFIXES and path.stem.lower() in folders:
+        return folders[path.stem.lower()], path.parent.as_posix()
     return (found[0], (path.parent / found[1]).as_posix()) if found else None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -69,6 +70,15 @@ def test_a_clip_with_depth_is_scaled_and_its_depth_is_not(studio) -> None:
     assert clip.rgb.max() == 255
     assert (clip.depth_mm == 70).all()
     assert len(told(clip)) == 1
+
+
+def test_alpha_is_no_brightness(studio) -> None:
+    for side, eye in zip(("left", "right"), studio.eyes(1), strict=True):
+        pixels = np.dstack([deep(eye, 12)[0], np.full((80, 96), 65535, np.uint16)])
+        assert cv2.imwrite(str(studio.image(f"clip/{side}/0.png", eye[0])), pixels)
+    clip = open_clip(studio.root / "clip")
+    assert isinstance(clip, StereoClip)
+    assert next(clip.pairs())[0].max() == 255
 
 
 def test_black_frames_tell_no_depth(studio) -> None:

@@ -83,6 +83,29 @@ def test_folders_of_masks_and_depth_and_three_cameras_are_no_eyes() -> None:
     assert eye_folders(names) == {"left": "left", "right": "right"}
 
 
+@pytest.mark.parametrize(("left", "right"), [("L", "R"), ("cam0", "cam1"), ("video_left", "video_right")])
+def test_two_videos_are_known_by_their_pair(studio, left: str, right: str) -> None:
+    for name, eye in zip((left, right), studio.eyes(3), strict=True):
+        studio.video(f"clip/{name}.webm", eye)
+    clip = open_clip(studio.root / "clip")
+    assert isinstance(clip, StereoClip)
+    for shown, given in zip(next(clip.pairs()), studio.eyes(3), strict=True):
+        assert np.abs(shown.astype(float) - given[0]).mean() < 12
+
+
+def test_frames_that_repeat_their_folders_name_are_paired(studio) -> None:
+    check_eyes(studio, write_eyes(studio, "cam0/cam0_{}.png", "cam1/cam1_{}.png"))
+
+
+def test_folders_of_masks_alone_are_pairs(studio) -> None:
+    folder = write_eyes(studio, "left/{}.png", "right/{}.png")
+    for eye in ("left", "right"):
+        studio.masks(f"clip/masks/{eye}_mask", studio.tool(3))
+    clip = open_clip(folder)
+    assert isinstance(clip, StereoClip)
+    np.testing.assert_array_equal(clip.tissue_right, ~studio.tool(3))
+
+
 def test_what_names_no_eye_is_told_the_folders_that_do(studio) -> None:
     folder = write_eyes(studio, "left/{}.png", "right/{}.png")
     studio.image("clip/other/0.png", studio.eyes(1)[0][0])
