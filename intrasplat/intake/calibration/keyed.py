@@ -12,7 +12,7 @@ from typing import Any
 
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.check import FIELD
-from intrasplat.intake.calibration.names import name_of
+from intrasplat.intake.calibration.names import name_below
 
 _TOKEN = re.compile(
     r"(?P<comment>(?:(?<=\s)|^)(?:#|//).*)"
@@ -51,7 +51,7 @@ class Keyed:
     def add(self, parent: str, entry: Entry) -> None:
         """Keep an entry whose name is known alone or with its parent's ("left", "K"). The first one counts."""
         self.keys.add(entry.key.lower())
-        name = name_of(parent + entry.key) or name_of(entry.key + parent) or name_of(entry.key)
+        name = name_below(parent, entry.key)
         if name is not None:
             self.entries.setdefault(name, entry)
 
@@ -152,5 +152,7 @@ def _flatten(value: Any, entry: Entry) -> None:
             _flatten(each, entry)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         entry.numbers.append(float(value))
+    elif isinstance(value, str) and (number := _number(value.strip())) is not None:
+        entry.numbers.append(number)
     elif isinstance(value, str):
         entry.other = entry.other or value

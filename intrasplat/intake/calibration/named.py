@@ -18,6 +18,9 @@ def raw_value(entries: Mapping[str, Entry]) -> dict[str, Any]:
     Raises:
         InputError: a name is missing, or has another number of numbers than it must have.
     """
+    entries = dict(entries)
+    for side in ("left", "right"):
+        _join(entries, side)
     check_names(entries.keys())
     rotation = _numbers(entries["rotation"], 9, 3)
     if len(rotation) == 3:
@@ -29,6 +32,20 @@ def raw_value(entries: Mapping[str, Entry]) -> dict[str, Any]:
         "right_from_left_rotation": [rotation[:3], rotation[3:6], rotation[6:]],
         "right_from_left_translation_mm": _numbers(entries["translation"], 3),
     }
+
+
+def _join(entries: dict[str, Entry], side: str) -> None:
+    """Add an eye's matrix and distortion if the file has their numbers one by one."""
+    fx, fy, cx, cy = (entries.get(f"{side}_{each}") for each in ("fx", "fy", "cx", "cy"))
+    if fx and fy and cx and cy and f"{side}_k" not in entries:
+        f, g, x, y = (_numbers(each, 1)[0] for each in (fx, fy, cx, cy))
+        entries[f"{side}_k"] = Entry(fx.key, fx.line, [f, 0.0, x, 0.0, g, y, 0.0, 0.0, 1.0])
+    single = [entries.get(f"{side}_{each}") for each in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+    given = [each for each in single if each is not None]
+    if given and f"{side}_d" not in entries:
+        count = next(count for count in (4, 5, 8) if not any(single[count:]))
+        numbers = [0.0 if each is None else _numbers(each, 1)[0] for each in single[:count]]
+        entries[f"{side}_d"] = Entry(given[0].key, given[0].line, numbers)
 
 
 def _eye(entries: Mapping[str, Entry], side: str) -> dict[str, Any]:

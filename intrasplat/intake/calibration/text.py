@@ -15,11 +15,12 @@ from pydantic import ValidationError
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.check import FIELD, check_calibration
 from intrasplat.intake.calibration.fisheye import check_no_fisheye
-from intrasplat.intake.calibration.keyed import Keyed, keyed_json, keyed_yaml
+from intrasplat.intake.calibration.keyed import keyed_json, keyed_yaml
 from intrasplat.intake.calibration.named import raw_value
 from intrasplat.intake.calibration.names import FORMATS_REMEDY, MATRICES
 from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
 
+_LAST_COMMA = re.compile(r",(?=\s*[}\]])")
 _BLANKS = re.compile(r"[^\S\n]+")
 _JSON_COMMENT = re.compile(r'("(?:[^"\\\n]|\\.)*"?)|(?:#|//)[^\n]*')
 
@@ -75,26 +76,24 @@ def parse_text(text: str) -> dict[str, Any] | None:
     if start.startswith("<"):
         return None
     found = keyed_yaml(text)
+    check_no_fisheye(text, found.keys)
     if not found.entries.keys() & MATRICES and "%YAML" not in text:
         raise InputError(FIELD, "it is neither JSON, nor a stereo ini, nor an OpenCV YAML or XML file.", FORMATS_REMEDY)
-    return _named(found, text)
-
-
-def _named(found: Keyed, text: str) -> dict[str, Any]:
-    check_no_fisheye(text, found.keys)
     return raw_value(found.entries)
 
 
 def _parse_json(text: str) -> dict[str, Any]:
-    plain = _JSON_COMMENT.sub(lambda found: found.group(1) or "", text)
+    plain = _LAST_COMMA.sub("", _JSON_COMMENT.sub(lambda found: found.group(1) or "", text))
     try:
         value = json.loads(plain)
         found = keyed_json(value)
     except (ValueError, RecursionError) as error:
         raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
     assert isinstance(value, dict)  # it starts with a brace
-    is_ours = value.get("model") in ("rectified", "raw")
-    return _named(found, plain) if not is_ours and found.entries.keys() & MATRICES else value
+    if value.get("model") in ("rectified", "raw") or not found.entries.keys() & MATRICES:
+        return value
+    check_no_fisheye(plain, found.keys)
+    return raw_value(found.entries)
 
 
 def _parse_ini(text: str) -> dict[str, Any]:

@@ -94,6 +94,15 @@ TEXTS = {
         for name, value in VALUES.items()
     )
     + f"imageSize: [{WIDTH}, {HEIGHT}]\n",
+    "single numbers": json.dumps(
+        {
+            side: {"fx": k[0][0], "fy": k[1][1], "cx": str(k[0][2]), "cy": k[1][2]}
+            | dict(zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True))
+            for side, k, d in (("Camera 1", LISTS["M1"], LISTS["D1"]), ("right_eye", LISTS["M2"], LISTS["D2"]))
+        }
+        | {name: LISTS[name] for name in ("R", "T", "image_width", "image_height")}
+    ),
+    "a comma behind the last": json.dumps(LISTS, indent=1)[:-2] + ",\n}",
     "nested YAML": f"left:\n  K: {LISTS['M1']}\n  D: {LISTS['D1']}\nright:\n  K: {LISTS['M2']}\n  D: {LISTS['D2']}\n"
     f"stereo:\n  R: {LISTS['R']}\n  T: {LISTS['T']}\nimage_size: [{WIDTH}, {HEIGHT}]\n",
 }
@@ -143,6 +152,11 @@ FISHEYE = {
     "Kannala-Brandt": lambda text: text + 'camera_model: "kannala_brandt"\n',
     "equidistant in JSON": lambda text: json.dumps(LISTS | {"distortion_model": "equidistant"}),
     "a flag": lambda text: json.dumps(LISTS | {"fisheye": True}, indent=1),
+    "its coefficients by eye": lambda text: json.dumps(
+        {side: dict.fromkeys(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), 1.0) for side in ("left", "right")}
+        | LISTS
+    ),
+    "Kalibr's": lambda text: "cam0:\n  distortion_model: equidistant\n  intrinsics: [90, 90, 48, 40]\n",
     "its coefficients": lambda text: text + "k1: 0.1\nk2: 0.2\nk3: 0.1\nk4: 0.0\n",
     "in an ini": lambda text: ini_text() + "\nmodel=fisheye\n",
 }
