@@ -30,11 +30,13 @@ STRETCHED_SHARE = 0.9
 MAX_SORTED = 10_000
 
 FRAMES_LOOKED_AT = 8
-FRAMES_APART = 6
+FRAMES_APART = (6, 3, 1)
+"""The farthest at which MIN_TRACKED corners are found again shows the most parallax."""
+MIN_TRACKED = 150
 MIN_RIM_PIXELS = 50
 BEHIND = 1.05
 """Depth of instruments over that of the tissue around: 0.6 to 0.7 in real depth, 1.5 and more in disparity."""
-MAX_POINTS, MIN_POINTS = 300, 60
+MAX_POINTS, MIN_POINTS = 300, 40
 MIN_PARALLAX_PX = 1.5
 INVERTED_RANK = 0.4
 """Rank correlation of the values with the nearness that parallax shows; in depth it is negative."""
@@ -42,6 +44,7 @@ MIN_SCALE_OFF = 3.0
 MIN_BEFORE = 0.8
 """Share of the points that the path places before the camera; with less the path itself is wrong."""
 
+_NO_POINTS = np.empty((0, 2)), np.empty((0, 2))
 _REMEDY = "Give millimetres as grey PNG, 16 bit for more than 255; depth_mm = focal_px * baseline_mm / disparity_px."
 _STRETCHED_REMEDY = "Give the depth before it was scaled for display, in millimetres; set pixels without depth to 0."
 
@@ -101,26 +104,24 @@ def parallax_warnings(
 
     InputError if values grow where the parallax of a moving camera shows that tissue is nearer.
     """
+    if np.allclose(world_from_camera[:, :3, 3], world_from_camera[0, :3, 3], atol=1e-6):
+        return ()
     found = []
     for i in _spread(len(rgb)):
-        j = i + FRAMES_APART if i + FRAMES_APART < len(rgb) else i - FRAMES_APART
-        if j < 0 or np.allclose(world_from_camera[i, :3, 3], world_from_camera[j, :3, 3], atol=1e-6):
-            continue
-        points, moved = _tracked(rgb[i], rgb[j], tissue[i] & (depth[i] > 0))
-        if len(points):
-            nearness, parallax_px = _nearness(
-                points, moved, np.linalg.inv(world_from_camera[j]) @ world_from_camera[i], k
-            )
-            seen = np.rint(points).astype(int)
-            values = depth[i][seen[:, 1], seen[:, 0]].astype(np.float64)
-            found.append(np.stack([nearness, values])[:, parallax_px > MIN_PARALLAX_PX])
-    nearness, values = np.concatenate(found, axis=1) if found else np.empty((2, 0))
-    if len(values) < MIN_POINTS:
+        for apart in FRAMES_APART:
+            j = i + apart if i + apart < len(rgb) else i - apart
+            points, moved = _tracked(rgb[i], rgb[j], tissue[i] & (depth[i] > 0)) if j >= 0 else _NO_POINTS
+            if len(points) >= MIN_TRACKED:
+                break
+        second_from_first = np.linalg.inv(world_from_camera[j]) @ world_from_camera[i]
+        nearness, parallax_px = _nearness(points, moved, second_from_first, k)
+        far = parallax_px > MIN_PARALLAX_PX
+        found.append((nearness[far], _values(depth[i], points[far])))
+    nearness, values = (np.concatenate(each) for each in zip(*found, strict=True))
+    if len(values) < MIN_POINTS or np.mean(nearness > 0) < MIN_BEFORE:
         return ()
-    if np.mean(nearness > 0) < MIN_BEFORE:
-        return ()
-    _check_not_inverted(nearness, values, field, "the moving camera")
-    times = float(np.median(nearness) * np.median(values))
+    _check_not_inverted(found, field, "the moving camera")
+    times = float(np.median(nearness * values))
     if 1 / MIN_SCALE_OFF < times < MIN_SCALE_OFF:
         return ()
     text = f"depth: by the camera's path it is {times:.3g} times the distance; are both in millimetres?"
@@ -134,17 +135,15 @@ def check_with_right_eye(
     found = []
     for (left, right), values in zip(pairs, depth, strict=True):
         points, moved = _tracked(left, right, values > 0)
-        if len(points):
-            level = np.abs(points[:, 1] - moved[:, 1]) < MIN_PARALLAX_PX
-            seen = np.rint(points[level]).astype(int)
-            found.append(np.stack([(points - moved)[level, 0], values[seen[:, 1], seen[:, 0]]]))
-    disparity_px, held = np.concatenate(found, axis=1) if found else np.empty((2, 0))
-    if len(held) >= MIN_POINTS:
-        _check_not_inverted(disparity_px, held, field, "the right eye")
+        level = np.abs(points[:, 1] - moved[:, 1]) < MIN_PARALLAX_PX
+        found.append(((points - moved)[level, 0], _values(values, points[level])))
+    _check_not_inverted(found, field, "the right eye")
 
 
-def _check_not_inverted(nearness: Reals, values: Reals, field: str, witness: str) -> None:
-    if _rank_correlation(nearness, values) > INVERTED_RANK:
+def _check_not_inverted(found: Iterable[tuple[Reals, Reals]], field: str, witness: str) -> None:
+    """InputError if, in most frames, values [M] rise with the nearness [M] that the witness shows."""
+    ranks = [_rank_correlation(nearness, values) for nearness, values in found if len(values) >= MIN_POINTS]
+    if ranks and np.median(ranks) > INVERTED_RANK:
         problem = f"depth/ grows where {witness} shows that tissue is nearer: it holds disparity or nearness."
         raise InputError(field, problem, _REMEDY)
 
@@ -171,11 +170,17 @@ def _tracked(first: RgbFrame, second: RgbFrame, where: NDArray[np.bool_]) -> tup
     grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (first, second)]
     corners = cv2.goodFeaturesToTrack(grey[0], MAX_POINTS, 0.01, 5, mask=where.astype(np.uint8))
     if corners is None:
-        return np.empty((0, 2)), np.empty((0, 2))
+        return _NO_POINTS
     there, good, _ = cv2.calcOpticalFlowPyrLK(grey[0], grey[1], corners, None)
     back, good_back, _ = cv2.calcOpticalFlowPyrLK(grey[1], grey[0], there, None)
     kept = (good & good_back).ravel().astype(bool) & (np.abs(back - corners).max(axis=(1, 2)) < 0.5)
     return corners[kept, 0].astype(np.float64), there[kept, 0].astype(np.float64)
+
+
+def _values(depth: NDArray[np.float32], points: Reals) -> Reals:
+    """The values [M] at points (x, y)."""
+    x, y = np.rint(points).astype(int).T
+    return np.asarray(depth[y, x], np.float64)
 
 
 def _nearness(

@@ -91,6 +91,8 @@ def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
     whole = _PNG_END in data if data.startswith(PNG_MAGIC) else data.find(_JPEG_END, _jpeg_scan(data)) >= 0
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if image is None:
+        if whole and (bits := _jpeg_bits(data)) not in (None, 8):
+            raise InputError(field, f"{name} is a JPEG of {bits} bits a colour.", "Write it as a PNG of 16 bits.")
         raise InputError(field, f"{name} is damaged or cut short.", "Write the image again.")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(field, f"{name} has pixels of type {image.dtype}.", "Give 8-bit or 16-bit images.")
@@ -138,10 +140,21 @@ def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """(width, height) of a JPEG; walks the marker segments up to the frame header (ITU T.81, B.2)."""
-    for at, marker in _jpeg_segments(data):
-        if 0xC0 <= marker <= 0xCF and marker not in _JPEG_NOT_SIZES:
-            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-    return None
+    if (at := _jpeg_frame(data)) is None:
+        return None
+    return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+
+
+def _jpeg_bits(data: bytes) -> int | None:
+    """Bits of a colour in a JPEG; None if it has no frame header."""
+    at = _jpeg_frame(data)
+    return None if at is None else data[at + 4]
+
+
+def _jpeg_frame(data: bytes) -> int | None:
+    """Where the frame header of a JPEG starts."""
+    found = (at for at, marker in _jpeg_segments(data) if 0xC0 <= marker <= 0xCF and marker not in _JPEG_NOT_SIZES)
+    return next(found, None)
 
 
 def _jpeg_scan(data: bytes) -> int:

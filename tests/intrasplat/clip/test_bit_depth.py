@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, StereoClip, open_clip
+from intrasplat.errors import InputError
 from intrasplat.notices import NoticeCode
 
 
@@ -79,6 +80,17 @@ def test_alpha_is_no_brightness(studio) -> None:
     clip = open_clip(studio.root / "clip")
     assert isinstance(clip, StereoClip)
     assert next(clip.pairs())[0].max() == 255
+
+
+def test_a_jpeg_of_12_bits_is_refused_by_name(studio) -> None:
+    for side, eye in zip(("left", "right"), studio.eyes(1), strict=True):
+        path = studio.image(f"clip/{side}/0.jpg", eye[0])
+        data = bytearray(path.read_bytes())
+        data[data.index(b"\xff\xc0") + 4] = 12
+        path.write_bytes(data)
+    with pytest.raises(InputError, match="is a JPEG of 12 bits a colour") as caught:
+        next(open_clip(studio.root / "clip").pairs())
+    assert "PNG" in caught.value.remedy
 
 
 def test_black_frames_tell_no_depth(studio) -> None:
