@@ -22,7 +22,8 @@ _TOKEN = re.compile(
 )
 """What a line holds. It takes linear time: where a key is none, the word there is skipped as a whole."""
 
-_OF_MATRIX = frozenset({"rows", "cols", "dt", "data", "type_id"})
+_OF_MATRIX = frozenset({"rows", "cols", "sizes", "dt", "data", "type_id"})
+_MAX_PARENTS = 16  # keys above a key; a calibration has two
 _NOT_FINITE = frozenset({"nan", "inf", "infinity"})
 
 
@@ -71,21 +72,21 @@ def keyed_yaml(text: str) -> Keyed:
     """
     found = Keyed()
     opened = {"[": 0, "{": 0}
-    parents: list[tuple[tuple[int, int], str]] = []
+    parents: list[tuple[tuple[int, int], Entry]] = []
     current, part = Entry(""), ""
     for line, kind, word, column in _tokens(text):
         if kind == "bracket":
             opened["[" if word in "[]" else "{"] += 1 if word in "[{" else -1
             opened = {bracket: max(0, count) for bracket, count in opened.items()}
-        elif kind == "key" and word in _OF_MATRIX:
-            part = word
         elif kind == "key":
             level = (opened["{"], 0 if opened["{"] else column)
-            while parents and parents[-1][0] >= level:
-                parents.pop()
+            above = [entry for at, entry in parents if at < level]
+            if word in _OF_MATRIX:
+                current, part = above[-1] if above else current, word
+                continue
             current, part = Entry(word, line), ""
-            found.add(parents[-1][1] if parents else "", current)
-            parents.append((level, word))
+            found.add(above[-1].key if above else "", current)
+            parents = [*parents[: len(above)], (level, current)][:_MAX_PARENTS]
         else:
             _take(current, part, word)
     if any(opened.values()):
