@@ -26,6 +26,7 @@ class NoticeCode(StrEnum):
 
     # assumptions about the input
     BASELINE = "baseline"
+    BIT_DEPTH = "bit_depth"
     CALIBRATION = "calibration"
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"
@@ -52,6 +53,7 @@ class NoticeCode(StrEnum):
     CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
+    DEPTH_INVERTED = "depth_inverted"
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
@@ -69,6 +71,7 @@ class NoticeCode(StrEnum):
     MASKS_MARK_NOTHING = "masks_mark_nothing"
     MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
+    MASK_LEVELS = "mask_levels"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
     NO_TIME = "no_time"

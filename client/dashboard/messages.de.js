@@ -3,6 +3,7 @@
 export const DE = {
   "notice": {
     "baseline": "Alle Abstände beruhen auf dem Abstand der beiden Linsen, den die Kalibrierdatei nennt.",
+    "bit_depth": "Die Bilder nutzen weniger Bits, als ihre Dateien haben; ihre Helligkeit richtet sich danach.",
     "calibration": "Die Kalibrierdatei ließ etwas offen; es wurde angenommen.",
     "decoding": "Der Clip wurde in einem geschützten Prozess gelesen.",
     "depth_unit": "Die Tiefenbilder enthalten Millimeter.",
@@ -27,6 +28,7 @@ export const DE = {
     "calibration_scaled": "Die Kalibrierung gilt für eine andere Bildgröße und wurde umgerechnet.",
     "colours_unknown": "Die Farben der beiden Augen ließen sich nicht vergleichen.",
     "colour_changes": "Die Farbe des Gewebes ändert sich während des Clips.",
+    "depth_inverted": "Instrumente liegen hinter dem Gewebe um sie herum: Die Tiefenbilder enthalten vielleicht keine Abstände.",
     "depth_jumps": "Die gemessene Tiefe springt von Bild zu Bild.",
     "depth_out_of_range": "Teile liegen außerhalb des Bereichs, in dem nach Tiefe gesucht wurde.",
     "depth_unusual": "Der Abstand zum Gewebe ist für ein Endoskop ungewöhnlich; prüfen Sie die Kalibrierung.",
@@ -44,6 +46,7 @@ export const DE = {
     "masks_mark_nothing": "Die Masken zeigen kein Instrument.",
     "masks_unsure": "Teile der Instrumente gelten vielleicht als Gewebe, oder Gewebe als Instrument.",
     "mask_gaps": "Einigen Bildern fehlt eine Maske.",
+    "mask_levels": "Die Masken haben mehrere Stufen; alle außer der des Gewebes gelten als Teile von Instrumenten.",
     "no_instrument_masked": "Kein Instrument ist maskiert; Instrumente werden Teil des Gewebes.",
     "no_texture": "Viel Gewebe ist zu glatt, um es gut zu vermessen.",
     "no_time": "Einige Bilder wurden weggelassen, um Zeit zu sparen.",

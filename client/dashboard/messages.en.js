@@ -3,6 +3,7 @@
 export const EN = {
   "notice": {
     "baseline": "All distances rest on the distance between the two lenses that the calibration file states.",
+    "bit_depth": "The pictures use fewer bits than their files have; their brightness was scaled by that.",
     "calibration": "The calibration file left something open, and it was assumed.",
     "decoding": "The clip was read in a protected process.",
     "depth_unit": "The depth pictures hold millimetres.",
@@ -27,6 +28,7 @@ export const EN = {
     "calibration_scaled": "The calibration was made for another picture size and was converted.",
     "colours_unknown": "The colours of the two eyes could not be compared.",
     "colour_changes": "The colour of the tissue changes during the clip.",
+    "depth_inverted": "Instruments lie behind the tissue around them: the depth pictures may hold something else than distance.",
     "depth_jumps": "The measured depth jumps from frame to frame.",
     "depth_out_of_range": "Parts lie outside the range in which depth was looked for.",
     "depth_unusual": "The distance to the tissue is unusual for an endoscope; check the calibration.",
@@ -44,6 +46,7 @@ export const EN = {
     "masks_mark_nothing": "The masks mark no instrument.",
     "masks_unsure": "Parts of the instruments may have been taken for tissue, or tissue for instruments.",
     "mask_gaps": "Some frames lack a mask.",
+    "mask_levels": "The masks have several levels; all but that of tissue were taken as parts of instruments.",
     "no_instrument_masked": "No instrument is masked; instruments become part of the tissue.",
     "no_texture": "Much of the tissue is too smooth to measure well.",
     "no_time": "Some frames were left out to save time.",

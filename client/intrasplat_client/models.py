@@ -60,6 +60,7 @@ class NoticeCode(StrEnum):
     """The kind of a notice. Two notices of one code differ in their numbers and names only."""
 
     BASELINE = "baseline"
+    BIT_DEPTH = "bit_depth"
     CALIBRATION = "calibration"
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"
@@ -84,6 +85,7 @@ class NoticeCode(StrEnum):
     CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
+    DEPTH_INVERTED = "depth_inverted"
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
@@ -101,6 +103,7 @@ class NoticeCode(StrEnum):
     MASKS_MARK_NOTHING = "masks_mark_nothing"
     MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
+    MASK_LEVELS = "mask_levels"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
     NO_TIME = "no_time"

@@ -138,7 +138,8 @@ def detect_packing(sequence: FrameSequence) -> Packing:
         raise InputError(
             "clip",
             f"{sequence.label} does not look like two eyes in one picture ({figures}).",
-            'Give the right eye as a second file, or say layout "sbs" or "tb" if the clip is stereo.',
+            'Give the right eye as a second file, or both in folders left/ and right/, or say layout "sbs" or "tb" '
+            "if the clip is stereo.",
         )
     if by_shape in (None, by_content) or abs(likeness["sbs"] - likeness["tb"]) >= _CLEAR_MARGIN:
         return by_content

@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames, tissue_from_masks
-from intrasplat.clip.naming import eye_of, left_eye_only, pair_names
+from intrasplat.clip.naming import eye_folders, eye_of, left_eye_only, pair_names
 from intrasplat.clip.packing import PACKING_WORDS, FrameSequence, PackedPairs, Packing, TwoSequences, pair_sequences
 from intrasplat.clip.types import StereoClip
 from intrasplat.clip.video import FALLBACK_RATE_HZ, open_video_in
@@ -39,12 +40,13 @@ def packed_clip(
 
 def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Notice, limits: ClipLimits) -> StereoClip:
     """The clip of one sequence per eye. InputError if their lengths or sizes differ."""
-    return _stereo_clip(pair_sequences(left, right), (assumption,), limits)
+    return _stereo_clip(pair_sequences(*at_own_depth(left, right)), (assumption,), limits)
 
 
 def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
     """The clip of two videos in a tree whose names give the eye. InputError if there are other videos."""
-    eyes = {found[0] for name in videos if (found := eye_of(name))}
+    folders = eye_folders(videos)
+    eyes = {found[0] for name in videos if (found := eye_of(name, folders))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
             "clip",

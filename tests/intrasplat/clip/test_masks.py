@@ -139,12 +139,6 @@ def test_coloured_and_16_bit_masks_are_read(studio, frames: Path) -> None:
     np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("deep/{}.png", deep)), ~tool)
 
 
-def test_masks_of_ones_instead_of_255_are_refused_rather_than_read_as_empty(studio, frames: Path) -> None:
-    masks = studio.images("masks/{}.png", studio.tool().astype(np.uint8))
-    with pytest.raises(InputError, match="largest value in the masks is 1 of 255"):
-        open_clip(frames, masks=masks)
-
-
 def test_masks_of_another_count_or_size_are_refused(studio, frames: Path) -> None:
     with pytest.raises(InputError, match="5 masks for 6 frames"):
         open_clip(frames, masks=studio.masks("few", studio.tool(5)))
