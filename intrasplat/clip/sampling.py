@@ -131,12 +131,14 @@ def most_frames(options: ReconstructionOptions) -> int | None:
 
 
 def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
-    """A clip with depth, with skipped training frames in skipped."""
+    """A clip with depth, with more skipped training frames in skipped."""
     if options.use_frames == "all":
         return clip
-    found = skippable_frames(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
+    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
+    found = skippable_frames(clip.rgb, train, most_frames(options))
     assumptions = tuple(each for each in clip.assumptions if each.code not in SKIPPED_CODES)
-    return replace(clip, skipped=found.frames, assumptions=(*assumptions, *found.notices(clip.frame_count)))
+    skipped = tuple(sorted({*clip.skipped, *found.frames}))
+    return replace(clip, skipped=skipped, assumptions=(*assumptions, *found.notices(clip.frame_count)))
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:
