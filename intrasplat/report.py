@@ -86,7 +86,7 @@ class Masks(BaseModel):
         description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
         "pixel counts as tissue"
     )
-    share: float = Field(default=0.0, ge=0, le=1, description="share of the left eye's pixels that are no tissue")
+    share: float = Field(default=0.0, ge=0, le=1, description="share of the left eye's field of view that is no tissue")
     sure: float | None = Field(
         default=None,
         ge=0,

@@ -38,11 +38,10 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
     clip = replace(
         clip,
         fov=fields.entry,
-        skipped=empty.frames,
         assumptions=(*clip.assumptions, *fields.notices),
         warnings=(*clip.warnings, *empty.notices(clip.frame_count)),
     )
-    return sampled(clip, options)
+    return sampled(clip, options, empty.frames)
 
 
 def shown_frames(train: list[int], empty: tuple[int, ...]) -> list[int]:
