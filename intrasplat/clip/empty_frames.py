@@ -17,11 +17,12 @@ from intrasplat.clip.sampling import Thumbnail
 from intrasplat.notices import Notice, NoticeCode
 
 PATCH_PX = 4
-EMPTY, FADED = 0.2, 0.9
+EMPTY, FADED = 0.2, 0.8
 """Contrast of an empty frame, and of a frame beside one that is still fading, as shares of the clip's median."""
-UNBOUNDED_PERCENTILE = 75.0
-MIN_CONTRAST_LEVELS = 0.3
-"""A clip of less contrast has no frame that another could be compared with."""
+KNOWN_PERCENTILE, UNKNOWN_PERCENTILE = 50.0, 95.0
+"""Of the patches, where the field of view is known, and where most of the picture may lie outside it."""
+FEW_PERCENTILE, MIN_CONTRAST_LEVELS = 90.0, 0.3
+"""Of the training frames' contrast, where half of them are empty; the least contrast of one that shows something."""
 MIN_TISSUE = 0.005
 """Share of a frame's pixels that masks must leave."""
 SAME, OTHER = 0.1, 0.5
@@ -73,17 +74,18 @@ def find_empty(
     Args:
         eyes: T thumbnails of each eye.
         train: the frames that are not held out, rising.
-        fields: [H, W] field of view of each eye; None: not known.
+        fields: [H, W] field of view of each eye, None for the whole picture; none: not known.
         tissue_shares: T shares of each frame that the masks leave; none: no masks.
     """
     count = len(eyes[0])
     faded, torn = np.zeros((2, count), np.bool_)
     empty = np.zeros((len(eyes), count), np.bool_)
+    percentile = KNOWN_PERCENTILE if fields else UNKNOWN_PERCENTILE
     for eye, (thumbnails, inside) in enumerate(zip(eyes, fields or [None] * len(eyes), strict=True)):
-        contrast = np.array([_contrast(each, inside) for each in thumbnails])
+        contrast = np.array([_contrast(each, inside, percentile) for each in thumbnails])
         usual = float(np.median(contrast[train]))
-        if usual < MIN_CONTRAST_LEVELS:
-            continue
+        if usual < MIN_CONTRAST_LEVELS:  # most frames may be empty
+            usual = max(float(np.percentile(contrast[train], FEW_PERCENTILE)), MIN_CONTRAST_LEVELS)
         empty[eye] = contrast < EMPTY * usual
         faint = contrast < FADED * usual
         faded[train] |= _fading(empty[eye][train], faint[train])
@@ -101,11 +103,8 @@ def find_empty(
     return EmptyFrames(reasons)
 
 
-def _contrast(thumbnail: Thumbnail, inside: NDArray[np.bool_] | None) -> float:
-    """The median standard deviation of a thumbnail's patches, levels: of those inside the field [H, W] alone.
-
-    If the field is not known (None), most of the picture may be a border: a higher percentile.
-    """
+def _contrast(thumbnail: Thumbnail, inside: NDArray[np.bool_] | None, percentile: float) -> float:
+    """A percentile of the standard deviations of a thumbnail's patches inside the field [H, W], levels."""
     size = (PATCH_PX, PATCH_PX)
     mean, square = cv2.blur(thumbnail, size), cv2.blur(np.square(thumbnail), size)
     deviation = np.sqrt(np.maximum(square - np.square(mean), 0))[PATCH_PX // 2 :: PATCH_PX, PATCH_PX // 2 :: PATCH_PX]
@@ -113,8 +112,8 @@ def _contrast(thumbnail: Thumbnail, inside: NDArray[np.bool_] | None) -> float:
         small = cv2.resize(inside.astype(np.uint8) * 255, thumbnail.shape[::-1], interpolation=cv2.INTER_AREA)
         wholly = cv2.erode((small == 255).astype(np.uint8), np.ones((PATCH_PX + 1, PATCH_PX + 1), np.uint8))
         chosen = wholly[PATCH_PX // 2 :: PATCH_PX, PATCH_PX // 2 :: PATCH_PX] > 0
-        return float(np.median(deviation[chosen] if chosen.any() else deviation))
-    return float(np.percentile(deviation, UNBOUNDED_PERCENTILE if inside is None else 50))
+        deviation = deviation[chosen] if chosen.any() else deviation
+    return float(np.percentile(deviation, percentile))
 
 
 def _fading(empty: NDArray[np.bool_], faint: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -32,9 +32,9 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
         for index, tissue in enumerate(clip.tissue):
             np.logical_and(tissue, fields.left, out=inside[index])
             let_go(inside[index])
-        empty = find_empty(thumbnails, train, [fields.left], shares)
-        shown_frames(train, empty.frames)
         clip = replace(clip, tissue=inside, field_of_view=fields.left)
+    empty = find_empty(thumbnails, train, [fields.left], shares)
+    shown_frames(train, empty.frames)
     clip = replace(
         clip,
         fov=fields.entry,

@@ -107,8 +107,7 @@ def estimate_depth(
         shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
         empty = find_empty(received.thumbnails, measured, tissue_shares=shares)
         fields = find_fields([rgb, right_rgb], shown_frames(measured, empty.frames), fov, pool.map)
-        if fields.notices:
-            empty = find_empty(received.thumbnails, measured, [fields.left, fields.right], shares)
+        empty = find_empty(received.thumbnails, measured, [fields.left, fields.right], shares)
         measured = shown_frames(measured, empty.frames)
         matches = received.matches(spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()

@@ -168,6 +168,9 @@ class FrameWork:
             no_tool = self.label if self.fields.left is None else self.label | ~self.fields.left
             shown = moved_tissue(left.tissue[i] | no_tool, left.depth_mm[i], focal_baseline, offset_px)
             right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
+        for eye in (left, right):
+            if eye.field_of_view is not None:
+                eye.depth_mm[i][~eye.field_of_view], eye.depth_confidence[i][~eye.field_of_view] = 0, 0
         if self.fields.right is not None:
             right.tissue[i] &= self.fields.right
         if self.fields.left is not None:  # what the right eye alone sees lies outside the left one's field

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -25,9 +25,11 @@ def pictures() -> NDArray[np.uint8]:
     return np.ascontiguousarray(wide[::4])
 
 
-def found_in(*eyes: NDArray[np.uint8], **given: object) -> dict[int, str]:
+def found_in(
+    *eyes: NDArray[np.uint8], fields: Sequence[NDArray[np.bool_]] = (), shares: Sequence[float] = ()
+) -> dict[int, str]:
     thumbnails = [[thumbnail(rgb) for rgb in eye] for eye in eyes]
-    return dict(find_empty(thumbnails, TRAIN, **given).reasons)  # type: ignore[arg-type]
+    return dict(find_empty(thumbnails, TRAIN, fields or [None] * len(eyes), shares).reasons)
 
 
 def as_one_colour(colour: tuple[int, int, int]) -> Change:
@@ -62,15 +64,18 @@ def test_a_sound_clip_loses_nothing_not_even_when_its_light_changes() -> None:
     assert found_in(eye) == {}
 
 
-def test_a_clip_without_contrast_has_no_empty_frames() -> None:
-    assert found_in(np.full((COUNT, 80, 100, 3), 90, np.uint8)) == {}
+def test_a_clip_of_one_colour_is_empty_and_so_are_most_frames_of_one_that_lost_its_signal() -> None:
+    assert found_in(np.full((COUNT, 80, 100, 3), 90, np.uint8)) == dict.fromkeys(range(COUNT), EMPTY_FRAME)
+    eye = pictures()
+    eye[6:] = 0
+    assert found_in(eye) == dict.fromkeys(range(6, COUNT), EMPTY_FRAME)
 
 
-def test_fades_are_left_out_up_to_full_light() -> None:
+def test_fades_are_left_out_up_to_nearly_full_light() -> None:
     eye = pictures()
     for index in range(6):
         eye[index] = eye[index] * (index / 6)
-    assert found_in(eye) == {0: EMPTY_FRAME, 1: EMPTY_FRAME} | dict.fromkeys(range(2, 6), FADE)
+    assert found_in(eye) == {0: EMPTY_FRAME, 1: EMPTY_FRAME} | dict.fromkeys(range(2, 5), FADE)
 
 
 def test_one_lost_eye_is_told_from_both() -> None:
@@ -89,7 +94,7 @@ def test_a_white_picture_in_a_round_field_is_empty() -> None:
 def test_frames_that_masks_cover_are_left_out() -> None:
     shares = np.full(COUNT, 0.8)
     shares[[3, 4]] = 0.0
-    assert found_in(pictures(), tissue_shares=shares) == {3: COVERED, 4: COVERED}
+    assert found_in(pictures(), shares=list(shares)) == {3: COVERED, 4: COVERED}
 
 
 @pytest.mark.parametrize("upper", [True, False])
