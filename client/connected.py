@@ -39,7 +39,7 @@ def connected(url: str, api_key: str | None = None, remedies: Remedies | None = 
         InputError, UnavailableError, Cancelled, IntrasplatError: in place of the client's errors.
     """
     try:
-        with Client(url, api_key=api_key, on_wait=_Waiting().tell) as client:
+        with Client(url, api_key=api_key, on_wait=_Waiting().report) as client:
             yield client
     except intrasplat_client.IntrasplatError as error:
         raise command_error(error, {**REMEDIES, **(remedies or {})}) from error
@@ -51,7 +51,7 @@ class _Waiting:
     def __init__(self) -> None:
         self._is_reported = False
 
-    def tell(self, failure: intrasplat_client.IntrasplatError, pause_s: float) -> None:
+    def report(self, failure: intrasplat_client.IntrasplatError, pause_s: float) -> None:
         if not self._is_reported:
             self._is_reported = True
             again = f"Asking again for up to {DEFAULT_PATIENCE_S:g} s."

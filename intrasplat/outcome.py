@@ -53,7 +53,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
         settings={
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,
-            "eyes": run.taught_by,
+            "eyes": run.trained_eyes,
             "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_WARNINGS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
         },
@@ -73,7 +73,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
     """The run's part of the report: settings, choices with their reasons, durations, warnings and versions."""
     return Training(
         preset=run.preset.name,
-        eyes=run.taught_by,
+        eyes=run.trained_eyes,
         seed=run.seed,
         device=str(run.device),
         iterations=run.iteration,

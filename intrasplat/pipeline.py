@@ -29,8 +29,8 @@ from intrasplat.notices import Notice
 from intrasplat.outcome import scene_of, snapshot_of, training_of
 from intrasplat.poses import placed, with_poses
 from intrasplat.quality.checks import clip_warnings
-from intrasplat.quality.judge import judged
 from intrasplat.quality.report import first_report
+from intrasplat.quality.score import score_model
 from intrasplat.report import Recorded, Report
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.compact import compile_coder
@@ -39,8 +39,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.deformation import motion_named
-from intrasplat.stereo import ClipPaths
-from intrasplat.stereo import open_with_depth as open_paths
+from intrasplat.stereo import ClipPaths, open_with_depth
 from intrasplat.train.first_picture import first_picture
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
@@ -52,7 +51,7 @@ from intrasplat.train.resume import resume
 from intrasplat.train.run import Run, write_curve
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup, length_of
-from intrasplat.view.recorded import EYES, kept_frames
+from intrasplat.view.recorded import EYES, zipped_frames
 from intrasplat.view.render import SceneRenderer
 
 FINISHING_STEPS = 7
@@ -61,7 +60,7 @@ FINISHING_STEPS = 7
 
 @dataclass(eq=False)
 class Made:
-    """A finished scene, and all that judge() needs; judge() deletes the scene from it."""
+    """A finished scene, and all that score_scene() needs; score_scene() deletes the scene from it."""
 
     clip: DepthClip
     split: FrameSplit
@@ -84,7 +83,7 @@ def reconstruct(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHo
     """
     made = make(request, out_dir, hooks)
     try:
-        report = judge(made, hooks)
+        report = score_scene(made, hooks)
     except (Cancelled, TrainingDiverged) as error:
         add_scores(out_dir, without_scores(made.report, error.code))
         raise
@@ -97,9 +96,9 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, re
 
     resume_dir: folder for the state that the same request resumes from; the caller removes it. None: out_dir.
     """
-    length, tell = length_of(request.options, request.preset), hooks.on_progress
+    length, report_progress = length_of(request.options, request.preset), hooks.on_progress
     forecast = TimeEstimate(*length, most_frames(request.options))
-    hooks = dataclasses.replace(hooks, on_progress=lambda progress: tell(forecast.completed(progress)))
+    hooks = dataclasses.replace(hooks, on_progress=lambda progress: report_progress(forecast.completed(progress)))
     with keeping(resume_dir or out_dir, forgets=resume_dir is None) as keeper:
         setup = begin(request, out_dir, hooks, keeper)
         used = len(setup.clip.used)
@@ -116,7 +115,7 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, re
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
-def judge(made: Made, hooks: Hooks) -> Report:
+def score_scene(made: Made, hooks: Hooks) -> Report:
     """The report with the scores of the scene as it is stored.
 
     Raises:
@@ -125,11 +124,11 @@ def judge(made: Made, hooks: Hooks) -> Report:
     """
     renderer = SceneRenderer(made.scene, made.device)
     del made.scene  # the renderer has the weights, and they take much memory
-    return judged(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
+    return score_model(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
 
 
-def judge_again(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
-    """Like judge, for the finished scene in a directory: opens its clip again, and places it at the scene's poses.
+def score_stored_scene(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
+    """Like score_scene, for the stored scene in a directory: opens its clip again, placed at the scene's poses.
 
     Raises:
         InputError: the clip, its calibration, masks or an option cannot be used.
@@ -137,11 +136,11 @@ def judge_again(request: ReconstructionRequest, directory: Path, hooks: Training
     """
     device = device_for(request.preset.deformation, request.device)
     scene, unplaced = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
-    clip = open_with_depth(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
+    clip = open_with_poses(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
     clip = placed(clip, scene.world_from_camera)
     split = split_frames(clip, request.options.holdout)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
-    return judge(Made(clip, split, scene, report, device), hooks)
+    return score_scene(Made(clip, split, scene, report, device), hooks)
 
 
 def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, keeper: Keeper) -> Setup:
@@ -160,7 +159,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
             timings.seconds["t_first_view_s"] = time.time() - accepted_at_s
 
     showing = dataclasses.replace(hooks, on_first_moment=show)
-    clip = keeper.clip(request, lambda: open_with_depth(request, showing, timings, device))
+    clip = keeper.clip(request, lambda: open_with_poses(request, showing, timings, device))
     if "t_first_view_s" not in timings.seconds:  # the clip was stored with its depth, or its first moment has none
         frames = training_frames(clip.frame_count, options.holdout)
         moment = next((i for i in frames if (clip.tissue[i] & (clip.depth_mm[i] > 0)).any()), frames[0])
@@ -177,7 +176,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     return Setup(clip, split, preset, options, device, hooks, timings, accepted_at_s=accepted_at_s, gpu_is_idle=idle)
 
 
-def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
+def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timings, device: Device = CPU) -> DepthClip:
     """The clip of a request with depth (intrasplat/stereo/opening.py) and camera poses (intrasplat/poses/posed.py).
 
     On a GPU the splatting kernels are checked before stereo matching.
@@ -192,7 +191,7 @@ def open_with_depth(request: ReconstructionRequest, hooks: Hooks, timings: Timin
             timings.add("compile_s", examine(device))
 
     paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
-    clip = open_paths(
+    clip = open_with_depth(
         paths,
         request.options,
         hooks,
@@ -251,7 +250,7 @@ def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
     if run.setup.options.keep_recorded == "off":
         return None, None
     with run.setup.timings.measure("recorded_s"):
-        return kept_frames(run.setup.clip, EYES[: len(run.eyes)])
+        return zipped_frames(run.setup.clip, EYES[: len(run.eyes)])
 
 
 def publish(

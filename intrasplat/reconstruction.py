@@ -107,7 +107,7 @@ class Scene:
 
         Args:
             t: 0 is the first frame, i / T is frame i; later times show the last frame, with a warning.
-            pose: `orbit(...)`, `pose(...)`, [4, 4] world_from_camera in mm, or the API's text; None: the endoscope's.
+            pose: `orbit(...)`, `parse_pose(...)`, [4, 4] world_from_camera in mm, or text; None: the endoscope's.
             width, height: size of the picture in pixels; one alone keeps the aspect ratio. Default: the clip's size.
             intrinsics: another camera, instead of width and height.
             highlights: whether to show the highlights that were separated by means of the two eyes of a stereo clip.
@@ -239,8 +239,8 @@ def reconstruct(
     """Train a scene from a clip.
 
     Args:
-        clip: the result of `read_clip`, or of `Clip.with_depth` or `follow` in memory.
-        method: instant, fast, quality and small are ours; paper is Deform3DGS as published (docs/method.md).
+        clip: the result of `read_clip` or of `Clip.with_depth`.
+        method: instant, fast, quality and small are ours; paper is Deform3DGS as published. The API's `preset`.
         budget_s: about how many seconds to train, often less; None: the method's own.
         iterations: the exact number of steps instead; then the same seed on the same machine gives identical bits.
         seed: seed of all random numbers.

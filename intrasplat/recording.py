@@ -27,7 +27,7 @@ from intrasplat.machine.timing import Timings
 from intrasplat.names import Layout, MaskPolarity, MaskSource, PoseConvention
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ClipOptions, ReconstructionOptions, parse_options
-from intrasplat.pipeline import open_with_depth
+from intrasplat.pipeline import open_with_poses
 from intrasplat.report import CameraPoses, Masks
 from intrasplat.splat.backend import choose_device
 from intrasplat.stereo import ClipPaths, match_eyes
@@ -115,7 +115,7 @@ class Clip:
             options=chosen,
             segmenter=self.segmenter,
         )
-        return open_with_depth(request, hooks, timings, where)
+        return open_with_poses(request, hooks, timings, where)
 
 
 def read_clip(
@@ -141,7 +141,7 @@ def read_clip(
     Args:
         source: a video, folder or zip of both eyes or, with `right`, of the left one; or [T, H, W, 3] uint8 RGB.
         right: the right eye, likewise.
-        calibration: of both eyes, a file or the values of our JSON (docs/conventions.md). Needed for stereo frames.
+        calibration: of both eyes, a file or the values of our JSON (docs/input.md). Needed for stereo frames.
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
         depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
         poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; None: the camera is fixed. Only with depth_mm.

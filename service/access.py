@@ -122,8 +122,8 @@ class Access:
     def stranger(self) -> Iterator[None]:
         """Count a connection without a key during the context. Raises Problem 503 if there are too many."""
         if self._strangers >= MAX_STRANGERS:
-            detail = f"{MAX_STRANGERS} viewers have yet to send their keys, as many as may be."
-            raise Problem(503, detail, remedy="Come back, or send the key as a header.")
+            detail = f"{MAX_STRANGERS} connections have not sent their keys yet, the most at once."
+            raise Problem(503, detail, remedy="Send the key as a header, or connect again in some seconds.")
         self._strangers += 1
         try:
             yield

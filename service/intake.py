@@ -35,34 +35,34 @@ class Intake:
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
         self._store = store
-        self._places: set[UploadSlot] = set()
+        self._slots: set[UploadSlot] = set()
 
     @contextmanager
-    def place(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[UploadSlot]:
+    def slot(self, tenant: str, declared_bytes: int = 0, part: str = "clip") -> Iterator[UploadSlot]:
         """A slot for one upload, with disk space for `declared_bytes`. part: what is sent.
 
         Raises:
             Problem: 429: the tenant has used its share. 503: all slots are taken. 507: the disk has no space for it.
             LimitError: it exceeds the maximum size of an upload.
         """
-        own, share = sum(place.tenant == tenant for place in self._places), self._settings.tenant_share
+        own, share = sum(slot.tenant == tenant for slot in self._slots), self._settings.tenant_share
         if own and own + 1 > self._settings.max_uploads * share:
             detail = f"{own} of your uploads are being received, as many as one tenant may send at once."
-            raise Problem(429, detail, field="uploads", remedy="Come back when one of them is through.")
-        if len(self._places) >= self._settings.max_uploads:
-            detail = f"{len(self._places)} uploads are being received, as many as may be."
-            raise Problem(503, detail, field="uploads", remedy="Come back when one of them is through.")
+            raise Problem(429, detail, field="uploads", remedy="Send this one when one of them has ended.")
+        if len(self._slots) >= self._settings.max_uploads:
+            detail = f"{len(self._slots)} uploads are being received, the most at once (INTRASPLAT_MAX_UPLOADS)."
+            raise Problem(503, detail, field="uploads", remedy="Send this one when one of them has ended.")
         if declared_bytes:
             self.check(tenant, declared_bytes, part)
-        place = UploadSlot(declared_bytes, tenant)
-        self._places.add(place)
+        slot = UploadSlot(declared_bytes, tenant)
+        self._slots.add(slot)
         try:
-            yield place
+            yield slot
         finally:
-            self._places.discard(place)
+            self._slots.discard(slot)
 
     def check(self, tenant: str, declared_bytes: int, part: str = "clip") -> None:
-        """Return if an upload of this size is allowed and fits on the disk; raises as place().
+        """Return if an upload of this size is allowed and fits on the disk; raises as slot().
 
         A tenant with reserved space gets no more of the disk's free space than its share.
         """
@@ -75,9 +75,13 @@ class Intake:
         own_bytes = self._reserved_bytes(tenant)
         allowed_bytes = self._settings.tenant_share * (available_bytes + own_bytes)
         if own_bytes and own_bytes + declared_bytes > allowed_bytes:
-            detail = f"Your uploads have been promised {own_bytes} bytes that have not come, and {declared_bytes} more "
-            detail += f"are beyond the {allowed_bytes:.0f} of one tenant."
-            raise Problem(429, detail, field="uploads", remedy="Send them, or give some up: DELETE /uploads/{id}.")
+            detail = (
+                f"Your uploads have {own_bytes} bytes of the disk reserved; {declared_bytes} more would exceed the "
+            )
+            detail += f"{allowed_bytes:.0f} of one tenant."
+            raise Problem(
+                429, detail, field="uploads", remedy="Finish these uploads, or delete some: DELETE /uploads/{id}."
+            )
 
     def has_free_space(self) -> bool:
         """Whether the disk has more than the minimum free space; otherwise no clip is accepted."""
@@ -97,10 +101,10 @@ class Intake:
 
     def _reserved_bytes(self, tenant: str | None = None) -> int:
         """Bytes reserved for unfinished uploads, of one tenant or of all."""
-        places = sum(place.reserved_bytes for place in self._places if tenant in (None, place.tenant))
-        return places + promised_bytes(self._store, tenant)
+        slots = sum(slot.reserved_bytes for slot in self._slots if tenant in (None, slot.tenant))
+        return slots + promised_bytes(self._store, tenant)
 
-    async def body(self, request: Request, place: UploadSlot | None = None) -> AsyncIterator[bytes]:
+    async def body(self, request: Request, slot: UploadSlot | None = None) -> AsyncIterator[bytes]:
         """The pieces of a request's body as they arrive.
 
         Raises:
@@ -121,14 +125,14 @@ class Intake:
                     return
                 left_s -= time.monotonic() - asked_at_s  # counts waiting for the caller, not writing to disk
                 new_bytes += len(piece)
-                if place is not None:
-                    place.reserved_bytes = max(place.reserved_bytes - len(piece), 0)
+                if slot is not None:
+                    slot.reserved_bytes = max(slot.reserved_bytes - len(piece), 0)
                 yield piece
 
 
 def _silence(silence_s: float) -> Problem:
     detail = f"Fewer than {MIN_BYTES} bytes came in {silence_s:g} s."
-    return Problem(408, detail, remedy="Send it again.", headers={"Connection": "close"})
+    return Problem(408, detail, field="body", remedy="Send it again.", headers={"Connection": "close"})
 
 
 def declared_length(request: Request) -> int:

@@ -86,7 +86,7 @@ class Partial:
         """The SHA-256 of the file."""
         return sha256_of(self.path)
 
-    def give_to(self, job_id: str) -> None:
+    def assign_to(self, job_id: str) -> None:
         """Record which job has the file, and remove the file here."""
         taken = self.declaration.model_copy(update={"job_id": job_id})
         replace_file(self.folder / DECLARATION, taken.model_dump_json().encode())

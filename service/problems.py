@@ -19,6 +19,7 @@ from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 2
 """Default Retry-After of 423, 429 and 503."""
+RETRY_REMEDY = "Send the request again after the seconds in Retry-After."
 API_REMEDY = "The API is described at /openapi.json."
 SPACE_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"

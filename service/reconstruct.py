@@ -119,20 +119,20 @@ async def receive_form(
 ) -> JobRecord:
     """Receive a multipart request and return the job that `accept` creates from it."""
     store, settings = services.store, services.settings
-    with services.intake.place(caller.tenant, declared_length(request), form.main_part) as place:
+    with services.intake.slot(caller.tenant, declared_length(request), form.main_part) as slot:
         job_id = new_job_id()
         folder = store.open_incoming(job_id)
         try:
-            available_bytes = services.intake.available_bytes() + place.reserved_bytes
+            available_bytes = services.intake.available_bytes() + slot.reserved_bytes
             limits = UploadLimits(settings.max_upload_bytes, available_bytes, settings.min_free_bytes)
             content_type = request.headers.get("content-type", "")
             with traces.span("receive"):
-                body = services.intake.body(request, place)
+                body = services.intake.body(request, slot)
                 received = await receive_upload(content_type, body, folder, limits, form)
             return await run_in_threadpool(accept, services, caller, job_id, received, key)
         except ClientDisconnect:
             detail = "The connection was closed before the upload was complete."
-            raise Problem(400, detail, remedy="Send it again.") from None
+            raise Problem(400, detail, field="body", remedy="Send it again.") from None
         finally:
             await run_in_threadpool(store.discard_incoming, job_id)
 
@@ -148,7 +148,7 @@ async def read_json(request: Request, services: Deps, model: type[Body], max_byt
     async for piece in services.intake.body(request):
         body += piece
         if len(body) > max_bytes:
-            raise Problem(413, f"The JSON body is larger than {max_bytes} bytes.", remedy=remedy)
+            raise Problem(413, f"The JSON body is larger than {max_bytes} bytes.", field="body", remedy=remedy)
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
@@ -164,8 +164,8 @@ def _accept_uploads(services: Deps, caller: Caller, submission: Submission, key:
     options = parse_options(JobOptions, submission.options)
     given = submission.uploads()
     partials = {part: _finished(services, caller, part, upload_id) for part, upload_id in given.items()}
-    job_ids = {partial.declaration.job_id for partial in partials.values()}
-    if job_ids - {None}:
+    job_ids = {part: partial.declaration.job_id for part, partial in partials.items()}
+    if any(job_ids.values()):
         return _taken_before(services, job_ids, submission, options)
     labels = parse_labels(submission.label, submission.metadata)
     received = Received(options=options.model_dump_json(), clip_of=submission.clip_of, labels=labels)
@@ -187,7 +187,7 @@ def _make_job_of(
         Problem: 507: the disk is full; the uploads stay.
     """
     if not services.intake.has_free_space():
-        raise disk_full("The disk has too little room; the uploads are kept.", services.intake.space_remedy())
+        raise disk_full("The disk has too little free space; the uploads stay on it.", services.intake.space_remedy())
     job_id = new_job_id()
     folder = services.store.open_incoming(job_id)
     try:
@@ -201,11 +201,11 @@ def _make_job_of(
         record = _accept(services, caller, job_id, received, key)
     except Problem as problem:
         if "job_id" in problem.extensions:  # the clip is in the spool despite the error
-            _give(partials, job_id)
+            _assign(partials, job_id)
         raise
     finally:
         services.store.discard_incoming(job_id)
-    _give(partials, record.job_id)
+    _assign(partials, record.job_id)
     return record
 
 
@@ -232,24 +232,29 @@ def _finished(services: Deps, caller: Caller, part: str, upload_id: str) -> Part
     return partial
 
 
-def _taken_before(services: Deps, job_ids: set[str | None], submission: Submission, options: JobOptions) -> JobRecord:
-    """The job that took the uploads, if one job took all of them and has the same clip and options."""
-    job_id = next(job_id for job_id in job_ids if job_id is not None)
+def _taken_before(
+    services: Deps, job_ids: Mapping[str, str | None], submission: Submission, options: JobOptions
+) -> JobRecord:
+    """The job that took the uploads, if one job took all of them and has the same clip and options.
+
+    job_ids: the job that took each part; None: no job did.
+    """
+    part, job_id = next((part, job_id) for part, job_id in job_ids.items() if job_id is not None)
     known = services.queue.get(job_id)
     record = known or services.store.labelled_submission(job_id)
     clip_of = submission.clip_of and first_job(services.store, submission.clip_of)
     asked = (options, clip_of, submission.callback_url)
     asked_before = record and (record.options, record.clip_of, record.callback_url)
-    if len(job_ids) > 1 or record is None or asked_before != asked:
-        detail = f"An upload was used for the job {job_id} already."
-        raise Problem(409, detail, remedy="Upload it again.", extensions={"job_id": job_id})
+    if len(set(job_ids.values())) > 1 or record is None or asked_before != asked:
+        detail = f"The upload was used for the job {job_id} already."
+        raise Problem(409, detail, field=part, remedy="Upload the file again.", extensions={"job_id": job_id})
     # An accepted clip is never refused by a full queue that has lost its record.
     return known or services.queue.submit(record)
 
 
-def _give(partials: Mapping[str, Partial], job_id: str) -> None:
+def _assign(partials: Mapping[str, Partial], job_id: str) -> None:
     for partial in partials.values():
-        partial.give_to(job_id)
+        partial.assign_to(job_id)
 
 
 def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
@@ -278,7 +283,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         idempotency_key=key,
         created_at_s=time.time(),
     )
-    with traces.span("judge"):
+    with traces.span("check"):
         _look_at(services, record, received.names, sent)
     outcome = "ok" if clip_of is None else f"ok (clip of {clip_of})"
     services.audit.record(AuditAction.ACCEPTED, caller, job_id, outcome)
@@ -335,7 +340,7 @@ def enqueue(services: Deps, record: JobRecord) -> JobRecord:
         services.store.purge(record.job_id)
         raise
     except UnavailableError as error:
-        services.sweep.owe(record.job_id)
+        services.sweep.leave(record.job_id)
         detail = f"{error.problem} The clip is safe and is queued as soon as the queue is back."
         remedy = f"Send nothing again; ask for GET /jobs/{record.job_id} later."
         raise Problem(503, detail, field="queue", remedy=remedy, extensions={"job_id": record.job_id}) from error

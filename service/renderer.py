@@ -89,7 +89,7 @@ class ZmqRenderer:
         if worker is not None:
             workers = [each for each in workers if each.endpoint == worker]
             if not workers:
-                raise UnavailableError("The worker is gone.", WORKER_REMEDY)
+                raise UnavailableError("The worker of this export has ended.", "Ask for the export again.")
         if not workers:
             problem = f"No worker runs job {request.scene_id} yet."
             not_yet = ReplyError(kind="not-yet", problem=problem, field="scene", remedy="Ask again in a second.")
@@ -110,7 +110,7 @@ class ZmqRenderer:
             problem = f"The worker did not answer within {self._timeout_s:g} s."
             raise UnavailableError(problem, _remedy(first)) from None
         except WorkerGoneError:
-            raise UnavailableError("The worker is gone.", _remedy(first)) from None
+            raise UnavailableError("The worker ended before it answered.", _remedy(first)) from None
 
     async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
         connection = await self._connection(address)

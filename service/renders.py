@@ -222,8 +222,8 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
     if record.state is JobState.RUNNING:
         return Shown(scene, None)
     if record.state is JobState.QUEUED and record.attempt > 0:
-        remedy = "Ask again in some seconds: a worker goes on with it."
-        raise Problem(503, "The job has lost its worker and waits for another.", field="scene", remedy=remedy)
+        remedy = "Ask again in some seconds, when another worker has claimed it."
+        raise Problem(503, "The job's worker has ended, and the job is queued again.", field="scene", remedy=remedy)
     detail = f"The job is {record.state}; there is nothing to show."
     raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene}.")
 
@@ -232,7 +232,9 @@ def _only(services: Deps, caller: Caller) -> Shown:
     page, _ = services.done.page_of(caller.tenant, SceneSearch())
     there = [record for record in page.records if services.store.has_scene(record.job_id, record.attempt)]
     if len(there) != 1 or page.end is not None:
-        detail = f"There are {len(there)}{' or more' if page.end else ''} scenes and none was named."
+        if not there and page.end is None:
+            raise Problem(400, "There is no finished scene.", field="scene", remedy="Send a clip: POST /reconstruct.")
+        detail = f"There are {len(there)}{' or more' if page.end else ''} scenes, and the request names none."
         raise Problem(400, detail, field="scene", remedy="Add scene=ID; GET /scenes lists them.")
     return Shown(there[0].job_id, there[0].attempt)
 

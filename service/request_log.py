@@ -22,7 +22,7 @@ from contract.runtime import traces
 from contract.runtime.logs import answering
 from contract.store.shelf import is_job_id
 from service.metrics import METHODS
-from service.problems import Problem, fault
+from service.problems import RETRY_REMEDY, Problem, fault
 
 REQUEST_ID = "X-Request-Id"
 ACCEPTED_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
@@ -80,7 +80,9 @@ class RequestLog:
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, answered: _Answered) -> None:
         if self._open > MAX_OPEN:
-            problem = Problem(503, f"{MAX_OPEN} requests are being answered, as many as may be.", remedy="Come back.")
+            problem = Problem(
+                503, f"The service answers {MAX_OPEN} requests already, its most at once.", remedy=RETRY_REMEDY
+            )
             await _refuse(problem, scope, receive, send)
             return
         try:

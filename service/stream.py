@@ -170,7 +170,7 @@ class _Viewer:
             try:
                 answer = await self._answer(document, start)
             except Exception as error:
-                await self._tell(error, document.get("id") if isinstance(document, dict) else None)
+                await self._send_problem(error, document.get("id") if isinstance(document, dict) else None)
             else:
                 async with asyncio.timeout(SEND_TIMEOUT_S):
                     await self._websocket.send_bytes(answer)
@@ -190,7 +190,7 @@ class _Viewer:
                 raise problem_of_reply(answer.head.error)
         return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)
 
-    async def _tell(self, error: Exception, message_id: object) -> None:
+    async def _send_problem(self, error: Exception, message_id: object) -> None:
         """Send the error; close the connection of a caller without a valid key."""
         problem = problem_of(error)
         if problem is None:

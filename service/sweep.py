@@ -51,7 +51,7 @@ class Sweep:
             with self._lock:
                 self._in_hand.discard(job_id)
 
-    def owe(self, job_id: str) -> None:
+    def leave(self, job_id: str) -> None:
         """Leave a job to the sweep: its clip is in the spool, and the queue may not know it."""
         with self._lock:
             self._in_hand.discard(job_id)

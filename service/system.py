@@ -60,7 +60,7 @@ async def readyz(services: Services, caller: EarlyCaller) -> Readiness:
     missing_bytes = await run_in_threadpool(services.intake.missing_bytes)
     if missing_bytes > 0:
         remedy = space_remedy(None if caller is None else missing_bytes, services.settings.min_free_bytes)
-        raise disk_full("The disk has too little room.", remedy, status=503, field="disk")
+        raise disk_full("The disk has too little free space.", remedy, status=503, field="disk")
     try:
         workers = await run_in_threadpool(services.questions.ask, services.queue.workers, QUEUE_PATIENCE_S)
     except UnavailableError as error:

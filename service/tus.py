@@ -33,7 +33,7 @@ CONTENT_TYPE = "application/offset+octet-stream"
 MAX_OPEN_UPLOADS = 100
 """Maximum uploads of one tenant that are unfinished or not used yet."""
 
-REST_REMEDY = "Ask how far it came (HEAD) and send what follows."
+REST_REMEDY = "Ask for the offset (HEAD) and send the bytes that follow."
 METADATA_REMEDY = "Send `part` (clip, left, right, calibration or masks) and `suffix` (.mp4), each value in base64."
 
 
@@ -147,14 +147,15 @@ async def append_to_upload(
     if content_type != CONTENT_TYPE:
         raise Problem(415, f"The content type is {content_type[:80]!r}.", field="Content-Type", remedy=CONTENT_TYPE)
     partial = await run_in_threadpool(_owned, services, caller, upload_id)
-    with services.intake.place(caller.tenant) as place:
+    with services.intake.slot(caller.tenant) as slot:
         file = await run_in_threadpool(_open_at, partial, upload_offset)
         try:
             left_bytes = partial.declaration.length_bytes - upload_offset
             _check_fits(declared_length(request), left_bytes)
-            new_bytes = await _write(services.intake.body(request, place), file, left_bytes)
+            new_bytes = await _write(services.intake.body(request, slot), file, left_bytes)
         except ClientDisconnect:
-            raise Problem(400, "The connection was closed; what came is kept.", remedy=REST_REMEDY) from None
+            detail = "The connection was closed; the bytes that came are stored."
+            raise Problem(400, detail, field="body", remedy=REST_REMEDY) from None
         finally:
             await run_in_threadpool(close, file)
     response.headers["Upload-Offset"] = str(upload_offset + new_bytes)
@@ -182,23 +183,25 @@ def _open_at(partial: Partial, offset_bytes: int) -> RawIOBase:
     try:
         file = partial.open()
     except BlockingIOError:
-        problem = "Another request is writing to this upload."
-        raise Problem(423, problem, remedy="Wait for it to end, then ask how far it came: HEAD.") from None
+        detail, remedy = "Another request is writing to this upload.", f"Wait until it has ended. {REST_REMEDY}"
+        raise Problem(423, detail, field="upload_id", remedy=remedy) from None
     except FileNotFoundError:
-        raise Problem(409, "All of this upload has come, and a job has it.", remedy="See GET /jobs.") from None
+        detail = "This upload is complete, and a job has taken it."
+        raise Problem(409, detail, field="upload_id", remedy="See GET /jobs.") from None
     if partial.offset_bytes == offset_bytes:
         return file
     file.close()
     detail = f"{partial.offset_bytes} bytes have come, not {offset_bytes}."
     headers = {"Upload-Offset": str(partial.offset_bytes)}
-    raise Problem(409, detail, field="Upload-Offset", remedy="Go on from there.", headers=headers)
+    raise Problem(409, detail, field="Upload-Offset", remedy="Send the bytes that follow.", headers=headers)
 
 
 def _owned(services: Deps, caller: Caller, upload_id: str) -> Partial:
     """The caller's upload. A missing upload and another tenant's upload give the same 404."""
     partial = find_partial(services.store, upload_id, caller.tenant)
     if partial is None:
-        raise Problem(404, f"There is no upload {upload_id[:40]!r}.", remedy="Create one: POST /uploads.")
+        detail = f"There is no upload {upload_id[:40]!r}."
+        raise Problem(404, detail, field="upload_id", remedy="Create one: POST /uploads.")
     return partial
 
 
@@ -213,7 +216,8 @@ def _check_size(services: Deps, caller: Caller, part: str, length_bytes: int) ->
     services.intake.check(caller.tenant, length_bytes)
     count = sum(partial.declaration.tenant == caller.tenant for partial in open_partials(services.store))
     if count >= MAX_OPEN_UPLOADS:
-        raise Problem(429, f"{count} uploads are open.", remedy="Use or delete some: DELETE /uploads/{id}.")
+        remedy = "Use or delete some: DELETE /uploads/{id}."
+        raise Problem(429, f"{count} uploads are open.", field="uploads", remedy=remedy)
 
 
 def _check_fits(new_bytes: int, left_bytes: int) -> None:

@@ -179,7 +179,7 @@ async def receive_upload(
                 await run_in_threadpool(receiver.write, chunk)
             return receiver.finish()
     except FormParserError as error:
-        raise Problem(400, f"The multipart body is malformed: {error}", remedy=form.remedy) from error
+        raise Problem(400, f"The multipart body is malformed: {error}", field="body", remedy=form.remedy) from error
 
 
 class _Receiver:
@@ -228,7 +228,8 @@ class _Receiver:
         """The received parts, once the body is complete."""
         self._parser.finalize()
         if not self._ended:
-            raise Problem(400, "The body ended before its last boundary.", remedy="Send the upload again.")
+            detail = "The body ended before its last boundary."
+            raise Problem(400, detail, field="body", remedy="Send the upload again.")
         texts = {name: self._text(name) for name in self._texts}
         self._received.options = texts.get(OPTIONS, self._received.options)
         self._received.clip_of = texts.get(CLIP_OF)
@@ -260,7 +261,7 @@ class _Receiver:
 
     def _check_header(self) -> None:
         if len(self._header_name) + len(self._header_value) > MAX_HEADER_BYTES:
-            raise Problem(400, "A part's header is too long.", remedy=self._form.remedy)
+            raise Problem(400, "A part's header is too long.", field="body", remedy=self._form.remedy)
 
     def _on_headers_finished(self) -> None:
         _, parameters = parse_options_header(self._headers.get(b"content-disposition", b""))

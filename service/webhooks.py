@@ -1,6 +1,6 @@
 """Webhooks: sends callers' systems a signed message when a job has ended, and retries failed deliveries.
 
-The queue stores the pending deliveries (contract/queue/deliveries.py). Each service borrows from it and attempts them.
+The queue stores the pending deliveries (contract/queue/deliveries.py). Each service claims due ones and attempts them.
 Nothing is stored here, so a service may die at any time, and the next one continues.
 """
 
@@ -26,7 +26,7 @@ from opentelemetry.trace import SpanKind
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.webhook_secrets import signature, tenant_secret
-from contract.queue.deliveries import Loan
+from contract.queue.deliveries import ClaimedDelivery
 from contract.queue.interface import Queue
 from contract.runtime import traces
 from contract.runtime.settings import Settings
@@ -88,55 +88,55 @@ class Webhooks:
             asyncio.TaskGroup() as tries,
         ):
             while True:
-                loan = None
+                claim = None
                 if self._in_progress.total() < MAX_AT_ONCE:
                     full = [tenant for tenant, count in self._in_progress.items() if count >= MAX_OF_TENANT]
-                    loan = await to_thread.run_sync(self._lent, full, limiter=self._threads)
-                if loan is None:
+                    claim = await to_thread.run_sync(self._claim_due, full, limiter=self._threads)
+                if claim is None:
                     await asyncio.sleep(LOOK_PERIOD_S)
                 else:
-                    self._in_progress[loan.tenant] += 1
-                    tries.create_task(self._deliver(http, loan))
+                    self._in_progress[claim.tenant] += 1
+                    tries.create_task(self._deliver(http, claim))
 
-    def _lent(self, full: Collection[str]) -> Loan | None:
-        """Borrow a due delivery; None if there is none, the queue is unreachable, or the call failed."""
+    def _claim_due(self, full: Collection[str]) -> ClaimedDelivery | None:
+        """Claim a due delivery; None if there is none, the queue is unreachable, or the call failed."""
         try:
-            loan = self._queue.lend_delivery(uuid.uuid4().hex, full)
+            claim = self._queue.claim_delivery(uuid.uuid4().hex, full)
         except UnavailableError as error:
             if not self._is_away:
                 logger.warning("webhooks wait for the queue: %s", error.problem)
             self._is_away = True
             return None
-        except Exception:  # if a delivery was borrowed, its loan expires
-            logger.exception("the queue lends no webhook by a fault of ours")
+        except Exception:  # if a delivery was claimed, the claim expires
+            logger.exception("a fault while a webhook was claimed")
             return None
         self._is_away = False
-        return loan
+        return claim
 
-    async def _deliver(self, http: httpx.AsyncClient, loan: Loan) -> None:
-        """Attempt a delivery once and store the result. After an unexpected error its loan expires."""
+    async def _deliver(self, http: httpx.AsyncClient, claim: ClaimedDelivery) -> None:
+        """Attempt a delivery once and store the result. After an unexpected error its claim expires."""
         try:
-            await self._note(loan, await self._tried(http, loan))
+            await self._note(claim, await self._tried(http, claim))
         except Exception:
-            logger.exception("what became of a webhook is not noted", extra={"job_id": loan.delivery.job_id})
+            logger.exception("the result of a webhook was not stored", extra={"job_id": claim.delivery.job_id})
         finally:
-            self._in_progress[loan.tenant] -= 1
+            self._in_progress[claim.tenant] -= 1
 
-    async def _tried(self, http: httpx.AsyncClient, loan: Loan) -> Delivery:
+    async def _tried(self, http: httpx.AsyncClient, claim: ClaimedDelivery) -> Delivery:
         """Attempt a delivery. Returns it with the new attempt."""
-        began_s, job_id = time.time(), loan.delivery.job_id
+        began_s, job_id = time.time(), claim.delivery.job_id
         status_code = failure = retry_after_s = None
-        span = traces.begin("deliver webhook", loan.trace or traces.NEW, kind=SpanKind.CLIENT, job_id=job_id)
+        span = traces.begin("deliver webhook", claim.trace or traces.NEW, kind=SpanKind.CLIENT, job_id=job_id)
         try:
-            traces.describe(span, method="POST", host=_host_of(httpx.URL(loan.url)))
+            traces.describe(span, method="POST", host=_host_of(httpx.URL(claim.url)))
             async with asyncio.timeout(TRY_S):
-                status_code = await self._post(http, loan)
+                status_code = await self._post(http, claim)
         except TimeoutError:
             failure = TryFailure.TIMEOUT
         except TryFailed as error:
             failure, status_code, retry_after_s = error.failure, error.status_code, error.retry_after_s
         except Exception:
-            logger.exception("a webhook was not sent by a fault of ours", extra={"job_id": job_id})
+            logger.exception("a fault while a webhook was sent", extra={"job_id": job_id})
             failure = TryFailure.FAULT
         finally:
             if status_code is not None:
@@ -145,27 +145,27 @@ class Webhooks:
                 traces.fail(span, failure or "cancelled")
             span.end()
         tried = DeliveryTry(at_s=began_s, status_code=status_code, failure=failure, retry_after_s=retry_after_s)
-        return _after(loan.delivery, tried)
+        return _after(claim.delivery, tried)
 
-    async def _note(self, loan: Loan, delivery: Delivery) -> None:
+    async def _note(self, claim: ClaimedDelivery, delivery: Delivery) -> None:
         _log(delivery)
         asked_s = delivery.tries[-1].retry_after_s or 0.0
         wait_s = wait_after(_counted(delivery), asked_s) if delivery.status is DeliveryStatus.OWED else None
         try:
-            await to_thread.run_sync(self._queue.note_try, loan, delivery, wait_s, limiter=self._threads)
-        except UnavailableError as error:  # the loan expires, and the webhook is sent again
-            logger.warning("what became of a webhook is not noted: %s", error.problem, extra=_about(delivery))
+            await to_thread.run_sync(self._queue.record_try, claim, delivery, wait_s, limiter=self._threads)
+        except UnavailableError as error:  # the claim expires, and the webhook is sent again
+            logger.warning("the result of a webhook was not stored: %s", error.problem, extra=_about(delivery))
 
-    async def _post(self, http: httpx.AsyncClient, loan: Loan) -> int:
+    async def _post(self, http: httpx.AsyncClient, claim: ClaimedDelivery) -> int:
         """Send the webhook. Returns the status of the receiver's successful answer.
 
         Raises:
             TryFailed: no address gave a successful answer.
         """
         secret = self._settings.webhook_secret
-        if secret is None or not is_allowed(loan.url, self._settings):
+        if secret is None or not is_allowed(claim.url, self._settings):
             raise TryFailed(TryFailure.HOST_REFUSED)
-        url = httpx.URL(loan.url)
+        url = httpx.URL(claim.url)
         try:
             addresses = await permitted_addresses(_host_of(url), self._settings, self._look_ups)
         except (OSError, UnicodeError):
@@ -173,7 +173,7 @@ class Webhooks:
         if not addresses:
             raise TryFailed(TryFailure.ADDRESS_REFUSED)
         secrets = [each for each in (secret, self._settings.webhook_old_secret) if each]
-        request = _request(loan, [tenant_secret(each, loan.tenant) for each in secrets])
+        request = _request(claim, [tenant_secret(each, claim.tenant) for each in secrets])
         failed = TryFailed(TryFailure.UNREACHABLE)
         for address in addresses:
             try:
@@ -233,9 +233,13 @@ class _Request:
     headers: dict[str, str]
 
 
-def _request(loan: Loan, secrets: Sequence[str]) -> _Request:
+def _request(claim: ClaimedDelivery, secrets: Sequence[str]) -> _Request:
     """The HTTP request of a webhook, with a signature by each secret."""
-    body, now_s, event = JobEnded.of(loan.delivery).model_dump_json().encode(), int(time.time()), loan.delivery.event_id
+    body, now_s, event = (
+        JobEnded.of(claim.delivery).model_dump_json().encode(),
+        int(time.time()),
+        claim.delivery.event_id,
+    )
     headers = {
         "Content-Type": "application/json",
         "User-Agent": f"intrasplat/{version()}",

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Collection
 
-from contract.queue.deliveries import LOAN_S, Loan
+from contract.queue.deliveries import DELIVERY_LEASE_S, ClaimedDelivery
 from contract.wire.job import JobRecord
 from contract.wire.webhooks import Delivery, DeliveryStatus
 
@@ -19,46 +19,46 @@ class MemoryDeliveries:
         self._all: dict[str, Delivery] = {}
         """By event."""
         self._due_at_s: dict[str, float] = {}
-        self._lent: dict[str, str] = {}
+        self._event_of_token: dict[str, str] = {}
         """Event by token."""
         self._tenants: dict[str, str] = {}
         """By event."""
         self._trying: dict[str, float] = {}
-        """By event: when the loan runs out, UNIX s."""
+        """By event: when the claim runs out, UNIX s."""
 
     @property
     def owed(self) -> int:
         """How many are owed."""
         return len(self._due_at_s)
 
-    def owe(self, record: JobRecord) -> None:
+    def add(self, record: JobRecord) -> None:
         """The delivery of a job that has just ended, if it has a callback."""
         delivery = Delivery.of(record)
         if record.callback_url is not None and delivery.event_id not in self._all:
             self._set_due(delivery, record.tenant)
 
-    def lend(self, token: str, passed: Collection[str]) -> tuple[Delivery, str] | None:
-        """The delivery and the mark of its loan."""
-        event = self._lent.get(token)
+    def claim(self, token: str, skipped: Collection[str]) -> tuple[Delivery, str] | None:
+        """The delivery and its due_score."""
+        event = self._event_of_token.get(token)
         if event not in self._due_at_s:
             now_s = time.time()
             due = [
                 each
                 for each, due_at_s in self._due_at_s.items()
-                if due_at_s <= now_s and self._tenants[each] not in passed
+                if due_at_s <= now_s and self._tenants[each] not in skipped
             ]
             if not due:
                 return None
-            event = self._lent[token] = min(due, key=self._due_at_s.__getitem__)
-            self._due_at_s[event] = self._trying[event] = now_s + LOAN_S
+            event = self._event_of_token[token] = min(due, key=self._due_at_s.__getitem__)
+            self._due_at_s[event] = self._trying[event] = now_s + DELIVERY_LEASE_S
         return self._all[event], repr(self._due_at_s[event])
 
-    def note(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
-        """As Deliveries.note_try has it."""
+    def record_try(self, claim: ClaimedDelivery, delivery: Delivery, wait_s: float | None) -> bool:
+        """As Deliveries.record_try has it."""
         event = delivery.event_id
         if self._all.get(event) == delivery:
             return True
-        if event not in self._due_at_s or repr(self._due_at_s[event]) != loan.mark:
+        if event not in self._due_at_s or repr(self._due_at_s[event]) != claim.due_score:
             return False
         self._all[event] = delivery
         self._trying.pop(event, None)

@@ -8,7 +8,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection
 
-from contract.queue.deliveries import OWED_FOR_S, Loan
+from contract.queue.deliveries import OWED_FOR_S, ClaimedDelivery
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -95,7 +95,7 @@ class MemoryQueue:
             self._remember(record, record.created_at_s + IDEMPOTENCY_S - time.time())
             self._write(record)
             if (record.finished_at_s or 0.0) > time.time() - OWED_FOR_S:
-                self._deliveries.owe(record)
+                self._deliveries.add(record)
             return True
 
     def claim(self, owner: str, timeout_s: float) -> JobRecord | None:
@@ -217,16 +217,16 @@ class MemoryQueue:
             self._idempotent = {key: held for key, held in self._idempotent.items() if held[0] != job_id}
             return True
 
-    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
+    def claim_delivery(self, token: str, skipped: Collection[str] = ()) -> ClaimedDelivery | None:
         with self._changed:
-            if (lent := self._deliveries.lend(token, passed)) is None:
+            if (found := self._deliveries.claim(token, skipped)) is None:
                 return None
-            record = self._records[lent[0].job_id]
-            return Loan(lent[0], record.callback_url or "", record.tenant, lent[1], record.trace)
+            record = self._records[found[0].job_id]
+            return ClaimedDelivery(found[0], record.callback_url or "", record.tenant, found[1], record.trace)
 
-    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+    def record_try(self, claim: ClaimedDelivery, delivery: Delivery, wait_s: float | None) -> bool:
         with self._changed:
-            return self._deliveries.note(loan, delivery, wait_s)
+            return self._deliveries.record_try(claim, delivery, wait_s)
 
     def send_again(self, record: JobRecord) -> None:
         with self._changed:
@@ -392,7 +392,7 @@ class MemoryQueue:
                 self._rests_s.append(now_s - record.started_at_s - asked_s)
         changed = self._write(self._moved(record, target, **update))
         if target in TERMINAL_STATES:
-            self._deliveries.owe(changed)
+            self._deliveries.add(changed)
         return changed
 
     def _write(self, record: JobRecord) -> JobRecord:

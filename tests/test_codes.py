@@ -19,7 +19,7 @@ PAGE, ERRORS, REFUSALS, TRIES = re.split(
 )
 NOTICES, FINDINGS = PAGE.split("## Findings")
 SOURCES = [
-    path for room in ("intrasplat", "contract", "worker", "service") for path in (REPOSITORY / room).rglob("*.py")
+    path for folder in ("intrasplat", "contract", "worker", "service") for path in (REPOSITORY / folder).rglob("*.py")
 ]
 
 

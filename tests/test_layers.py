@@ -1,4 +1,4 @@
-"""The import rules: which package may import which, in what order its rooms are read, and what stays light.
+"""The import rules: which package may import which, in what order its folders are read, and what stays light.
 
 intrasplat <- contract <- worker, service, client; those three never import each other, and nothing that is installed
 imports lab or tests. intrasplat_client lies in client/ but is packed alone, so it imports no other package of ours;
@@ -117,7 +117,7 @@ def imports_of(package: str) -> Iterator[Import]:
 
 
 def place_of(module: str) -> str:
-    """intrasplat.splat.cpu.blend belongs to raster; worker itself and other packages' modules to no room ("")."""
+    """intrasplat.splat.cpu.blend belongs to splat; worker itself and other packages' modules to no folder ("")."""
     package, *rest = module.split(".")
     return rest[0] if rest and package in ORDER else ""
 
@@ -128,11 +128,11 @@ def module_of(path: Path) -> str:
 
 
 def is_out_of_order(importer: str, imported: str) -> bool:
-    """Whether a module imports one of a room that stands later in the same package."""
-    package, room, other = importer.split(".")[0], place_of(importer), place_of(imported)
-    if imported.split(".")[0] != package or room not in ORDER[package] or other not in ORDER[package]:
+    """Whether a module imports one of a folder that stands later in the same package."""
+    package, folder, other = importer.split(".")[0], place_of(importer), place_of(imported)
+    if imported.split(".")[0] != package or folder not in ORDER[package] or other not in ORDER[package]:
         return False
-    return ORDER[package].index(other) > ORDER[package].index(room)
+    return ORDER[package].index(other) > ORDER[package].index(folder)
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)

@@ -76,7 +76,7 @@ def test_one_trace_leads_from_a_request_through_the_queue_and_every_stage_of_the
     (attempt,) = [each for each in of_job if each.name == "attempt"]
     assert request.parent_id == CALLERS_SPAN
     assert sent.headers["X-Request-Id"] == CALLERS_TRACE
-    assert {"receive", "judge", "spool", "enqueue", "wait in queue", "attempt", "score"} <= children(of_job, request)
+    assert {"receive", "check", "spool", "enqueue", "wait in queue", "attempt", "score"} <= children(of_job, request)
     assert children(of_job, attempt) >= STAGES - {"score"}
     assert attempt.attributes == {
         "intrasplat.job_id": job_id,

@@ -10,13 +10,29 @@ import logging
 import queue
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
 from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
-from worker.orders import Advanced, DeviceOrder, Failed, Finished, Holding, Ready, Scored, Stopped, line_of, read_report
+from contract.wire.job import JobProgress
+from intrasplat.machine.hooks import ignore
+from worker.hang import HangDetector
+from worker.orders import (
+    Advanced,
+    CachedScenes,
+    DeviceOrder,
+    Failed,
+    Finished,
+    Ready,
+    Scored,
+    StopJob,
+    Stopped,
+    line_of,
+    read_report,
+)
 
 MAX_START_S = 240.0
 """Time to import torch and compile all kernels on a slow machine with an empty cache."""
@@ -38,9 +54,10 @@ logger = logging.getLogger("intrasplat.worker")
 
 @dataclass(frozen=True)
 class Ended:
-    """The child has ended; cause is for the log."""
+    """The child has ended; cause is for the log. was_stopping: it had been ordered to stop."""
 
     cause: str
+    was_stopping: bool = False
 
 
 JobReport: TypeAlias = Advanced | Finished | Scored | Stopped | Failed
@@ -92,10 +109,39 @@ class DeviceChild:
                     logger.warning("the device process printed a line of %d bytes that is not a report", len(line))
                 elif isinstance(report, Ready):
                     self.ready = report
-                elif isinstance(report, Holding):
+                elif isinstance(report, CachedScenes):
                     self.scenes = report.scenes
                 else:
                     self._reports.put(report)
+
+
+def watch(
+    child: DeviceChild, stop: Callable[[], bool], on_progress: Callable[[JobProgress], object] = ignore
+) -> Finished | Scored | Stopped | Failed | Ended:
+    """The child's report that ends its order; kill the child if it hangs.
+
+    stop: when it returns True, the child is ordered to stop, and killed if it needs more than MAX_STOP_S for that.
+    on_progress: receives the child's progress.
+    """
+    detector, asked_s = HangDetector(), None
+    while True:
+        report = child.next_report(LOOK_PERIOD_S)
+        if isinstance(report, Ended):
+            return replace(report, was_stopping=asked_s is not None)
+        if isinstance(report, Finished | Scored | Stopped | Failed):
+            return report
+        if isinstance(report, Advanced):
+            detector.observe(report.progress)
+            on_progress(report.progress)
+        if asked_s is None and stop():
+            child.send(StopJob())
+            asked_s = time.monotonic()
+        if asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S:
+            child.kill()
+            return Ended(f"did not stop within {MAX_STOP_S:g} s and was killed", was_stopping=True)
+        if detector.is_hung():
+            child.kill()
+            return Ended(f"hung in stage {detector.stage!r} and was killed", was_stopping=asked_s is not None)
 
 
 class ChildKeeper:

@@ -26,13 +26,12 @@ from contract.store.store import Store
 from contract.wire.job import JobProgress, JobRecord, JobState
 from intrasplat.errors import ErrorCode, IntrasplatError, UnavailableError
 from intrasplat.files.disk_errors import StoreFullError
-from worker.child import LOOK_PERIOD_S, MAX_STOP_S, ChildKeeper, DeviceChild, Ended
+from worker.child import ChildKeeper, DeviceChild, Ended, watch
 from worker.claim_file import ClaimFile
 from worker.disk_space import FreeSpace
-from worker.hang import HangDetector
 from worker.heartbeat import Heartbeat
 from worker.job_errors import describe
-from worker.orders import FETCHING, Advanced, Failed, Finished, RunJob, StopJob, Stopped
+from worker.orders import FETCHING, Failed, Finished, RunJob, Scored, Stopped
 from worker.scores import AwaitedScores, InterruptedScores
 from worker.spans import StageSpans, attempt_span
 
@@ -97,7 +96,9 @@ class Consumer:
         while (child := self._keeper.child(self._end)) is not None:
             was_short, short = short, self._free_space.is_short()
             if short != was_short:
-                logger.warning("jobs wait for room on the disk" if short else "the disk has room for jobs again")
+                logger.warning(
+                    "jobs wait for free space on the disk" if short else "the disk has enough free space for jobs again"
+                )
             if short:
                 self._end.wait(claim_timeout_s)
                 continue
@@ -202,27 +203,13 @@ class _Job:
         out = self._retry_store(lambda: self._store.work_folder(job_id, attempt))
         if child.ended is not None:
             return Died(child.ended.cause, excused=True)
-        child.send(RunJob(record=record, spool=spool, out=out, kept=resume_dir))
-        detector, asked_s = HangDetector(), None
-        while True:
-            report = child.next_report(LOOK_PERIOD_S)
-            if isinstance(report, Finished | Stopped | Failed):
-                self.is_scoring = isinstance(report, Finished)
-                return report
-            if isinstance(report, Ended):
-                return Died(report.cause, excused=asked_s is not None)
-            if isinstance(report, Advanced):
-                detector.observe(report.progress)
-                self._report(report.progress)
-            if asked_s is None and self._is_to_stop():
-                child.send(StopJob())
-                asked_s = time.monotonic()
-            if asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S:
-                child.kill()
-                return Died(f"did not stop within {MAX_STOP_S:g} s and was killed", excused=True)
-            if detector.is_hung():
-                child.kill()
-                return Died(f"hung in stage {detector.stage!r} and was killed", excused=asked_s is not None)
+        child.send(RunJob(record=record, spool=spool, out=out, resume_dir=resume_dir))
+        report = watch(child, self._is_to_stop, self._report)
+        if isinstance(report, Ended):
+            return Died(report.cause, excused=report.was_stopping)
+        assert not isinstance(report, Scored)  # follows Finished
+        self.is_scoring = isinstance(report, Finished)
+        return report
 
     def _report(self, progress: JobProgress) -> None:
         self._heart.report(progress)
@@ -253,7 +240,7 @@ class _Job:
         if self._heart.order in (Order.CANCEL, Order.LOST):
             return self._withdraw()
         result = self._excuse(result)
-        accepted, outcome = self._tell(result)
+        accepted, outcome = self._report_end(result)
         if accepted is None:
             return UNSETTLED
         if not accepted:
@@ -274,7 +261,7 @@ class _Job:
             self._free_space.sufficed(self._claim.job_id)
         return result
 
-    def _tell(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
+    def _report_end(self, result: Finished | Stopped | Failed | Died) -> tuple[bool | None, str]:
         """Whether the queue accepts the end (None: it cannot be reached), and a description of the end for the log."""
         if isinstance(result, Finished):
             return self._publish(), DONE
@@ -286,7 +273,7 @@ class _Job:
         if isinstance(result, Stopped) and result.checkpointed:
             self._store.hand_over(self._claim.job_id, self._claim.attempt)
         accepted = self._retry_queue(lambda: self._queue.release(self._claim, died=died))
-        return accepted, "handed back, its worker's death held against it" if died else "handed back"
+        return accepted, "released, counted as a death" if died else "released"
 
     def _publish(self) -> bool | None:
         """Publish the scene, then finish the record: a caller who sees that the job is done must find its scene."""

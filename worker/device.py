@@ -26,7 +26,7 @@ from intrasplat.intake.limits import ClipLimits
 from intrasplat.machine.hooks import Progress
 from intrasplat.machine.processes import die_with_parent
 from intrasplat.names import REPORT
-from intrasplat.pipeline import Made, judge, judge_again, make
+from intrasplat.pipeline import Made, make, score_scene, score_stored_scene
 from intrasplat.report import Imported, Report
 from intrasplat.scene.compact import compile_coder
 from intrasplat.scene.imported import take_scene
@@ -42,9 +42,9 @@ from worker.job_errors import describe
 from worker.orders import (
     FETCHING,
     Advanced,
+    CachedScenes,
     Failed,
     Finished,
-    Holding,
     Ready,
     RunJob,
     Scored,
@@ -118,7 +118,7 @@ def _serve(settings: Settings, channel: Channel, orders: Orders) -> None:
 
     def report_cached_scenes() -> None:
         views.forget_purged()
-        channel.send_if_new(Holding(scenes=views.cached))
+        channel.send_if_new(CachedScenes(scenes=views.cached))
 
     endpoint = settings.render_endpoint or _socket_endpoint(store, settings.worker_name)
     scheduler = Scheduler(
@@ -161,7 +161,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace,
     )
     if isinstance(order, ScoreScene):
         request = request_of(order.record, order.spool, settings.device, limits, settings.segmenter)
-        channel.send(scored(lambda: judge_again(request, order.scene, hooks), order.scene / REPORT))
+        channel.send(scored(lambda: score_stored_scene(request, order.scene, hooks), order.scene / REPORT))
         return
     with pace.training():
         made = work_on(order, settings.device, limits, snapshots, hooks, settings.segmenter)
@@ -169,7 +169,7 @@ def obey(task: Task, settings: Settings, snapshots: Snapshots, pace: RenderPace,
         channel.send(made)
         return
     channel.send(Finished())
-    channel.send(scored(lambda: judge(made, hooks), made.report))
+    channel.send(scored(lambda: score_scene(made, hooks), made.report))
 
 
 def take_in(
@@ -181,11 +181,13 @@ def take_in(
         channel.send(scored(lambda: Report.model_validate_json(report.read_bytes()), report))
         return
 
-    def tell(fraction: float) -> None:
+    def report_fraction(fraction: float) -> None:
         channel.send(Advanced(progress=JobProgress(stage=FETCHING, fraction=fraction)))
 
     try:
-        taken = take_scene(order.spool / order.record.files.clip, order.out, imported, limits, max_bytes, tell)
+        taken = take_scene(
+            order.spool / order.record.files.clip, order.out, imported, limits, max_bytes, report_fraction
+        )
     except Exception as error:
         channel.send(Failed(error=describe(error), fault=type(error).__name__))
         return
@@ -206,19 +208,17 @@ def work_on(
     snapshots.begin(job_id)
     try:
         request = request_of(order.record, order.spool, device, limits, segmenter)
-        return make_or_start_anew(request, order.out, order.kept, hooks)
+        return make_or_start_anew(request, order.out, order.resume_dir, hooks)
     except Cancelled:
         snapshots.drop(job_id)
-        return Stopped(checkpointed=(order.kept / RESUME_FILE).exists())
+        return Stopped(checkpointed=(order.resume_dir / RESUME_FILE).exists())
     except Exception as error:
         snapshots.drop(job_id)
-        if gpu_is_lost():
-            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
-            raise SystemExit(1) from error
+        exit_if_gpu_is_lost(error)
         return Failed(error=describe(error), fault=type(error).__name__)
 
 
-def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
+def scored(score: Callable[[], Report], first: Report | Path) -> Scored | Stopped:
     """The result of scoring a scene. After an error the scene has no scores, and its report says so.
 
     Stopped: the scene may be scored later, because of an order to stop, because something is not available now, or
@@ -227,22 +227,31 @@ def scored(judge: Callable[[], Report], first: Report | Path) -> Scored | Stoppe
     first: the report without scores, or its file.
     """
     try:
-        return Scored(report=judge())
+        return Scored(report=score())
     except Cancelled:
         return Stopped(checkpointed=False)
     except UnavailableError as error:
         logger.warning("a scene cannot be scored now: %s", error)
         return Stopped(checkpointed=False)
     except Exception as error:
-        if gpu_is_lost():
-            logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
-            raise SystemExit(1) from error
+        exit_if_gpu_is_lost(error)
         logger.error("a scene could not be scored: %s", type(error).__name__, exc_info=error)
         try:
             report = first if isinstance(first, Report) else Report.model_validate_json(first.read_bytes())
         except (OSError, ValidationError):  # it was purged, or is damaged
             return Stopped(checkpointed=False)
         return Scored(report=without_scores(report, type(error).__name__))
+
+
+def exit_if_gpu_is_lost(error: Exception) -> None:
+    """End this process if it has lost the GPU, which only another process can use again.
+
+    Raises:
+        SystemExit: the GPU is lost.
+    """
+    if gpu_is_lost():
+        logger.error("this process has lost the GPU (%s); another takes its place", type(error).__name__)
+        raise SystemExit(1) from error
 
 
 class _Reporter:
@@ -280,14 +289,14 @@ def request_of(
     )
 
 
-def make_or_start_anew(request: ReconstructionRequest, out: Path, kept: Path, hooks: TrainingHooks) -> Made:
-    """Train the scene, resuming the state in `kept`; start again if that state is damaged or of another version."""
+def make_or_start_anew(request: ReconstructionRequest, out: Path, resume_dir: Path, hooks: TrainingHooks) -> Made:
+    """Train the scene, resuming the state in `resume_dir`; start again if it is damaged or of another version."""
     try:
-        return make(request, out, hooks, kept)
+        return make(request, out, hooks, resume_dir)
     except ResumeMismatch as error:
         logger.warning("training starts again, because the stored state cannot be resumed: %s", error.__cause__)
-        (kept / RESUME_FILE).unlink()
-        return make(request, out, hooks, kept)
+        (resume_dir / RESUME_FILE).unlink()
+        return make(request, out, hooks, resume_dir)
 
 
 def _socket_endpoint(store: Store, name: str) -> str:

@@ -60,7 +60,7 @@ class FreeSpace:
         problem = f"The worker's disk was full {MAX_SHORTAGES} times; {began_mib} MiB were free when the job began."
         remedy = (
             f"Free more than {began_mib} MiB on it, send a shorter clip, or raise INTRASPLAT_MIN_FREE_BYTES "
-            f"({self._min_free_bytes}), which keeps room free for jobs; then retry the job."
+            f"({self._min_free_bytes}), which keeps space free for jobs; then retry the job."
         )
         return JobError(code=ErrorCode.STORE_FULL, problem=problem, remedy=remedy)
 

@@ -39,14 +39,13 @@ class OpenExports:
         if request.part == 0:
             self.forget()
             if len(self._open) >= MAX_OPEN:
-                raise UnavailableError(
-                    f"{MAX_OPEN} exports are under way, as many as may be.", "Ask again in a minute."
-                )
+                problem = f"This worker makes {MAX_OPEN} exports already, its most at once."
+                raise UnavailableError(problem, "Ask again when one of them has ended.")
             key = (request.scene_id, request.attempt)
             self._open[request.export_id] = _Open(key, begin(), 0, self._clock())
         export = self._open.get(request.export_id)
         if export is None or export.next_part != request.part:
-            raise SceneError(f"The export of scene {request.scene_id} is not under way here any more.")
+            raise SceneError(f"The export of scene {request.scene_id} has ended, or belongs to another worker.")
         try:
             content = next(export.parts, None)
         except BaseException:

@@ -1,7 +1,7 @@
 """The messages between the supervisor and its device process, one JSON document per line.
 
     supervisor -> child   on the child's stdin    RunJob, ScoreScene, StopJob; when stdin closes, the child ends at once
-    child -> supervisor   on the child's stdout   Ready once; Holding at any time; for each order any number of
+    child -> supervisor   on the child's stdout   Ready once; CachedScenes at any time; for each order any number of
                                                   Advanced, then its end
 
 RunJob ends with Stopped or Failed, or with Finished followed by Scored or Stopped. ScoreScene ends with Scored or
@@ -29,13 +29,13 @@ class _Message(BaseModel):
 
 
 class RunJob(_Message):
-    """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `kept`."""
+    """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `resume_dir`."""
 
     kind: Literal["run"] = "run"
     record: JobRecord
     spool: Path
     out: Path
-    kept: Path
+    resume_dir: Path
 
 
 class ScoreScene(_Message):
@@ -48,7 +48,7 @@ class ScoreScene(_Message):
 
 
 class StopJob(_Message):
-    """Stop what runs; an unfinished job stores its state in `kept`. Ignored while nothing runs."""
+    """Stop what runs; an unfinished job stores its state in `resume_dir`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
@@ -61,10 +61,10 @@ class Ready(_Message):
     device: str
 
 
-class Holding(_Message):
+class CachedScenes(_Message):
     """The scenes in the child's memory."""
 
-    kind: Literal["holding"] = "holding"
+    kind: Literal["cached_scenes"] = "cached_scenes"
     scenes: tuple[str, ...]
 
 
@@ -89,7 +89,7 @@ class Scored(_Message):
 
 
 class Stopped(_Message):
-    """The work stopped as ordered. checkpointed: training had started, and its state is in `kept`."""
+    """The work stopped as ordered. checkpointed: training had started, and its state is in `resume_dir`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
@@ -105,7 +105,7 @@ class Failed(_Message):
 
 
 DeviceOrder: TypeAlias = RunJob | ScoreScene | StopJob
-DeviceReport: TypeAlias = Ready | Holding | Advanced | Finished | Scored | Stopped | Failed
+DeviceReport: TypeAlias = Ready | CachedScenes | Advanced | Finished | Scored | Stopped | Failed
 
 _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(discriminator="kind")])
 _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])

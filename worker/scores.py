@@ -18,9 +18,8 @@ from contract.wire.job import JobRecord, JobState
 from intrasplat.errors import SceneError, UnavailableError
 from intrasplat.report import Report
 from intrasplat.scene.results import without_scores
-from worker.child import LOOK_PERIOD_S, MAX_STOP_S, DeviceChild, Ended
-from worker.hang import HangDetector
-from worker.orders import Advanced, Scored, ScoreScene, StopJob, Stopped
+from worker.child import DeviceChild, Ended, watch
+from worker.orders import Scored, ScoreScene
 
 ASK_PERIOD_S = 1.0
 """How often the worker asks the queue for waiting jobs while it only scores."""
@@ -53,18 +52,10 @@ class AwaitedScores:
             return self._take(child, stop, gives_up=gives_up)
 
     def _take(self, child: DeviceChild, stop: Callable[[], bool], *, gives_up: bool) -> bool:
-        detector, asked_s = HangDetector(), None
-        while not isinstance(report := child.next_report(LOOK_PERIOD_S), Scored | Stopped | Ended):
-            if isinstance(report, Advanced):
-                detector.observe(report.progress)
-            if asked_s is None and stop():
-                child.send(StopJob())
-                asked_s = time.monotonic()
-            if detector.is_hung() or (asked_s is not None and time.monotonic() - asked_s > MAX_STOP_S):
-                child.kill()
+        report = watch(child, stop)
         if isinstance(report, Scored):
             return self._add_report(lambda: report.report)
-        if isinstance(report, Ended) and asked_s is None:
+        if isinstance(report, Ended) and not report.was_stopping:
             cause = report.cause
             self._log.warning("the device process %s while it scored a scene", cause)
             if gives_up:
@@ -77,10 +68,10 @@ class AwaitedScores:
             try:
                 self._store.add_scores(*self._scene, scored())
             except SceneError as error:  # it was purged, or is damaged
-                self._log.warning("the scores were not kept: %s", error)
+                self._log.warning("the scores were not stored: %s", error)
                 self._store.expect_no_scores(*self._scene)
         except UnavailableError as error:
-            self._log.warning("the scores were not kept: %s", error)
+            self._log.warning("the scores were not stored: %s", error)
             return False
         return True
 
@@ -113,7 +104,7 @@ class InterruptedScores:
                 self._warn_once(job_id, attempt, error)
                 continue
             if order is not None:
-                logger.info("the scores of an earlier attempt are made up for", extra=_named(job_id, attempt))
+                logger.info("scoring a scene whose scoring was interrupted", extra=_named(job_id, attempt))
                 child.send(order)
                 scores = AwaitedScores(self._store, self._name, order.record)
                 if not scores.take(child, stop=self._is_to_stop(), gives_up=True):

@@ -1,9 +1,9 @@
-"""Answer render and export requests: a ZeroMQ ROUTER in a thread during training (contract/wire/rendering.py).
+"""Answer the requests of contract/wire/rendering.py: a ZeroMQ ROUTER in a thread, as long as the device process lives.
 
-The thread reads all waiting messages, lets the scheduler compute one part of one answer (worker/scheduler.py), sends
-completed answers, and reads again. A request that would wait too long is refused, with the time at which to ask again.
-The permissions of its folder protect a unix socket. TCP is encrypted, and only callers who know the installation's
-secret are answered.
+The thread answers while the process trains and while it is idle. It reads all waiting messages, lets the scheduler
+compute one part of one answer (worker/scheduler.py), sends completed answers, and reads again. A request that would
+wait too long is refused, with the time at which to ask again. The permissions of its folder protect a unix socket. TCP
+is encrypted, and only callers who know the installation's secret are answered.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from contract.access.render_keys import service_keys, worker_keys
 from contract.wire.rendering import CancelRequest, ReplyError, WorkerReply, WorkerRequest
 from intrasplat.errors import InputError, SceneError, UnavailableError
+from worker.job_errors import FAULT_REMEDY
 from worker.reply import NotYetError, Reply
 from worker.scheduler import Answered, Scheduler
 
@@ -37,6 +38,9 @@ BETWEEN_PERIOD_S = 1.0
 
 MAX_READ = 1000
 """Most messages that are read before the next part is computed, so that a flood does not stop the answers."""
+
+UNAVAILABLE_RETRY_S = 2.0
+"""When to ask again for what is not available now, such as the disk or one more export."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -132,8 +136,11 @@ class RequestServer:
         try:
             envelope = WorkerRequest.model_validate_json(document)
         except ValidationError as error:
-            problem = f"The request does not fit: {error.errors()[0]['msg']}."
-            self._send(caller, request_id, WorkerReply(error=ReplyError(kind="internal", problem=problem)))
+            problem = f"The worker cannot read the service's request: {error.errors()[0]['msg']}."
+            remedy = "Install the same version of intrasplat for the service and for its workers."
+            self._send(
+                caller, request_id, WorkerReply(error=ReplyError(kind="internal", problem=problem, remedy=remedy))
+            )
             return
         request = envelope.request
         if isinstance(request, CancelRequest):
@@ -203,10 +210,11 @@ def _reply_error(error: Exception) -> ReplyError:
     if isinstance(error, NotYetError):
         return ReplyError(kind="not-yet", problem=str(error), field="scene", remedy="Ask again in a second.")
     if isinstance(error, UnavailableError):
-        return ReplyError(kind="busy", problem=error.problem, remedy=error.remedy)
+        return ReplyError(kind="busy", problem=error.problem, remedy=error.remedy, retry_after_s=UNAVAILABLE_RETRY_S)
     where = "".join(traceback.format_tb(error.__traceback__))
     logger.error("a request could not be answered: %s\n%s", type(error).__name__, where)
-    return ReplyError(kind="internal", problem=f"The worker could not render ({type(error).__name__}).")
+    problem = f"The worker could not answer ({type(error).__name__})."
+    return ReplyError(kind="internal", problem=problem, remedy=FAULT_REMEDY)
 
 
 def _encrypt(socket: zmq.Socket[bytes], render_secret: str) -> ThreadAuthenticator:

@@ -1,6 +1,10 @@
-"""Render and export finished scenes, which stay loaded between requests, and render the job in training.
+"""Answer the requests of contract/wire/rendering.py from finished scenes and from the job in training.
 
-A scene whose folder was removed leaves memory at once: a deleted patient's tissue is neither shown nor stored.
+    RenderRequest, RecordedRequest, CamerasRequest   a finished scene or the job in training
+    ExportRequest, MeasureRequest                    finished scenes only
+
+Scenes stay loaded between requests. A scene whose folder was removed leaves memory at once: a deleted patient's tissue
+is neither shown nor stored.
 """
 
 from __future__ import annotations
@@ -47,7 +51,7 @@ from intrasplat.view.lenses import Lenses
 from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
 from intrasplat.view.recorded import live_frame, stored_frame
-from intrasplat.view.render import ROUNDING, ViewRequest, frame_in_parts, renderer_of
+from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts, renderer_of
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.reply import NotYetError, Reply
@@ -68,7 +72,7 @@ LARGE_PIXELS = 1 << 19
 
 
 class Views:
-    """Answers render and export requests from a store's scenes and a job's snapshots; for use in one thread.
+    """Answers requests from a store's scenes and a job's snapshots; for use in one thread.
 
     `cached` names the scenes in memory, with the last used one at the end; other threads may read it.
     """
@@ -119,7 +123,7 @@ class Views:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
             yield  # loading the scene may have taken long
         else:
-            snapshot = self._trained(request.scene_id)
+            snapshot = self._newest_snapshot(request.scene_id)
             scene = snapshot.scene
         if isinstance(request, CamerasRequest):
             return _cameras(scene, snapshot)
@@ -189,7 +193,7 @@ class Views:
         shown = index / clip.frame_count
         return Reply(picture, media_type, shown, iteration=iteration, is_untimed=True)
 
-    def _trained(self, job_id: str) -> Snapshot:
+    def _newest_snapshot(self, job_id: str) -> Snapshot:
         """The newest snapshot; may wait for training, without slowing it."""
         snapshot = self._snapshots.newest(job_id)
         if snapshot is None:
@@ -223,12 +227,12 @@ class Views:
         self, scene: TrainedScene, request: RenderRequest, snapshot: Snapshot | None, level: int
     ) -> Parts[Reply]:
         """One render. snapshot: the one that the scene comes from; None: the scene is finished. level: of detail."""
-        pose, lens = self._standing(scene, request)
+        pose, lens = self._pose_and_lens(scene, request)
         camera = camera_of(lens, request.camera, request.max_pixels)
         size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
-        own = endoscope_pose(scene, shown_time(scene, request.t)) if pose is None else pose
+        own = endoscope_pose(scene, clamped_to_clip(scene, request.t)[0]) if pose is None else pose
         pose_rows = tuple(own[:3].flatten().tolist())
-        taken_by = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
+        picture_camera = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
         detail = LEVELS[level]
         camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
         drawn = thinned(scene, detail.gaussians)
@@ -245,9 +249,11 @@ class Views:
         frame = frame.enlarged(*size) if level else frame
         body = yield from _encoded(frame, request, range_mm)
         reply = _reply(scene, frame, request, snapshot, body)
-        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=taken_by)
+        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=picture_camera)
 
-    def _standing(self, scene: TrainedScene, request: RenderRequest) -> tuple[NDArray[np.float64] | None, Intrinsics]:
+    def _pose_and_lens(
+        self, scene: TrainedScene, request: RenderRequest
+    ) -> tuple[NDArray[np.float64] | None, Intrinsics]:
         """The pose of the caller's camera (None: the endoscope's left eye), and its lens before the caller's overrides.
 
         Raises:
@@ -265,7 +271,7 @@ class Views:
         if registration is None:
             problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
             raise InputError("eye", problem, "Ask for eye=left.")
-        return right_eye(scene, shown_time(scene, request.t), registration)
+        return right_eye(scene, clamped_to_clip(scene, request.t)[0], registration)
 
     def _measured(self, scene: TrainedScene, request: MeasureRequest) -> Reply:
         """A Measurement as JSON. Its time does not predict that of renders."""
@@ -279,7 +285,7 @@ class Views:
             request, lambda: export_parts(scene, request.format, request.options, self._device)
         )
         known, t = EXPORT_FORMATS.get(request.format), request.options.t or 0.0
-        shown, warnings = shown_time(scene, t), scene.pose_warnings
+        shown, warnings = clamped_to_clip(scene, t)[0], scene.pose_warnings
         if t > shown + ROUNDING:
             outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
             warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside), *warnings)
@@ -319,7 +325,7 @@ def _reply(scene: TrainedScene, frame: View, request: RenderRequest, snapshot: S
             # One moment is shown at every time, and no eye has trained the scene.
             unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
         warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
-    shown = shown_time(scene, request.t)
+    shown, _ = clamped_to_clip(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
     return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
@@ -339,8 +345,3 @@ def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:
     )
     iteration = None if snapshot is None else snapshot.iteration
     return Reply(cameras.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, 0.0, iteration=iteration, is_untimed=True)
-
-
-def shown_time(scene: TrainedScene, t: float) -> float:
-    """The model time that is shown for t: at most that of the last frame."""
-    return min(t, (scene.frame_count - 1) / scene.frame_count)

@@ -113,7 +113,7 @@ class Bridge:
                 self._status.refused = ""
             except InputError as error:
                 self._status.refused = f"The pose from {heard.device} is refused: {error.problem}"
-                self._tell()
+                self._send_status()
         elif heard.device == messages.COMMAND and heard.text is not None:
             self._obey(heard.text)
         self._wake_up()
@@ -132,12 +132,12 @@ class Bridge:
             self._status.refused = self._playback.note_on(t)
         else:
             self._status.refused = f"{words[:40]!r} is no command. Send play, pause, t=0.4 or endoscope."
-        self._tell()
+        self._send_status()
 
     def _wake_up(self) -> None:
         self._woken.set()
 
-    def _tell(self) -> None:
+    def _send_status(self) -> None:
         self.link.send(messages.STATUS, messages.text(messages.STATUS, self._status.words()))
 
     async def _show(self) -> None:
@@ -148,7 +148,7 @@ class Bridge:
                 await self._show_view(wanted)
             except AWAY as error:
                 self._status.trouble = str(error)
-                self._tell()
+                self._send_status()
                 await asyncio.sleep(RETRY_S)
 
     async def _next_view(self) -> _PeerView:
@@ -183,7 +183,7 @@ class Bridge:
             self.link.send(messages.CAMERA, messages.transform(messages.CAMERA, pose))
             self._shown = _Shown(wanted, image, camera, plane_mm)
         self._status.show(image, wanted.frame, follows=wanted.pose is not None)
-        self._tell()
+        self._send_status()
         self._moment.set()
 
     async def _plane_mm(self, view: _PeerView, camera: PictureCamera) -> float:
@@ -228,7 +228,7 @@ class Bridge:
                 await self._send_surface(frame)
             except AWAY as error:
                 self._status.surface = f"There is no new surface yet: {error}"
-                self._tell()
+                self._send_status()
                 await asyncio.sleep(RETRY_S)
             else:
                 sent = frame
@@ -246,7 +246,7 @@ class Bridge:
         else:
             self.link.send(messages.SURFACE, await asyncio.to_thread(messages.surface, messages.SURFACE, surface))
             self._status.surface = f"The surface is that of frame {frame}."
-        self._tell()
+        self._send_status()
 
     async def _farewell(self, error: BaseException | None) -> None:
         """Tell peers why the bridge ends. The picture of a scene that they may no longer see becomes black."""
@@ -257,7 +257,7 @@ class Bridge:
             await self._send(messages.PICTURE, np.zeros((camera.height, camera.width, 3), np.uint8), place)
             if self._choice.depth:
                 await self._send(messages.DEPTH, np.zeros((camera.height, camera.width), np.float32), place)
-        self._tell()
+        self._send_status()
         await self.link.flush(FAREWELL_S)
 
 

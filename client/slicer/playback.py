@@ -19,7 +19,7 @@ class Playback:
     def __init__(self, times_s: Sequence[float], t: float | None = None) -> None:
         self.times_s = tuple(times_s)
         self.frame_count = len(self.times_s)
-        self._standing: int | None = None
+        self._paused_frame: int | None = None
         self._begin_s = time.monotonic()
         if t is not None:
             self.stand_at(t)
@@ -27,7 +27,7 @@ class Playback:
     @property
     def plays(self) -> bool:
         """Whether the clip plays."""
-        return self._standing is None and self.frame_count > 1
+        return self._paused_frame is None and self.frame_count > 1
 
     @property
     def duration_s(self) -> float:
@@ -39,7 +39,7 @@ class Playback:
     @property
     def frame(self) -> int:
         """The frame that is shown now."""
-        return self.frame_after(time.monotonic() - self._begin_s) if self._standing is None else self._standing
+        return self.frame_after(time.monotonic() - self._begin_s) if self._paused_frame is None else self._paused_frame
 
     def frame_after(self, seconds: float) -> int:
         """The frame that is shown `seconds` after the clip has started to play."""
@@ -51,16 +51,16 @@ class Playback:
 
     def pause(self) -> None:
         """Pause at the shown frame."""
-        self._standing = self.frame
+        self._paused_frame = self.frame
 
     def play(self) -> None:
         """Play from the shown frame."""
         self._begin_s = time.monotonic() - self.times_s[self.frame]
-        self._standing = None
+        self._paused_frame = None
 
     def stand_at(self, t: float) -> None:
         """Pause at the frame nearest to a model time."""
-        self._standing = min(max(round(t * self.frame_count), 0), self.frame_count - 1)
+        self._paused_frame = min(max(round(t * self.frame_count), 0), self.frame_count - 1)
 
     def note_on(self, t: float) -> str:
         """A remark on a requested model time; empty if it lies within the clip."""

@@ -1,8 +1,8 @@
 """The part of the queue that stores which webhooks have yet to be delivered (`Deliveries`, a Protocol).
 
 A job's end and its delivery are written in one step, so neither a killed worker nor a killed service loses a delivery.
-A service borrows a delivery that is due. A loan is a lease: if the service reports no result before the loan expires,
-another service may borrow the delivery. So each webhook is sent at least once, and twice only if a service died, or
+A service claims a delivery that is due. A claim is a lease: if the service reports no result before it expires,
+another service may claim the delivery. So each webhook is sent at least once, and twice only if a service died, or
 lost the queue, in between.
 """
 
@@ -15,8 +15,8 @@ from typing import Protocol
 from contract.wire.job import JobRecord
 from contract.wire.webhooks import Delivery
 
-LOAN_S = 30.0
-"""The length of a loan; longer than an attempt takes (service/webhooks.py)."""
+DELIVERY_LEASE_S = 30.0
+"""The length of a claim; longer than an attempt takes (service/webhooks.py)."""
 
 
 OWED_FOR_S = 26 * 3600.0
@@ -25,31 +25,34 @@ usually stopped by then."""
 
 
 @dataclass(frozen=True)
-class Loan:
-    """A delivery that a service has to attempt now; `mark` distinguishes this loan from earlier and later ones."""
+class ClaimedDelivery:
+    """A delivery that a service has to attempt now.
+
+    due_score: distinguishes this claim from earlier and later ones.
+    trace: the traceparent of the job.
+    """
 
     delivery: Delivery
     url: str
     tenant: str
-    mark: str
+    due_score: str
     trace: str | None = None
-    """The traceparent of the job."""
 
 
 class Deliveries(Protocol):
     """Every method is atomic, and may be repeated when its answer was lost; all raise UnavailableError."""
 
-    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
-        """Borrow the delivery that has been due for longest, for LOAN_S; None if none is due.
+    def claim_delivery(self, token: str, skipped: Collection[str] = ()) -> ClaimedDelivery | None:
+        """Claim the delivery that has been due for longest, for DELIVERY_LEASE_S; None if none is due.
 
         A delivery that cannot be read is given up, and logged once.
 
-        token: identifies this call; the same token gets the same delivery again. passed: tenants to skip for now.
+        token: identifies this call; the same token gets the same delivery again. skipped: tenants to skip for now.
         """
         ...
 
-    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
-        """Store the result of a loan: the delivery with one more attempt. False if the loan has expired.
+    def record_try(self, claim: ClaimedDelivery, delivery: Delivery, wait_s: float | None) -> bool:
+        """Store the result of a claim: the delivery with one more attempt. False if the claim has expired.
 
         wait_s: seconds until it is due again; None: it is finished.
         """
@@ -67,7 +70,7 @@ class Deliveries(Protocol):
     def deliveries(self, job_id: str) -> list[Delivery]:
         """The deliveries of a job, one per end, oldest first; empty without a callback. Skips what cannot be read.
 
-        A delivery on loan has no next_try_at_s.
+        A claimed delivery has no next_try_at_s.
         """
         ...
 

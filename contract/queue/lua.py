@@ -21,7 +21,7 @@ from intrasplat.names import BUDGETS_S
 
 NAMES = (
     *("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget"),
-    *("lend", "note", "again", "announce"),
+    *("claim_delivery", "record_try", "again", "announce"),
 )
 
 UNREADABLE = JobError(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Collection
 from typing import Any
 
-from contract.queue.deliveries import LOAN_S, Loan, delivery_of
+from contract.queue.deliveries import DELIVERY_LEASE_S, ClaimedDelivery, delivery_of
 from contract.queue.lua import Scripts
 from contract.queue.redis_client import reachable
 from contract.wire.job import JobRecord
@@ -23,19 +23,26 @@ class RedisDeliveries:
         self._scripts = scripts
         self._prefix = prefix
 
-    def lend_delivery(self, token: str, passed: Collection[str] = ()) -> Loan | None:
-        while answer := self._scripts.run("lend", token, round(LOAN_S * 1000), *passed):
-            event, document, url, tenant, mark, trace = answer
+    def claim_delivery(self, token: str, skipped: Collection[str] = ()) -> ClaimedDelivery | None:
+        while answer := self._scripts.run("claim_delivery", token, round(DELIVERY_LEASE_S * 1000), *skipped):
+            event, document, url, tenant, due_score, trace = answer
             if delivery := delivery_of(document):
-                return Loan(delivery, url, tenant, mark, trace or None)
-            if self._scripts.run("note", event, mark, "", DeliveryStatus.FAILED.value, "", tenant):
+                return ClaimedDelivery(delivery, url, tenant, due_score, trace or None)
+            if self._scripts.run("record_try", event, due_score, "", DeliveryStatus.FAILED.value, "", tenant):
                 logger.error("A webhook cannot be read and is given up.", extra={"job_id": event.partition(".")[0]})
         return None
 
-    def note_try(self, loan: Loan, delivery: Delivery, wait_s: float | None) -> bool:
+    def record_try(self, claim: ClaimedDelivery, delivery: Delivery, wait_s: float | None) -> bool:
         wait_ms = "" if wait_s is None else round(wait_s * 1000)
-        arguments = (delivery.event_id, loan.mark, _document(delivery), delivery.status.value, wait_ms, loan.tenant)
-        return bool(self._scripts.run("note", *arguments))
+        arguments = (
+            delivery.event_id,
+            claim.due_score,
+            _document(delivery),
+            delivery.status.value,
+            wait_ms,
+            claim.tenant,
+        )
+        return bool(self._scripts.run("record_try", *arguments))
 
     def send_again(self, record: JobRecord) -> None:
         delivery = Delivery.of(record)

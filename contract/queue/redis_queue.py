@@ -15,6 +15,7 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         tenant, priority                of the document, for the scripts
         trace                           as in JobRecord
         entry, sequence                 its stream entry, and its place among the jobs of its priority
+        returned                        "1" while it waits again after a claim: it is claimed before new jobs
         restored                        token of the call that put it back
     {intrasplat}:events:<id>            stream; each entry is what a change left of the hash (EVENT_FIELDS)
     {intrasplat}:deliveries:<id>        hash, JSON of Delivery by event: the webhooks of the job's ends
@@ -23,20 +24,23 @@ Indexes, written by the same scripts as the hashes:
     {intrasplat}:waiting:high|standard  sorted set of queued jobs by sequence: the order in which they will be claimed
     {intrasplat}:queued                 sorted set of the same jobs by `queued`; and set tenant:<tenant>:waiting
     {intrasplat}:held                   hash of the running jobs, by owner
+    {intrasplat}:served                 sorted set of tenants, by when each was last given a job; expires after a day
     {intrasplat}:dead                   sorted set of dead letters, by time of failure
     {intrasplat}:ended                  hash, jobs that ever came to each terminal state
     {intrasplat}:durations              list, seconds that the last done jobs ran
-    {intrasplat}:owed-by                hash, how many webhooks each tenant owes; their events stand, by when they are
-                                        due, in sorted set tenant:<tenant>:owed
+    {intrasplat}:rests                  list, those seconds less the seconds of training that the job asked for
+    {intrasplat}:owed-by                hash, how many unfinished webhooks each tenant has; their events are, by when
+                                        they are due, in sorted set tenant:<tenant>:owed
+    {intrasplat}:owed                   sorted set of those events of all tenants, which earlier versions write
     {intrasplat}:delivered              hash, webhooks that ever came to each DeliveryStatus but owed
     {intrasplat}:sequence               counter
     {intrasplat}:workers                set of names that may have a {intrasplat}:worker:<name>
 These expire:
     {intrasplat}:worker:<name>          JSON of WorkerAddress
     {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
-    {intrasplat}:yield:<id>             owner that was told to make way for that job
+    {intrasplat}:yield:<id>             worker that was ordered to yield to that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
-    {intrasplat}:lent:<token>           event that was lent to that call
+    {intrasplat}:lent:<token>           event of the delivery that this call claimed
     {intrasplat}:trying:<event>         while a service tries to deliver it
 
 A user who may do this and nothing else:

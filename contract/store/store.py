@@ -8,9 +8,11 @@
     ├── kept/<job>.<n>/     what a later attempt resumes from: resume.safetensors, and prepared/, the clip with depth
     ├── work/tmp-<name>/    what worker <name> has unpacked; emptied whenever it starts
     ├── scenes/<job>.<n>/   what attempt n has finished: manifest.json, scene.safetensors, report.json, curve.csv
-    │                       and, of a clip whose masks were found, masks.zip, recorded.zip; thumbnail.jpg once asked for
+    │                       and, if there are any, recorded.zip, masks.zip (found masks) and thumbnail.jpg
     ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
-    ├── run/                sockets of live workers
+    ├── purging/<job>       an empty file for each job whose removal has started and not ended (service/purge.py)
+    ├── restoring           exists while the data directory is filled from a backup
+    ├── run/                of live processes: sockets, locks, claims, last words, the workers' known addresses
     └── valkey/             the embedded queue's log
 
 A folder in spool/ or scenes/ is always complete. The job's record in the queue says which attempt's scene is THE scene
@@ -47,9 +49,7 @@ from intrasplat.scene.results import RESULTS, add_scores
 
 UNSCORED = "unscored"
 PURGING = "purging"
-"""The folder of notes, each named by a job whose removal has started and not ended (service/purge.py)."""
 RESTORING = "restoring"
-"""A file that exists while a data directory is being filled from a backup."""
 
 
 def open_store(settings: Settings) -> Store:
@@ -78,7 +78,7 @@ class Store:
 
     @property
     def run_dir(self) -> Path:
-        """The folder of live workers' sockets."""
+        """The folder of what live processes share: sockets, locks, claims."""
         return self.data_dir / "run"
 
     @disk_errors()

@@ -117,7 +117,7 @@ class JobRecord(BaseModel):
     labels: Labels = Labels()
     files: JobFiles
     tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)
-    """Whose it is; nobody else learns that it exists."""
+    """The owner; no other tenant can find out that the job exists."""
     input_bytes: int = Field(default=0, ge=0)
     input_sha256: str = ""
     """The digest of all files, sorted by part."""
@@ -135,7 +135,7 @@ class JobRecord(BaseModel):
     attempt: int = 0
     """Counts claims; a worker's report is accepted only for the attempt it holds."""
     released: int = 0
-    """How many of the attempts are not held against the job: handed back, made way, or forgiven by a retry."""
+    """How many attempts do not count as deaths: released to end or for another job, or made before a retry."""
     owner: str | None = None
     """Name of the worker that holds, or last held, the job."""
     cancel_requested: bool = False

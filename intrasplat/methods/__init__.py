@@ -1,5 +1,5 @@
 """The methods as data: all settings of training, listed in the order in which a clip meets them.
 
-Read method (what a preset and a departure are), paper (the published method), fast (our method, as departures from
-paper), then registry (presets by name). docs/method.md shows the same on one page, with figures.
+Begin with docs/method.md, one page with figures. Then read paper (the published method) and fast (ours, as departures
+from paper); method says what every value means, registry finds a preset by its name.
 """

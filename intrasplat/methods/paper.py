@@ -14,7 +14,8 @@ FALLING = Rate(1.6e-3, 5.06e-5)
 
 PAPER = Preset(
     name="paper",
-    # Points: a tenth of the first frame's pixels and of those that moved later ("Motion-Aware Point Fusion").
+    # Points: all pixels of the first frame and a tenth of those that moved later; a tenth of all of these is drawn
+    # ("Motion-Aware Point Fusion").
     fusion=FusionSettings(mode="paper"),
     points_per_image=None,
     points_by_budget=False,

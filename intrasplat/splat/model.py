@@ -94,7 +94,7 @@ class Model(Protocol):
         ...
 
     @property
-    def answers_every(self) -> int:
+    def steps_a_report(self) -> int:
         """Steps from one StepSums to the next; 1 if step() waits for every step."""
         ...
 

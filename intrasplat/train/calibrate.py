@@ -19,7 +19,7 @@ from intrasplat.train.schedule import Schedule
 
 UNTIMED_STEPS, TIMED_STEPS = 3, 12
 """Steps before timing starts, which fill caches, and steps that are timed. Their median counts, because other processes
-disturb single steps. Where the device answers every k-th step only, both numbers count answers."""
+disturb single steps. Where the device reports every k-th step only, both numbers count reports."""
 GROWTH_ALLOWANCE = 1.15
 """Later steps are slower, because Gaussians grow. The factor is an estimate: it differs from clip to clip."""
 
@@ -72,15 +72,15 @@ def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = Non
     """The schedule of a new run whose iterations fit into its budget. Its first steps are timed to predict the others.
 
     budget_s includes what the run's clock shows already. The iterations show every training frame at least once. Where
-    the device answers every step, the timed steps are the run's first iterations. A device that answers late makes
+    the device reports every step, the timed steps are the run's first iterations. A device that reports late makes
     hundreds of them, so there they are undone.
 
     Raises:
         Cancelled: hooks.should_stop() returned True.
         TrainingDiverged: a loss is not finite, or no Gaussian is visible.
     """
-    model, steps_an_answer = run.model, run.model.answers_every
-    timed, keeps_steps = (UNTIMED_STEPS + TIMED_STEPS) * steps_an_answer, steps_an_answer == 1
+    model, steps_a_report = run.model, run.model.steps_a_report
+    timed, keeps_steps = (UNTIMED_STEPS + TIMED_STEPS) * steps_a_report, steps_a_report == 1
     known = Schedule(timed, run.preset.warm_restarts, min_gain_db, run.steps_an_epoch, opening=timed)
     run.schedule, ends = known, []
     with nullcontext() if keeps_steps else taken_back(model, run.preset.rates.beta1):
@@ -89,11 +89,11 @@ def measured_schedule(run: Run, budget_s: float, min_gain_db: float | None = Non
             if run.setup.hooks.should_stop():
                 raise Cancelled(f"Stopped after {iteration - 1} timed iterations.")
             step(run, iteration)
-            if iteration % steps_an_answer == 0:
+            if iteration % steps_a_report == 0:
                 check_sums(model.wait(), iteration)
                 ends.append(time.perf_counter())
     made = timed if keeps_steps else 0
     run.iteration = made
-    step_s = float(np.median(np.diff(ends)[UNTIMED_STEPS:])) / steps_an_answer * GROWTH_ALLOWANCE
+    step_s = float(np.median(np.diff(ends)[UNTIMED_STEPS:])) / steps_a_report * GROWTH_ALLOWANCE
     left = int((budget_s - run.setup.clock.elapsed_s) / step_s)
     return replace(known, planned=max(run.steps_an_epoch, made + left, made), opening=made)

@@ -1,4 +1,4 @@
-"""The one training loop. prepare.py builds what it needs; Run holds all of its state.
+"""The training loop. prepare.py builds the Run, its state; with a budget, calibrate.py makes the first steps.
 
 No schedule reads the clock. So on one device the same seed and iterations give a bit-identical model, also if the run
 was interrupted and resumed.

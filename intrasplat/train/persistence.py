@@ -88,16 +88,16 @@ class Keeper:
         if PREPARED in names:
             shutil.rmtree(self.folder / PREPARED, ignore_errors=True)
 
-    def clip(self, request: ReconstructionRequest, open_with_depth: Callable[[], DepthClip]) -> DepthClip:
-        """The stored clip of the request if there is one, else that of open_with_depth(), which is then stored."""
+    def clip(self, request: ReconstructionRequest, open_anew: Callable[[], DepthClip]) -> DepthClip:
+        """The stored clip of the request if there is one, else that of open_anew(), which is then stored."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if isinstance(request.clip, DepthClip):
-            return open_with_depth()
+            return open_anew()
         folder, identity = self.folder / PREPARED, _identity(request)
         kept = load_clip(folder, identity)
         if kept is not None:
             return kept
-        clip = open_with_depth()
+        clip = open_anew()
         self.written.add(PREPARED)
         size_bytes = sum(each.rgb.size * 3 for each in clip.eyes)  # 9 bytes a pixel
         self._submit(lambda: save_clip(folder, clip, identity, self._ending.is_set), size_bytes)

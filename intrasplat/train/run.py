@@ -40,16 +40,16 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 class Run:
     """A training run.
 
-    setup        clip, split, request, device, hooks, clocks
+    setup        clip, split, options, device, hooks, clocks
     model        Gaussians, deformation, Adam's moments
     frames       targets and cameras of the left eye
-    right        those of the right eye; None where only the left eye is trained on
     preset       rates, loss, order, densification; all that it left to the scene is filled in
-    schedule     how many iterations, and how the rates fall
+    schedule     the cycles, their rates, and early stopping
     box          bounding box of the Gaussians' centres before the first step, units
     iteration    iterations done
+    right        targets and cameras of the right eye; None where only the left eye is trained on
     average      mean of the last models of a cycle
-    densifier    its statistics; None where the preset has no densification
+    densifier    splits and prunes Gaussians; None where the preset has no densification
     chosen       what the preset left to the scene: the value chosen and the reason
     curve        scores of held-out frames so far
     """
@@ -83,7 +83,7 @@ class Run:
         return (self.frames,) if self.right is None else (self.frames, self.right)
 
     @property
-    def taught_by(self) -> Eyes:
+    def trained_eyes(self) -> Eyes:
         """The name of the eyes that are trained on."""
         return "left" if self.right is None else "both"
 

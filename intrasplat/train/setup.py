@@ -20,7 +20,10 @@ class Setup:
     clip           frames with depth, of the right eye too if there is one
     split          the frames to train on, and the held-out ones
     preset         as requested; prepare() fills in what it leaves to the scene
-    options        seed, length and eyes are read from them
+    options        as requested, among them seed, length and eyes
+    device         holds the model and renders it
+    hooks          the caller's callbacks
+    timings        seconds of each stage so far
     clock          t_train_s, which starts with the setup
     accepted_at_s  Unix time from which t_post_s counts
     gpu_is_idle    whether there is a GPU that the preset's motion cannot use

@@ -145,7 +145,7 @@ class _View:
     def _gaussians(self, window: Intrinsics, i: int, j: int) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
         """Indices and shares [M] of a pixel's Gaussians, and the standard deviation of their depths in mm."""
         renderer = renderer_of(self.scene, self.device)
-        weights = renderer.weights(self.t, self.pose, window, i, j).astype(np.float64)
+        weights = renderer.blending_weights(self.t, self.pose, window, i, j).astype(np.float64)
         chosen = np.flatnonzero(weights > LEAST_SHARE * weights.sum())
         shares = weights[chosen] / max(weights[chosen].sum(), 1e-9)
         z_mm = to_camera(renderer.means_mm(self.t)[chosen], self.pose)[:, 2]

@@ -45,7 +45,7 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 
-def kept_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
+def zipped_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
     """The zip file of a clip's recorded frames, and its entry in the report. The same clip gives the same bytes.
 
     It contains all frames, or MAX_MOMENTS that are spread evenly. If the masks were found in the pictures, it skips
@@ -98,7 +98,7 @@ def stored_frame(
     eye: EyeName = "left",
     masks: RecordedMasks = RecordedMasks.MARKED,
 ) -> tuple[int, bytes]:
-    """As live_frame, from the file of kept_frames.
+    """As live_frame, from the file of zipped_frames.
 
     Raises:
         SceneError: the file is missing or damaged.

@@ -116,7 +116,7 @@ class SceneRenderer:
         time_s = float(np.interp(t * self.scene.frame_count, np.arange(len(times_s)), times_s))
         return self._out_of_view.faded(self._values, time_s)
 
-    def weights(
+    def blending_weights(
         self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics, i: int, j: int
     ) -> NDArray[np.float32]:
         """[N] blending weights of the Gaussians at pixel (i, j)."""

@@ -7,9 +7,10 @@ an interrupted command goes on, and a file that is moved away is measured anew. 
 docs/method.md and the lines "Gain" of intrasplat/methods/fast.py are written from the rows; --redraw does only that.
 
 The number of iterations is fixed, so decibels do not depend on how busy the machine is. Seconds are processor seconds
-of preparing and training, all cores together, without scoring. Early stopping alone is measured in runs of
-STOPPING_ITERATIONS planned iterations, with it and without. What concerns two eyes is measured on clips of two eyes,
-everything else on clips of one. A missing clip is skipped.
+of preparing and training, all cores together, without scoring. `fast` itself is trained BASELINE_RUNS times, spread
+over the others; differences no greater than between its own runs are written as 0. Early stopping alone is measured in
+runs of STOPPING_ITERATIONS planned iterations. What concerns two eyes is measured on clips of two eyes, everything
+else on clips of one. A missing clip is skipped.
 """
 
 from __future__ import annotations
@@ -19,21 +20,25 @@ import csv
 import os
 import re
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.errors import InputError
+from intrasplat.fusion import FusionSettings
 from intrasplat.machine.hooks import Hooks
 from intrasplat.methods.fast import DEPARTURES, FAST
-from intrasplat.methods.method import Departure, Preset, departing
+from intrasplat.methods.method import DensifySettings, Departure, Preset, departing
 from intrasplat.methods.paper import PAPER
 from intrasplat.options import ReconstructionOptions
 from intrasplat.splat.cpu import compile_kernels
+from intrasplat.splat.optimize import Rate
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
@@ -59,21 +64,22 @@ OF_TWO_EYES = ("both eyes", "gloss")
 """Departures that change nothing on a clip of one eye, and the only ones that are measured on a clip of two."""
 UNMEASURED = ("budget in seconds",)
 """It says when training ends and changes no step."""
+BASELINE_RUNS = 3
+"""Runs of `fast` per clip and seed, equal in decibels: their seconds show which differences mean something."""
 KEY = ("run", "clip", "iterations", "seed")
 FIELDS = (
     *KEY, "psnr_tissue_db", "psnr_right_db", "cpu_s", "seconds", "gaussians", "bases", "load_1min", "machine", "commit",
 )  # fmt: skip
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#CC79A7", "#D55E00")
-BAR = 0.36
-"""The height of a bar; bars come in pairs."""
+BAR = 0.36  # the height of a bar; bars come in pairs
 
 Row = Mapping[str, str]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clips", nargs="+", default=["phantom:pull", "d4d_endonerf:320x256", "d4d_stereo"])
+    parser.add_argument("--clips", nargs="+", default=["phantom:pull", "d4d_endonerf", "d4d_stereo"])
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--only", nargs="*", choices=[each.name for each in DEPARTURES], help="these departures alone")
@@ -91,10 +97,11 @@ def main() -> None:
             continue
         clip = open_source(source, HOLDOUT, Hooks()).clip
         compile_kernels()
-        known = {tuple(row[name] for name in KEY) for row in read(options.csv)}
+        known = Counter(tuple(row[name] for name in KEY) for row in read(options.csv))
         of_clip = [name for name in names if (name in OF_TWO_EYES) == (clip.right is not None)]
         for run in planned(of_clip, options.iterations, options.seeds):
-            if key_of(run, source.name) in known:
+            if known[key_of(run, source.name)] > 0:
+                known[key_of(run, source.name)] -= 1
                 continue
             row = dict(zip(KEY, key_of(run, source.name), strict=True)) | measure(run, clip)
             append(options.csv, row)
@@ -138,9 +145,12 @@ def planned(names: Iterable[str], iterations: int, seeds: int) -> list[PlannedRu
     """The runs from which the gains of these departures are computed."""
     runs = []
     for seed in range(seeds):
-        runs += [PlannedRun("fast", FAST, iterations, seed), PlannedRun("paper", PAPER, iterations, seed)]
-        others = [name for name in names if name not in (STOPPING, *UNMEASURED)]
-        runs += [PlannedRun(name, fast_without(name), iterations, seed) for name in others]
+        baseline = PlannedRun("fast", FAST, iterations, seed)
+        without = [name for name in names if name not in (STOPPING, *UNMEASURED)]
+        others = [PlannedRun(name, fast_without(name), iterations, seed) for name in without]
+        others.insert(0, PlannedRun("paper", PAPER, iterations, seed))
+        for part in range(BASELINE_RUNS):
+            runs += [baseline, *others[part::BASELINE_RUNS]]
         if STOPPING in names:  # last, because it takes longest
             runs.append(PlannedRun(STOPPED, FAST, STOPPING_ITERATIONS, seed, stops_early=True))
             runs.append(PlannedRun(STOPPING, fast_without(STOPPING), STOPPING_ITERATIONS, seed))
@@ -209,7 +219,10 @@ def append(path: Path, row: Mapping[str, object]) -> None:
 
 @dataclass(frozen=True)
 class Gain:
-    """What a departure is worth on a clip: medians over the seeds of `fast` less `fast` without it."""
+    """What a departure is worth on a clip: medians over the seeds of `fast` less `fast` without it.
+
+    cpu_s  0.0 where the difference is no greater than that between runs of `fast` itself
+    """
 
     left_db: float
     right_db: float | None
@@ -226,32 +239,63 @@ class Gain:
 
 
 def signed(value: float, digits: int) -> str:
-    """The value with its sign and `digits` decimals."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}"  # adding 0.0 turns -0.0 into 0.0
+    """The value with its sign and `digits` decimals; "0" for exactly 0."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}" if value else "0"  # adding 0.0 turns -0.0 into 0.0
 
 
 def gains_of(rows: Sequence[Row], clip: str) -> dict[str, Gain]:
     """The gains on a clip by departure; departures without rows are skipped."""
     found = {}
     for departure in DEPARTURES:
-        name = departure.name
-        with_it = [row for row in rows if (row["run"], row["clip"]) == (STOPPED if name == STOPPING else "fast", clip)]
-        pairs = [
-            (one, other)
-            for one in with_it
-            for other in rows
-            if (other["run"], *(other[key] for key in KEY[1:])) == (name, *(one[key] for key in KEY[1:]))
-        ]
-        if pairs:
-            by_figure = {
-                figure: [float(one[figure]) - float(other[figure]) for one, other in pairs if one[figure]]
-                for figure in ("psnr_tissue_db", "psnr_right_db", "cpu_s")
-            }
-            right = by_figure["psnr_right_db"]
-            found[name] = Gain(
-                median(by_figure["psnr_tissue_db"]), median(right) if right else None, median(by_figure["cpu_s"])
+        without = [row for row in rows if (row["run"], row["clip"]) == (departure.name, clip)]
+        baseline = STOPPED if departure.name == STOPPING else "fast"
+        gains: dict[str, list[float]] = {"psnr_tissue_db": [], "psnr_right_db": [], "cpu_s": []}
+        for row in without:
+            same = [each for each in rows if each["run"] == baseline and all(each[key] == row[key] for key in KEY[1:])]
+            for figure, values in gains.items():
+                known = [float(each[figure]) for each in same if each[figure]]
+                if known and row[figure]:
+                    values.append(median(known) - float(row[figure]))
+        if gains["psnr_tissue_db"]:
+            right, cpu_s = gains["psnr_right_db"], median(gains["cpu_s"])
+            found[departure.name] = Gain(
+                median(gains["psnr_tissue_db"]),
+                median(right) if right else None,
+                cpu_s if abs(cpu_s) > noise_s(rows, clip) else 0.0,
             )
     return found
+
+
+def noise_s(rows: Sequence[Row], clip: str) -> float:
+    """The greatest difference in processor seconds between runs of `fast` with one seed and length on the clip."""
+    by_key: dict[tuple[str, ...], list[float]] = {}
+    for row in rows:
+        if (row["run"], row["clip"]) == ("fast", clip):
+            by_key.setdefault(tuple(row[key] for key in KEY), []).append(float(row["cpu_s"]))
+    return max((max(times) - min(times) for times in by_key.values()), default=0.0)
+
+
+def changes(departure: Departure) -> str:
+    """The values that the departure changes, as in paper.py and as in fast.py: "opacity 0.1 → 0.9; spread 1 → 0.5"."""
+    parts = ((departure.fields, PAPER), (departure.rates, PAPER.rates), (departure.loss, PAPER.loss))
+    pairs = ((name, getattr(base, name), value) for values, base in parts for name, value in values.items())
+    return "; ".join(f"{name} {shown(old)} → {shown(new)}" for name, old, new in pairs)
+
+
+def shown(value: Any) -> str:
+    """A preset's value in a few characters: rates as start..end, settings by their mode."""
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case Rate():
+            return f"{value.start:.3g}" if value.end is None else f"{value.start:.3g}..{value.end:.3g}"
+        case FusionSettings():
+            return value.mode
+        case DensifySettings():
+            return f"every {value.every}"
+        case float():
+            return f"{value:g}"
+    return "none" if value is None else str(value)
 
 
 def clips_of(rows: Sequence[Row]) -> list[str]:
@@ -274,21 +318,24 @@ def table_of(rows: Sequence[Row]) -> str:
     gains = {clip: gains_of(rows, clip) for clip in clips_of(rows)}
     cells = []
     for departure in DEPARTURES:
-        line = [departure.name]
+        if departure.name in UNMEASURED:
+            continue
+        line = [departure.name, changes(departure)]
         for clip, figure, _, digits in columns:
-            gain = gains[clip].get(departure.name)
-            value = None if gain is None else gain.by_figure[figure]
+            value = gains[clip][departure.name].by_figure[figure] if departure.name in gains[clip] else None
             line.append("–" if value is None else signed(value, digits))
         cells.append(line)
     length = next(row["iterations"] for row in rows if row["run"] == "fast")
     for name in ("fast", "paper"):
-        line = [f"`{name}` after {length} iterations"]
+        line = [f"`{name}` after {length} iterations", ""]
         for clip, figure, _, digits in columns:
             own = [float(row[figure]) for row in rows if (row["run"], row["clip"]) == (name, clip) and row[figure]]
             line.append(number(median(own) if own else None, digits))
         cells.append(line)
-    header = ["departure", *(f"{clip}: {unit}" for clip, _, unit, _ in columns)]
-    return table(header, cells) + origin([dict(row) for row in rows])
+    header = ["departure", "`paper` → `fast`", *(f"{clip}: {unit}" for clip, _, unit, _ in columns)]
+    spread = ", ".join(f"{noise_s(rows, clip):.1f} s on {clip}" for clip in clips_of(rows))
+    noise = f"\nRuns of `fast` itself differed by up to {spread}; smaller differences in seconds are written as 0.\n"
+    return table(header, cells) + noise + origin([dict(row) for row in rows])
 
 
 def with_gains(source: str, rows: Sequence[Row]) -> str:

@@ -29,8 +29,8 @@ from intrasplat.machine.hooks import Hooks
 from intrasplat.names import PresetName
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
-from intrasplat.pipeline import Made, judge, make
-from intrasplat.quality.judge import judged
+from intrasplat.pipeline import Made, make, score_scene
+from intrasplat.quality.score import score_model
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
@@ -96,7 +96,7 @@ def measured(path: Path, preset: PresetName, steps_a_frame: int, parts: Sequence
     with tempfile.TemporaryDirectory(prefix="intrasplat-long-") as folder:
         request = ReconstructionRequest(path, ReconstructionOptions(preset=preset, iterations=iterations), device="cpu")
         made = make(request, Path(folder), hooks)
-        report = judge(made, hooks)
+        report = score_scene(made, hooks)
         memory.end_stage()
         scores = _scores(made, load_scene(Path(folder)), parts) if parts else []
     print(*(each.text for each in report.assumptions if each.code == NoticeCode.BASES), sep="\n")
@@ -109,7 +109,7 @@ def _scores(made: Made, scene: TrainedScene, parts: Sequence[range]) -> list[Sco
     for part in parts:
         held_out = tuple(index for index in made.split.held_out if index in part)
         first = made.report.model_copy(update={"held_out": held_out})
-        report = judged(first, made.clip, made.split.train, renderer.seen_from, Hooks())
+        report = score_model(first, made.clip, made.split.train, renderer.seen_from, Hooks())
         found.append((report.psnr_tissue_db, report.psnr_right_db))
     return found
 

@@ -38,7 +38,7 @@ from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ReconstructionOptions
-from intrasplat.pipeline import judge, make
+from intrasplat.pipeline import make, score_scene
 from intrasplat.quality.checks import clip_warnings
 from intrasplat.report import Report
 from intrasplat.stereo import ClipPaths, match_eyes, open_with_depth
@@ -257,7 +257,7 @@ def trained(clip: DepthClip, truths: Sequence[DepthClip], iterations: int) -> li
     options = ReconstructionOptions(holdout=HOLDOUT, iterations=iterations)
     with tempfile.TemporaryDirectory() as folder:
         made = make(ReconstructionRequest(clip, options, device="cpu"), Path(folder), TrainingHooks())
-        return [judge(replace(made, clip=truth), TrainingHooks()) for truth in truths]
+        return [score_scene(replace(made, clip=truth), TrainingHooks()) for truth in truths]
 
 
 if __name__ == "__main__":

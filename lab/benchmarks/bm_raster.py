@@ -67,7 +67,7 @@ MOVES = {"render": 1, "step": 1 + 6}
 """Memory accesses per parameter: read once to deform; Adam reads and writes it and both moments."""
 PIXEL_BYTES = {"render": 5 * 4, "step": 3 + 1 + 4}
 """Bytes per pixel: the image is written; the target is read."""
-PARTS = {"place": "project", "bin": "bin", "sort": "sort", "blend": "blend", "carry_back": "project_backward"}
+PARTS = ("project", "sort", "blend", "project_backward")
 
 
 Row = dict[str, Any]
@@ -235,7 +235,7 @@ def _timed(model: CpuModel, call: Callable[[], object], repeats: int) -> tuple[f
 
         return timed
 
-    watched: list[tuple[Any, str, str]] = [(model.rasterizer, name, part) for name, part in PARTS.items()]
+    watched: list[tuple[Any, str, str]] = [(model.rasterizer, part, part) for part in PARTS]
     watched += [(model.motion, "deform", "deform"), (model.motion, "update", "motion_adam")]
     watched += [(model, "update_canonical", "canonical_adam")]
     for owner, name, part in watched:

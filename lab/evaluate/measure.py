@@ -25,7 +25,7 @@ from intrasplat.commands.exits import flag_of
 from intrasplat.errors import InputError
 from intrasplat.machine.timing import Timings
 from intrasplat.names import CURVE, REPORT, DeviceName
-from intrasplat.pipeline import open_with_depth, reconstruct
+from intrasplat.pipeline import open_with_poses, reconstruct
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
@@ -152,7 +152,7 @@ class Bench:
         """As measure(), for a rival, which has no scene."""
         device, timings, options = choose_device(self.device), Timings(), options_of(cell)
         timings.seconds.update(opened.seconds)
-        clip = open_with_depth(ReconstructionRequest(opened.clip, options), hooks, timings, device)
+        clip = open_with_poses(ReconstructionRequest(opened.clip, options), hooks, timings, device)
         step_px = scored_step_px(cell.series, device, clip.intrinsics.width)
         on_the_way = _OnTheWay(thinned(clip, step_px))
         fitted = run_rival(

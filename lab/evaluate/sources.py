@@ -30,7 +30,7 @@ from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.options import ClipOptions, ReconstructionOptions
-from intrasplat.pipeline import open_with_depth
+from intrasplat.pipeline import open_with_poses
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.stereo import match_eyes
 from intrasplat.train.request import ReconstructionRequest
@@ -136,7 +136,7 @@ def open_source(source: Source, holdout: str, hooks: Hooks, device: Device = CPU
     )  # each run chooses
     calibration, masks = source.files.get("calibration"), source.files.get("masks")
     request = ReconstructionRequest(source.clip, options, calibration=calibration, masks=masks)
-    clip = open_with_depth(request, hooks, timings, device)
+    clip = open_with_poses(request, hooks, timings, device)
     clip = clip if source.size is None else shrunk(clip, _shrinks_by(clip, source))
     return OpenClip(clip, None, timings.seconds, clip.tissue)
 

@@ -27,7 +27,7 @@ from intrasplat.clip import split_frames
 from intrasplat.errors import InputError, TrainingDiverged
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import Severity
-from intrasplat.pipeline import open_with_depth, reconstruct
+from intrasplat.pipeline import open_with_poses, reconstruct
 from intrasplat.poses.trajectory import trajectory_error
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
@@ -304,7 +304,7 @@ def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks:
 
 def _made_by_rival(request: ReconstructionRequest, cell: StabilityCell, hooks: TrainingHooks) -> _Made:
     options, device = request.options, choose_device(request.device)
-    clip = open_with_depth(request, hooks, Timings(), device)
+    clip = open_with_poses(request, hooks, Timings(), device)
     step_px = scored_step_px(cell.series, device, clip.intrinsics.width)
     drawn_by = thinned_camera(clip.intrinsics, step_px)
     fitted = run_rival(

@@ -154,9 +154,9 @@ class Checks:
         frames = [Noise(scene, self._random()) for scene in scenes]
         moved = [_arguments(scenes, self._device)]
         rasterizer = CudaRasterizer(self.sizes.width, self.sizes.height, self._device, frames=2)
-        rasterizer.project(*moved[0])
+        rasterizer.project_and_sort(*moved[0])
         poison(rasterizer)
-        rasterizer.project(*moved[0])
+        rasterizer.project_and_sort(*moved[0])
         pictures = zip(*(frame.on_device for frame in frames), strict=True)
         rgb, weight, inverse_depth = (torch.stack(each).to(self._device) for each in pictures)
         settings = torch.stack([frame.settings for frame in frames]).to(self._device)

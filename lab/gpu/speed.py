@@ -156,8 +156,8 @@ class Speed:
     def _parts(self, model: CudaModel) -> dict[str, float]:
         """Median ms on the device, by wrapping the model's own methods while it launches."""
         raster, stamps = model._training.rasterizer, []
-        watched: list[tuple[Any, str]] = [(model.motion, "deform"), (raster, "project"), (raster, "_bin")]
-        watched += [(torch, "sort"), (raster, "_blend"), (raster, "_carry_back"), (model.motion, "update")]
+        watched: list[tuple[Any, str]] = [(model.motion, "deform"), (raster, "project_and_sort"), (raster, "_bin")]
+        watched += [(torch, "sort"), (raster, "_blend"), (raster, "_project_backward"), (model.motion, "update")]
 
         def wrapped(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             def timed(*arguments: Any, **named: Any) -> Any:
@@ -271,11 +271,11 @@ def _nested(ms: dict[str, float]) -> dict[str, float]:
     """Subtract nested timings from those that contain them."""
     return {
         "deform": ms["deform"],
-        "project": ms["project"] - ms["_bin"],
+        "project": ms["project_and_sort"] - ms["_bin"],
         "sort": ms["sort"],
         "bin": ms["_bin"] - ms["sort"],
         "blend": ms["_blend"],
-        "project backward": ms["_carry_back"],
+        "project backward": ms["_project_backward"],
         "update": ms["update"],
     }
 

@@ -24,8 +24,8 @@ from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Progress
 from intrasplat.machine.timing import Stopwatch
 from intrasplat.quality.checks import clip_warnings
-from intrasplat.quality.judge import judged
 from intrasplat.quality.report import Training, first_report
+from intrasplat.quality.score import score_model
 from intrasplat.report import Report
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cpu import compile_kernels
@@ -188,7 +188,7 @@ def run_rival(
     seconds["t_post_s"] = waited_s + t_train_s
     doubts = clip_warnings(clip, split.train)
     first = first_report(scored, split, _training(name, rival, made, seed, device, seconds), doubts)
-    return Fitted(rival, renders, judged(first, scored, split.train, renders, hooks), tuple(curve))
+    return Fitted(rival, renders, score_model(first, scored, split.train, renders, hooks), tuple(curve))
 
 
 def every_core() -> AbstractContextManager[None]:

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from contract.queue.deliveries import LOAN_S
+from contract.queue.deliveries import DELIVERY_LEASE_S
 from contract.wire.job import TERMINAL_STATES, JobRecord, JobState
 from intrasplat.errors import SceneError, UnavailableError
 from tests.chaos.deployment import TENANTS, Deployment, Victim
@@ -31,7 +31,7 @@ ACCEPTED_WITHIN_S = 60.0
 ENDED_WITHIN_S = 90.0
 POINT_WITHIN_S = 40.0
 SCORED_WITHIN_S = 30.0
-TOLD_WITHIN_S = LOAN_S + 30.0
+TOLD_WITHIN_S = DELIVERY_LEASE_S + 30.0
 """How soon a webhook comes: the service that was to send it may be killed, and be killed again for another clip."""
 SECOND_ENDING_S = 0.3
 """How long to wait before looking again at a job that has ended."""

@@ -101,8 +101,8 @@ def install_service_points() -> None:
 
     _reach_after(Store, "accept", Point.SPOOLED)
     _reach_after(RedisQueue, "submit", Point.ENQUEUED)
-    _reach_after(RedisQueue, "lend_delivery", Point.TELLING, if_any=True)
-    _reach_before(RedisQueue, "note_try", Point.TOLD)
+    _reach_after(RedisQueue, "claim_delivery", Point.TELLING, if_any=True)
+    _reach_before(RedisQueue, "record_try", Point.TOLD)
 
 
 def install_worker_points() -> None:

@@ -62,14 +62,14 @@ def _views(endpoint: str) -> AbstractContextManager[object]:
 
 def _train(task: Task, order: RunJob, channel: Channel) -> Finished | Stopped:
     """Make the steps that no earlier attempt has kept; the scene's manifest lists all that were made."""
-    made = _kept_steps(order.kept)
+    made = _kept_steps(order.resume_dir)
     for step in range(len(set(made)), STEPS):
         if task.stop.is_set():
-            return Stopped(checkpointed=(order.kept / RESUME).exists())
+            return Stopped(checkpointed=(order.resume_dir / RESUME).exists())
         time.sleep(STEP_S)
         made.append(step)
         channel.send(Advanced(progress=JobProgress(stage="train", fraction=step / STEPS, iteration=step)))
-        _keep(order.kept, made)
+        _keep(order.resume_dir, made)
         if step == STEPS // 2:
             reach(Point.TRAINING)
     reach(Point.TRAINED)
@@ -77,21 +77,21 @@ def _train(task: Task, order: RunJob, channel: Channel) -> Finished | Stopped:
     return Finished()
 
 
-def _kept_steps(kept: Path) -> list[int]:
+def _kept_steps(resume_dir: Path) -> list[int]:
     with suppress(FileNotFoundError):
-        steps: list[int] = json.loads((kept / RESUME).read_text())
+        steps: list[int] = json.loads((resume_dir / RESUME).read_text())
         return steps
     return []
 
 
-def _keep(kept: Path, made: list[int]) -> None:
+def _keep(resume_dir: Path, made: list[int]) -> None:
     """As intrasplat/train/persistence.py: aside, then in place. It goes on where a later attempt has the folder."""
-    aside = kept / f".{RESUME}.new"
+    aside = resume_dir / f".{RESUME}.new"
     with suppress(FileNotFoundError):
         aside.write_text(json.dumps(made))
         if len(made) == STEPS // 2:
             reach(Point.KEEPING)
-        aside.rename(kept / RESUME)
+        aside.rename(resume_dir / RESUME)
 
 
 def _write_scene(out: Path, made: list[int]) -> None:

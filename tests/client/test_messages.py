@@ -13,7 +13,7 @@ from contract.wire.job import JobState
 from intrasplat.errors import ErrorCode
 from intrasplat.machine.forecast import COMPILATION, USUAL_S
 from intrasplat.notices import NoticeCode
-from intrasplat.quality.judge import STAGE
+from intrasplat.quality.score import STAGE
 from service.problems import TITLES
 from tests.client.words import LANGUAGES, table
 from tests.test_codes import NOTICES

@@ -30,7 +30,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions, parse_options
 from intrasplat.outcome import scene_of
 from intrasplat.picture import RecordedMasks
-from intrasplat.pipeline import judge, judge_again, make, reconstruct
+from intrasplat.pipeline import make, reconstruct, score_scene, score_stored_scene
 from intrasplat.report import Masks, Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
@@ -254,8 +254,8 @@ def test_a_scene_is_whole_before_it_is_scored_and_is_scored_alike_from_disk(
     assert files(tmp_path) == SCENE_FILES
     assert tensor_bits(tmp_path) == tensor_bits(out)
     assert not made.report.scored
-    again = judge_again(asked, tmp_path, TrainingHooks())
-    assert again.frames == judge(made, TrainingHooks()).frames == straight.frames
+    again = score_stored_scene(asked, tmp_path, TrainingHooks())
+    assert again.frames == score_scene(made, TrainingHooks()).frames == straight.frames
     assert again.warnings == straight.warnings
 
 
@@ -265,15 +265,15 @@ def test_a_scene_of_a_moving_camera_is_scored_anew_from_its_own_poses(tmp_path: 
     asked = request(tmp_path / "clip", preset="fast")
     made = make(asked, tmp_path / "out", TrainingHooks())
     assert (made.scene.world_from_camera != made.scene.world_from_camera[0]).any()
-    again = judge_again(asked, tmp_path / "out", TrainingHooks())
-    assert again.frames == judge(made, TrainingHooks()).frames
+    again = score_stored_scene(asked, tmp_path / "out", TrainingHooks())
+    assert again.frames == score_scene(made, TrainingHooks()).frames
 
 
 def test_a_stopped_run_with_a_budget_keeps_its_schedule(opened: Opened, tmp_path: Path) -> None:
     with pytest.raises(Cancelled) as stopped:
-        run(opened(), tmp_path, stopping_after(3), iterations=None, budget_s=0.3)
+        run(opened(), tmp_path, stopping_after(3), iterations=None, budget_s=1.0)
     planned = int(str(stopped.value).rstrip(".").rsplit(" ", 1)[1])
-    assert run(opened(), tmp_path, iterations=None, budget_s=0.3).iterations == planned
+    assert run(opened(), tmp_path, iterations=None, budget_s=1.0).iterations == planned
 
 
 @pytest.mark.parametrize("name", ["fast", "paper"])

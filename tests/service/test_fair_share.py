@@ -33,22 +33,22 @@ def test_one_tenant_holds_half_of_the_places_of_uploads_and_another_finds_one(tm
     intake = Intake(Settings(data_dir=tmp_path, max_uploads=4, min_free_bytes=0), Store(tmp_path))
     with contextlib.ExitStack() as held:
         for _ in range(2):
-            held.enter_context(intake.place("ward-3"))
+            held.enter_context(intake.slot("ward-3"))
         with pytest.raises(Problem) as refused:
-            held.enter_context(intake.place("ward-3"))
+            held.enter_context(intake.slot("ward-3"))
         assert (refused.value.status, refused.value.field) == (429, "uploads")
         for _ in range(2):
-            held.enter_context(intake.place("ward-4"))
+            held.enter_context(intake.slot("ward-4"))
         with pytest.raises(Problem) as refused:
-            held.enter_context(intake.place("ward-5"))
+            held.enter_context(intake.slot("ward-5"))
         assert refused.value.status == 503
-    with intake.place("ward-3"):
+    with intake.slot("ward-3"):
         pass
 
 
 def test_where_there_is_one_place_anybody_may_have_it(tmp_path: Path) -> None:
     intake = Intake(Settings(data_dir=tmp_path, max_uploads=1, min_free_bytes=0), Store(tmp_path))
-    with intake.place("ward-3"), pytest.raises(Problem) as refused, intake.place("ward-4"):
+    with intake.slot("ward-3"), pytest.raises(Problem) as refused, intake.slot("ward-4"):
         pass
     assert refused.value.status == 503
 

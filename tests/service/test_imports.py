@@ -60,7 +60,7 @@ def worked_off(service: ServiceUnderTest) -> list[object]:
     """The next job, done as a worker's two processes do it; what the device process reported."""
     record, claim = service.claimed()
     out, told = service.store.work_folder(record.job_id, record.attempt), Told()
-    order = RunJob(record=record, spool=service.store.fetch_clip(record.job_id), out=out, kept=out)
+    order = RunJob(record=record, spool=service.store.fetch_clip(record.job_id), out=out, resume_dir=out)
     obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), RenderPace(), told)
     for report in told.reports:
         if isinstance(report, Finished):
@@ -297,7 +297,7 @@ def test_a_scene_whose_worker_died_before_it_told_the_scores_has_them(
     record, claim = service.claimed()
     store = service.store
     out, told = store.work_folder(record.job_id, record.attempt), Told()
-    order = RunJob(record=record, spool=store.fetch_clip(record.job_id), out=out, kept=out)
+    order = RunJob(record=record, spool=store.fetch_clip(record.job_id), out=out, resume_dir=out)
     obey(Task(order), Settings(data_dir=service.store.data_dir), Snapshots(), RenderPace(), told)
     folder = store.publish_scene(record.job_id, record.attempt)
     assert service.queue.finish(claim)

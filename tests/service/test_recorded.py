@@ -46,7 +46,7 @@ def test_marked_frames_are_drawn_by_the_worker(service: ServiceUnderTest, state:
 
 
 @pytest.mark.parametrize(("t", "frame"), [(0.0, 0), (0.2, 3), (0.4, 6), (0.99, 11), (7.0, 11)])
-def test_kept_frames_are_sent_as_they_are_stored_without_a_worker(
+def test_recorded_frames_are_sent_as_they_are_stored_without_a_worker(
     service: ServiceUnderTest, t: float, frame: int
 ) -> None:
     scene = service.finished_scene()

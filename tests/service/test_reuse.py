@@ -101,7 +101,7 @@ def test_uploads_go_with_an_earlier_clip_and_are_used_once(service: ServiceUnder
     assert contents(service, second) == {"clip.mp4": CLIP, "masks.zip": EMPTY_ZIP}
     assert service.http.post("/reconstruct", json=submission).json()["id"] == second.job_id
     refused = service.http.post("/reconstruct", json={**submission, "clip_of": other})
-    assert assert_problem(refused, 409)["job_id"] == second.job_id
+    assert assert_problem(refused, 409, "masks")["job_id"] == second.job_id
     alone = service.http.post("/reconstruct", json={"clip_of": first, "options": {"seed": 1}})
     assert contents(service, record_of(service, alone)) == {"clip.mp4": CLIP}
 

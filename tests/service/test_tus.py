@@ -97,7 +97,7 @@ def test_two_requests_never_write_to_one_upload(service: ServiceUnderTest) -> No
     (file,) = (service.store.data_dir / "incoming" / path.rpartition("/")[2]).glob("clip.mp4")
     with file.open("rb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        assert_problem(send(service, path, 0, CLIP), 423)
+        assert_problem(send(service, path, 0, CLIP), 423, "upload_id")
     assert send(service, path, 0, CLIP).status_code == 204
 
 
@@ -180,7 +180,7 @@ def test_an_upload_given_up_is_gone(service: ServiceUnderTest) -> None:
     assert deleted.status_code == 204
     assert deleted.headers["tus-resumable"] == "1.0.0"
     assert service.http.request("HEAD", path, headers=TUS).status_code == 404
-    assert_problem(send(service, path, 0, CLIP), 404)
+    assert_problem(send(service, path, 0, CLIP), 404, "upload_id")
     assert service.spooled() == []
 
 
@@ -230,10 +230,10 @@ def test_an_upload_becomes_one_job_however_often_it_is_submitted(service: Servic
     first = service.http.post("/reconstruct", json=submission).json()["id"]
     assert service.http.post("/reconstruct", json=submission).json()["id"] == first
     other = service.http.post("/reconstruct", json={**submission, "options": {"seed": 4}})
-    assert assert_problem(other, 409)["job_id"] == first
+    assert assert_problem(other, 409, "clip")["job_id"] == first
     assert len(service.queue.records()) == 1
     assert offset_of(service, f"/uploads/{submission['clip']}") == len(CLIP)
-    assert_problem(send(service, f"/uploads/{submission['clip']}", len(CLIP), b""), 409)
+    assert_problem(send(service, f"/uploads/{submission['clip']}", len(CLIP), b""), 409, "upload_id")
 
 
 def test_of_an_upload_that_is_in_use_no_job_is_made(service: ServiceUnderTest) -> None:

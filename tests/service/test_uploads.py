@@ -229,6 +229,6 @@ def test_a_body_that_brings_hardly_anything_is_given_up(
 ) -> None:
     headers = {"content-type": "multipart/form-data; boundary=x"}
     for service in running_service(tmp_path, upload_silence_s=0.1):
-        assert_problem(service.http.post("/reconstruct", content=body(), headers=headers), 408)
+        assert_problem(service.http.post("/reconstruct", content=body(), headers=headers), 408, "body")
         assert service.spooled() == []
         assert service.upload().status_code == 202

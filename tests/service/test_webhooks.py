@@ -16,7 +16,7 @@ import pytest
 from client.cli import main as command_line
 from contract.access.keys import KeyScope
 from contract.access.webhook_secrets import tenant_secret
-from contract.queue.deliveries import Loan
+from contract.queue.deliveries import ClaimedDelivery
 from contract.store.shelf import new_job_id
 from contract.wire.job import LOCAL_TENANT, JobError, JobFiles, JobRecord, JobState
 from intrasplat.errors import ErrorCode, UnavailableError
@@ -165,19 +165,19 @@ def test_several_services_share_the_work_and_deliver_each_webhook_once(receiver:
 def test_while_the_queue_is_away_nothing_is_lost(
     receiver: Receiver, service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id, lend = accepted(service, f"{receiver.origin}/"), service.queue.lend_delivery
+    job_id, claim_delivery = accepted(service, f"{receiver.origin}/"), service.queue.claim_delivery
     asked = []
 
     def away(*arguments: object) -> None:
         asked.append(arguments)
         raise UnavailableError("The queue is away.", "Wait.")
 
-    monkeypatch.setattr(service.queue, "lend_delivery", away)
+    monkeypatch.setattr(service.queue, "claim_delivery", away)
     service.queue.cancel(job_id)
     while len(asked) < 3:
         time.sleep(0.01)
     assert receiver.came.empty()
-    monkeypatch.setattr(service.queue, "lend_delivery", lend)
+    monkeypatch.setattr(service.queue, "claim_delivery", claim_delivery)
     assert receiver.next().document["data"]["job_id"] == job_id
 
 
@@ -226,7 +226,7 @@ def test_while_the_queue_takes_no_notes_requests_have_threads_of_their_own(
         noting.remove(arguments)
         return False
 
-    monkeypatch.setattr(service.queue, "note_try", slow)
+    monkeypatch.setattr(service.queue, "record_try", slow)
     tenants = 2 * webhooks.MAX_CALLS // webhooks.MAX_OF_TENANT
     for number in range(2 * webhooks.MAX_CALLS):
         job_id = accepted(service, f"{receiver.origin}/", **bearer(service, f"ward-{number % tenants}"))
@@ -272,24 +272,24 @@ def test_a_fault_in_one_try_ends_neither_the_loop_nor_the_tries_under_way(
     assert fault.__dict__["job_id"] == faulty
 
 
-def test_a_fault_in_lending_is_logged_and_webhooks_go_out(
+def test_a_fault_in_a_claim_is_logged_and_webhooks_go_out(
     receiver: Receiver,
     service: ServiceUnderTest,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    lend, left = service.queue.lend_delivery, [ValueError("a fault")]
+    claim_delivery, left = service.queue.claim_delivery, [ValueError("a fault")]
 
-    def damaged(*arguments: Any) -> Loan | None:
+    def damaged(*arguments: Any) -> ClaimedDelivery | None:
         if left:
             raise left.pop()
-        return lend(*arguments)
+        return claim_delivery(*arguments)
 
-    monkeypatch.setattr(service.queue, "lend_delivery", damaged)
+    monkeypatch.setattr(service.queue, "claim_delivery", damaged)
     with caplog.at_level(logging.ERROR, "intrasplat.service"):
         job_id = cancelled(service, f"{receiver.origin}/")
         assert receiver.next().document["data"]["job_id"] == job_id
-    assert [each.getMessage() for each in caplog.records] == ["the queue lends no webhook by a fault of ours"]
+    assert [each.getMessage() for each in caplog.records] == ["a fault while a webhook was claimed"]
 
 
 def test_the_same_idempotency_key_with_another_callback_is_refused(

@@ -162,7 +162,7 @@ def assert_problem(response: httpx.Response, status: int, field: str | None = No
     problem: dict[str, Any] = response.json()
     assert problem["status"] == status
     assert problem["detail"]
-    assert problem.get("remedy") or status == 500  # of a fault of the worker there is none
+    assert problem["remedy"]
     assert problem.get("field") == field
     return problem
 

@@ -51,10 +51,10 @@ def advance(step: int, **fields: object) -> None:
     tell("advanced", progress=progress | fields)
 
 
-def publish(out: Path, kept: Path) -> None:
+def publish(out: Path, resume_dir: Path) -> None:
     """A scene that went on from what an earlier attempt kept."""
     advance(500, psnr_db=30.0, psnr_right_db=28.0, seconds_left=1.0)
-    steps = (kept / STATE).read_text() if (kept / STATE).exists() else ""
+    steps = (resume_dir / STATE).read_text() if (resume_dir / STATE).exists() else ""
     (out / "manifest.json").write_text(json.dumps({"went_on_from": steps, "files": {}}))
     (out / "curve.csv").write_text("psnr_tissue_db,psnr_right_db\n30,\n")
     (out / "report.json").write_text(json.dumps(REPORT | {"scored": False}))
@@ -73,19 +73,19 @@ def score(word: str, stop: threading.Event) -> None:
         tell("scored", report=REPORT)
 
 
-def wait(out: Path, kept: Path, stop: threading.Event) -> None:
+def wait(out: Path, resume_dir: Path, stop: threading.Event) -> None:
     """Work that never ends by itself; each attempt leaves a mark in the state it keeps."""
     (out / "half").write_text("written")
     step = 0
     while not stop.wait(0.01):
         step += 1
         advance(step)
-    with (kept / STATE).open("a") as file:
+    with (resume_dir / STATE).open("a") as file:
         file.write("x")
     tell("stopped", checkpointed=True)
 
 
-def run(word: str, out: Path, kept: Path, stop: threading.Event) -> None:
+def run(word: str, out: Path, resume_dir: Path, stop: threading.Event) -> None:
     """One attempt."""
     if word in ("publish", "noise", "slow", "unscored", "scoring"):
         if word == "noise":
@@ -93,10 +93,10 @@ def run(word: str, out: Path, kept: Path, stop: threading.Event) -> None:
         for step in range(1, 21 if word == "slow" else 1):
             advance(step)
             time.sleep(0.1)
-        publish(out, kept)
+        publish(out, resume_dir)
         score(word, stop)
     elif word == "wait":
-        wait(out, kept, stop)
+        wait(out, resume_dir, stop)
     elif word == "fail":
         (out / "half").write_text("written")
         error = {"problem": "they cover everything.", "field": "masks", "remedy": "Invert them."}
@@ -125,7 +125,7 @@ def main() -> None:
         Path(os.environ["INTRASPLAT_LAST_WORDS"]).write_text(json.dumps(lack))
         sys.exit(5)
     tell("ready", endpoint="ipc:///nowhere", device="cpu")
-    tell("holding", scenes=["a" * 32])
+    tell("cached_scenes", scenes=["a" * 32])
     stop = threading.Event()
     for line in sys.stdin:
         order: dict[str, Any] = json.loads(line)
@@ -139,7 +139,9 @@ def main() -> None:
             continue
         words = (Path(order["spool"]) / record["files"]["clip"]).read_text().split()
         word = words[min(record["attempt"], len(words)) - 1]
-        threading.Thread(target=run, args=(word, Path(order["out"]), Path(order["kept"]), stop), daemon=True).start()
+        threading.Thread(
+            target=run, args=(word, Path(order["out"]), Path(order["resume_dir"]), stop), daemon=True
+        ).start()
     os._exit(0)
 
 

@@ -7,18 +7,18 @@ import sys
 
 import pytest
 
-from worker.orders import Holding, StopJob, line_of, read_report
+from worker.orders import CachedScenes, StopJob, line_of, read_report
 
 DEAF = "import time; from worker.channel import Orders; Orders.from_stdin(); time.sleep(60)"
 CHATTY = """
 import os
 from worker.channel import Channel
-from worker.orders import Holding
+from worker.orders import CachedScenes
 channel = Channel.instead_of_stdout()
 print("from Python", flush=True)
 os.write(1, b"from a library")
 for scenes in (("a",), ("a",), ("b",)):
-    channel.send_if_new(Holding(scenes=scenes))
+    channel.send_if_new(CachedScenes(scenes=scenes))
 """
 
 
@@ -33,6 +33,9 @@ def test_a_process_ends_with_its_orders_or_at_one_that_it_cannot_read(orders: by
 
 def test_only_reports_leave_by_stdout_and_none_twice() -> None:
     said = run(CHATTY)
-    assert [read_report(line) for line in said.stdout.splitlines()] == [Holding(scenes=("a",)), Holding(scenes=("b",))]
+    assert [read_report(line) for line in said.stdout.splitlines()] == [
+        CachedScenes(scenes=("a",)),
+        CachedScenes(scenes=("b",)),
+    ]
     assert b"from Python" in said.stderr
     assert b"from a library" in said.stderr

@@ -22,7 +22,7 @@ from intrasplat.errors import UnavailableError
 from intrasplat.names import CURVE, MANIFEST, REPORT, RESUME
 from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import STANDIN, Jobs, eventually
-from worker import consume, hang
+from worker import child, consume, hang
 from worker.child import ChildKeeper
 from worker.consume import Consumer
 from worker.supervisor import address_of, announced
@@ -160,7 +160,7 @@ def test_cancelling_a_running_job_stops_it_and_removes_every_file_of_it(bench: J
 def test_a_cancelled_job_that_does_not_stop_is_killed(
     bench: JobLoop, monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
-    monkeypatch.setattr(consume, "MAX_STOP_S", 0.3)
+    monkeypatch.setattr(child, "MAX_STOP_S", 0.3)
     job_id, after = bench.submit(word), bench.submit("publish")
     bench.start()
     bench.wait_for_step(job_id)
@@ -274,7 +274,7 @@ def test_a_worker_that_is_told_to_end_hands_its_job_back_and_any_number_of_times
 def test_a_worker_that_is_told_to_end_does_not_wait_for_a_deaf_child(
     bench: JobLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(consume, "MAX_STOP_S", 0.3)
+    monkeypatch.setattr(child, "MAX_STOP_S", 0.3)
     job_id = bench.submit("deaf")
     bench.start()
     bench.wait_for_step(job_id)

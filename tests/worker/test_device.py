@@ -99,10 +99,10 @@ def wait_until(holds: Callable[[], bool], timeout_s: float = 60.0) -> None:
 def order(clip: Path, out: Path, **options: object) -> RunJob:
     chosen = JobOptions.model_validate(options)
     record = JobRecord(job_id="a" * 32, files=JobFiles(clip=clip.name), options=chosen, created_at_s=time.time())
-    kept = out.with_name(f"{out.name}.kept")
-    for folder in (out, kept):
+    resume_dir = out.with_name(f"{out.name}.resume")
+    for folder in (out, resume_dir):
         folder.mkdir(exist_ok=True)
-    return RunJob(record=record, spool=clip.parent, out=out, kept=kept)
+    return RunJob(record=record, spool=clip.parent, out=out, resume_dir=resume_dir)
 
 
 def end_of_job(child: DeviceChild, stop_after: int | None = None) -> tuple[object, list[Advanced]]:
@@ -144,10 +144,10 @@ def test_a_stopped_job_goes_on_to_the_same_bits_and_the_process_does_any_number_
     assert (failed.fault, failed.error.field) == ("InputError", "options.holdout")
     device.send(order(clip, out, iterations=600))
     assert end_of_job(device, stop_after=1)[0] == Stopped(checkpointed=True)
-    kept = tmp_path / "out.kept"
+    resume_dir = tmp_path / "out.resume"
     assert list(out.iterdir()) == []
-    assert {path.name for path in kept.iterdir()} == set(RESUME_STATE)
-    stopped_at = load_resume(kept)[1]["iteration"]
+    assert {path.name for path in resume_dir.iterdir()} == set(RESUME_STATE)
+    stopped_at = load_resume(resume_dir)[1]["iteration"]
     device.send(StopJob())  # too late for the last job, and not meant for the next
     device.send(order(clip, out, iterations=600))
     finished, advances = end_of_job(device)

@@ -109,10 +109,10 @@ def test_an_export_ends_when_its_scene_is_purged(store: Store, scene_id: str) ->
 
 def test_parts_come_in_order_and_once(store: Store, scene_id: str) -> None:
     views, request = Views(store), export_request(scene_id, "ply-zip")
-    with pytest.raises(SceneError, match="not under way"):
+    with pytest.raises(SceneError, match="has ended"):
         views.answer(next_of(request))
     views.answer(request)
-    with pytest.raises(SceneError, match="not under way"):
+    with pytest.raises(SceneError, match="has ended"):
         views.answer(next_of(next_of(request)))
 
 

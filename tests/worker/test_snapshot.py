@@ -27,6 +27,7 @@ from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.run import Run
 from intrasplat.train.scoring import HeldOutScore
 from intrasplat.view.render import render_frame
+from lab.evaluate.variants import register_variants
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf
 from tests.intrasplat.phantoms import bits, phantom_clip, prepared, view
 from tests.intrasplat.scenes import random_scene
@@ -72,6 +73,7 @@ def watching(snapshots: Snapshots, store: Store) -> Iterator[list[bytes]]:
 
 @pytest.mark.parametrize("preset", ["fast", "paper", "hexplane"])
 def test_a_watched_run_comes_to_the_bits_of_an_unwatched_one(preset: str, tmp_path: Path) -> None:
+    register_variants()
     clip = phantom_clip()
     alone, _ = prepared(clip, preset, iterations=ITERATIONS)
     trained_with(alone, lambda: snapshot_of(alone), TrainingHooks())

@@ -33,11 +33,12 @@ from intrasplat.splat.cpu.rasterizer import Rasterizer
 from intrasplat.splat.deformation import GaussianFdm
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.view.camera import camera_of, pose_of
+from intrasplat.view.render import clamped_to_clip
 from tests.worker.exports import export_request, exported
 from worker import views as views_module
 from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshots
-from worker.views import COPIES, Views, shown_time
+from worker.views import COPIES, Views
 
 CLIP = Intrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 FRAMES = 10
@@ -290,8 +291,8 @@ def test_an_orbit_turns_about_the_median_depth() -> None:
 
 
 def test_time_is_clamped_to_the_last_frame() -> None:
-    assert shown_time(scene(), 0.3) == 0.3
-    assert shown_time(scene(), 1.0) == 0.9
+    assert clamped_to_clip(scene(), 0.3)[0] == 0.3
+    assert clamped_to_clip(scene(), 1.0)[0] == 0.9
 
 
 def test_one_side_given_keeps_the_aspect_and_the_field_of_view() -> None:
@@ -450,13 +451,13 @@ def test_no_picture_is_drawn_of_more_pixels_than_the_limit_and_a_view_costs_all_
     scene_id: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    drawn, place = list[int](), Rasterizer.place
+    drawn, project = list[int](), Rasterizer.project
 
     def noted(rasterizer: Rasterizer, *args: Any) -> None:
         drawn.append(rasterizer.width * rasterizer.height)
-        place(rasterizer, *args)
+        project(rasterizer, *args)
 
-    monkeypatch.setattr(Rasterizer, "place", noted)
+    monkeypatch.setattr(Rasterizer, "project", noted)
     views = Views(store)
     asked = {"camera": IntrinsicsOverride(**lens), "max_pixels": max_pixels, "layer": layer}
     view = request_of(scene_id, t=0.5).model_copy(update={**asked, "pose": pose and parse_pose(pose)})

@@ -38,7 +38,7 @@ local function set_aside(id, priority)
   ended.tenant, ended.callback, ended.attempt = left.tenant, left.callback, tonumber(left.attempt) or 0
   if not ended.tenant then return end
   redis.call('SREM', waiting_of(ended.tenant), id)
-  owe(ended)
+  add_delivery(ended)
 end
 
 -- Give the owner the job of a stream's entry; nil if the entry had no job to give. Then it is removed.

@@ -8,7 +8,7 @@ local PRIORITIES = {'high', 'standard'}
 local GROUP, CONSUMER = 'workers', 'worker'
 -- A released entry counts as idle for longer than any lease, so that anybody may claim it at once.
 local LONG_MS = 86400000
--- How many deliveries each tenant owes; the events are in tenant:<tenant>:owed, by when they are due.
+-- How many unfinished deliveries each tenant has; the events are in tenant:<tenant>:owed, by when they are due.
 local OWED = P .. 'owed-by'
 
 local function now()
@@ -80,7 +80,7 @@ local function leave(job)
   end
 end
 
--- When a delivery is due; nil: it is owed no more.
+-- When a delivery is due; nil: it is finished.
 local function set_due(tenant, event, at)
   local own = owed_of(tenant)
   if at then redis.call('ZADD', own, at, event) else redis.call('ZREM', own, event) end
@@ -89,7 +89,7 @@ local function set_due(tenant, event, at)
 end
 
 -- A job has ended: if it has a callback, the delivery is due at once.
-local function owe(job)
+local function add_delivery(job)
   if not job.callback then return end
   local is_json, fault = pcall(cjson.decode, job.error or '')
   local delivery = {event_id = event_of(job), state = job.state, ended_at_s = job.finished}
@@ -111,7 +111,7 @@ local function enter(job)
     redis.call('HINCRBY', P .. 'ended', job.state, 1)
     drop(job.priority, job.entry)
     if job.state == 'failed' then redis.call('ZADD', P .. 'dead', job.finished, job.id) end
-    owe(job)
+    add_delivery(job)
   end
 end
 

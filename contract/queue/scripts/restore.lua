@@ -16,7 +16,7 @@ end
 changes.restored, changes.entry = ARGV[7], '0-0'
 local job = {id = id}
 write(job, changes)
-if tonumber(job.finished or 0) > now() - RULES.owed_for_s then owe(job) end
+if tonumber(job.finished or 0) > now() - RULES.owed_for_s then add_delivery(job) end
 if changes.state == 'failed' then redis.call('ZADD', P .. 'dead', changes.finished or 0, id) end
 index(id, changes.tenant, ARGV[4])
 return 1

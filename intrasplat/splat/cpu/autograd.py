@@ -20,7 +20,9 @@ def _kernels(
     columns = padded(max(1, len(mean)))
     state = np.concatenate([_rows(mean, columns), _rows(quaternion, columns, 1.0), _rows(scale.log(), columns)])
     rasterizer = Rasterizer(camera.width, camera.height)
-    rasterizer.project(camera_vector(camera), state, _rows(logit, columns, -MAX_LOGIT)[0], _rows(colour, columns))
+    rasterizer.project_and_sort(
+        camera_vector(camera), state, _rows(logit, columns, -MAX_LOGIT)[0], _rows(colour, columns)
+    )
     count = len(mean)  # not mean itself, which the closure would keep
 
     def gradients(cotangents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

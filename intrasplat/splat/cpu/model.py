@@ -51,7 +51,7 @@ MAX_CACHED_SIZES = 3
 class CpuModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained on the CPU. See intrasplat/splat/model.py."""
 
-    answers_every = 1
+    steps_a_report = 1
 
     def __init__(
         self,
@@ -84,12 +84,12 @@ class CpuModel:
     def _parameters(self) -> dict[str, Floats]:
         return {"canonical": self.canonical, "opacity_logit": self.opacity_logit, "sh_rest": self.sh_rest}
 
-    def _allocate(self, moments: int = 1) -> None:
-        """Allocate the Gaussians at one time, and their gradients at so many moments per step."""
+    def _allocate(self, times: int = 1) -> None:
+        """Allocate the Gaussians at one time, and their gradients at so many times per step."""
         columns = self.canonical.shape[1]
         self.state = np.zeros((ROWS, columns), np.float32)
         self.colour = np.zeros((3, columns), np.float32)
-        self._v_state = np.zeros((moments, ROWS, columns), np.float32)
+        self._v_state = np.zeros((times, ROWS, columns), np.float32)
         self._v_rest = np.zeros(self.sh_rest.shape, np.float32)
         total = Gradients.zeros(self._v_state[0])
         self._gradients = [replace(total, state=v_state) for v_state in self._v_state]  # they differ only in the state
@@ -121,20 +121,20 @@ class CpuModel:
     def project(self, camera: NDArray[np.float64], t: float, sh_degree: int) -> None:
         """Project the Gaussians at time t onto this camera's image."""
         self.motion.deform(self.canonical, t, self.state)
-        self._project_state(camera, sh_degree, self._rasterizer(*image_size(camera)))
+        self._project_and_sort(camera, sh_degree, self._rasterizer(*image_size(camera)))
 
-    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
+    def _project_and_sort(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
         """Project the Gaussians of the state onto this camera's image."""
-        self._place_state(camera, sh_degree, rasterizer)
+        self._project_state(camera, sh_degree, rasterizer)
         rasterizer.sort()
 
-    def _place_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
-        """First half of _project_state, after which the state may be overwritten."""
+    def _project_state(self, camera: NDArray[np.float64], sh_degree: int, rasterizer: Rasterizer) -> None:
+        """First half of _project_and_sort, after which the state may be overwritten."""
         if sh_degree == 0:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
-        rasterizer.place(camera, self.state, self.opacity_logit, self.colour)
+        rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
         self.rasterizer = rasterizer
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -147,7 +147,7 @@ class CpuModel:
         size = image_size(camera)
         rasterizer = self._rasterizers.pop(size, None) or Rasterizer(*size)
         self.motion.deform(self.canonical, t, self.state)
-        self._place_state(camera, self.sh_degree, rasterizer)
+        self._project_state(camera, self.sh_degree, rasterizer)
         if values is not None:
             rasterizer.set_values(values)
         return _Projected(rasterizer, values is not None, self._cached)
@@ -179,15 +179,15 @@ class CpuModel:
         self, frames: Sequence[TrainingFrame], loss: LossSettings, rates: StepRates, iteration: int, sh_degree: int = 0
     ) -> StepSums:
         """One iteration (counted from 1) on the sum of the frames' losses; sh_degree: the harmonics in use at it."""
-        moments = [(t, list(same)) for t, same in groupby(frames, key=attrgetter("t"))]
-        if len(moments) > len(self._gradients):
-            self._allocate(len(moments))
+        times = [(t, list(same)) for t, same in groupby(frames, key=attrgetter("t"))]
+        if len(times) > len(self._gradients):
+            self._allocate(len(times))
         self._seen[:] = False
         sums = [
-            each for place, (t, same) in enumerate(moments) for each in self._backward(place, t, same, loss, sh_degree)
+            each for place, (t, same) in enumerate(times) for each in self._backward(place, t, same, loss, sh_degree)
         ]
-        self.motion.update(self._v_state[: len(moments)], [t for t, _ in moments], rates, iteration)
-        for v_state in self._v_state[1 : len(moments)]:
+        self.motion.update(self._v_state[: len(times)], [t for t, _ in times], rates, iteration)
+        for v_state in self._v_state[1 : len(times)]:
             self._v_state[0] += v_state
         self.update_canonical(self._gradients[0], rates, iteration, sh_degree)
         colour_l1, depth_l1, squared_error, holes = np.sum(sums, axis=0).tolist()
@@ -198,13 +198,13 @@ class CpuModel:
     ) -> list[NDArray[np.float64]]:
         """Compute the gradients of the losses of all frames at time t, which share one state; returns the losses' sums.
 
-        place: index of the moment in the step. All moments add to the same gradients but those of the state.
+        place: index of that time in the step. All times add to the same gradients but those of the state.
         """
         gradients, sums = self._gradients[place], []
         self.motion.deform(self.canonical, t, self.state, trains=True)
         for k, frame in enumerate(frames):
             adds, adds_state = place + k > 0, k > 0
-            self._project_state(frame.camera, sh_degree, self._rasterizer(*image_size(frame.camera)))
+            self._project_and_sort(frame.camera, sh_degree, self._rasterizer(*image_size(frame.camera)))
             self.rasterizer.loss_backward(
                 frame.target, frame.loss_settings(loss), gradients, adds=adds, adds_state=adds_state
             )

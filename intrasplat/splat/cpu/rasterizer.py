@@ -92,13 +92,15 @@ class Rasterizer:
         self._slot_info, self._entries = np.zeros((2, self.threads * slots), np.uint32)
         self._sums = np.zeros(self.threads * accumulators * bins.GRADIENT, np.float32)
 
-    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+    def project_and_sort(
+        self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats
+    ) -> None:
         """Project and list each tile's splats. camera: camera_vector; state [>= 10, N], colour [3, N]."""
-        self.place(camera, state, opacity_logit, colour)
+        self.project(camera, state, opacity_logit, colour)
         self.sort()
 
-    def place(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
-        """First half of project: compute the splats on the image."""
+    def project(self, camera: NDArray[np.float64], state: Floats, opacity_logit: Floats, colour: Floats) -> None:
+        """Compute the splats on the image; sort() follows."""
         count = state.shape[1]
         if self.splats.shape[0] != count:
             self._allocate_gaussians(count)
@@ -109,7 +111,7 @@ class Rasterizer:
         )  # fmt: skip
 
     def sort(self) -> None:
-        """Second half of project: every splat's slots and accumulators, and every tile's entries, nearest first."""
+        """After project: every splat's slots and accumulators, and every tile's entries, nearest first."""
         if not self._filled():
             self._allocate_slots(*(self._needed() * 5 // 4).tolist())
             self._filled()
@@ -205,16 +207,18 @@ class Rasterizer:
         out instead, as project_backward of project.py describes.
         """
         self.blend(LOSS, target, loss_settings, self.image)
-        return self.carry_back(out, adds=adds, adds_state=adds_state)
+        return self.project_backward(out, adds=adds, adds_state=adds_state)
 
     def cotangent_backward(self, cotangents: Floats) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [5, H, W]."""
         padded_cotangents = np.zeros((5, self.height, self.stride), np.float32)
         padded_cotangents[:, :, : self.width] = cotangents
         self.blend(COTANGENT, self._no_target, _NO_LOSS, padded_cotangents.ravel())
-        return self.carry_back()
+        return self.project_backward()
 
-    def carry_back(self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False) -> Gradients:
+    def project_backward(
+        self, out: Gradients | None = None, *, adds: bool = False, adds_state: bool = False
+    ) -> Gradients:
         """Gradients of the Gaussians' parameters from those in the accumulators, which blend has summed."""
         out = out or self.gradients
         run(

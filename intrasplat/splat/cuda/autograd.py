@@ -18,9 +18,9 @@ def _kernels(
     rasterizer = CudaRasterizer(camera.width, camera.height, mean.device)
     row = torch.from_numpy(camera_vector(camera)).to(mean.device)
     given = row[None], state, logit, colour.float().T.contiguous()[None]
-    rasterizer.project(*given)
+    rasterizer.project_and_sort(*given)
     if rasterizer.grown():
-        rasterizer.project(*given)
+        rasterizer.project_and_sort(*given)
 
     def gradients(cotangents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         found = rasterizer.cotangent_backward(cotangents[None], pose=True)

@@ -208,13 +208,13 @@ def _grid(columns: int, *beside: int) -> tuple[int, ...]:
     return (triton.cdiv(columns, BLOCK), *beside)
 
 
-def show(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
+def evaluate(rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, degree: int) -> None:
     """Write the colour seen from the cameras, with harmonics up to `degree`, at least 1."""
     frames, _, columns = state.shape
     colour_from_sh[_grid(columns, frames)](rest, state, centre, colour, columns, TERMS=(degree + 1) ** 2, BLOCK=BLOCK)
 
 
-def carry_back(
+def evaluate_backward(
     rest: Tensor, state: Tensor, centre: Tensor, colour: Tensor, v_colour: Tensor, v_state: Tensor, degree: int
 ) -> None:
     """Add dL/dmean through the directions, from dL/dcolour [F, 3, columns], to rows 0:3 of v_state [F, 10, columns]."""
@@ -235,7 +235,7 @@ def update(
     control: Mapping[str, Tensor],
     degree: int,
 ) -> None:
-    """One step of Adam on the harmonics up to `degree`, after carry_back. control: adam_fields (control.py)."""
+    """One step of Adam on the harmonics up to `degree`, after evaluate_backward. control: adam_fields (control.py)."""
     frames, _, columns = state.shape
     terms = (degree + 1) ** 2
     update_rest[_grid(columns, terms - 1)](

@@ -66,7 +66,7 @@ MAX_CACHED_SIZES = 3
 class CudaModel:
     """Canonical Gaussians, their deformation and Adam's moments, trained on the device (intrasplat/splat/model.py)."""
 
-    answers_every = CHECK_EVERY
+    steps_a_report = CHECK_EVERY
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class CudaModel:
     def _launch(self, sh_degree: int) -> None:
         """Launch the kernels of a step, in order."""
         view = self._training
-        self._project(view, sh_degree)
+        self._project_and_sort(view, sh_degree)
         control, rasterizer = view.control.values, view.rasterizer
         store = self._store
         gradients = rasterizer.loss_backward(
@@ -162,7 +162,7 @@ class CudaModel:
         )
         if sh_degree > 0:
             seen, shown = (view.state, control["centre"], view.colour), (gradients.colour, gradients.state)
-            harmonics.carry_back(self._sh_rest, *seen, *shown, sh_degree)
+            harmonics.evaluate_backward(self._sh_rest, *seen, *shown, sh_degree)
             harmonics.update(
                 self._sh_rest, self._rest_moments, *seen, gradients.colour, rasterizer.ok, control, sh_degree
             )
@@ -173,13 +173,13 @@ class CudaModel:
         self.motion.update(trained, control)
         self._gradients = gradients
 
-    def _project(self, view: FrameBuffers, sh_degree: int) -> None:
+    def _project_and_sort(self, view: FrameBuffers, sh_degree: int) -> None:
         """Project the Gaussians, at the times and with the cameras of the view's control block."""
         control = view.control.values
         self.motion.deform(self._values, control, view.state, view.colour)
         if sh_degree > 0:
-            harmonics.show(self._sh_rest, view.state, control["centre"], view.colour, sh_degree)
-        view.rasterizer.project(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
+            harmonics.evaluate(self._sh_rest, view.state, control["centre"], view.colour, sh_degree)
+        view.rasterizer.project_and_sort(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
 
     def _synchronize(self) -> None:
         """Wait for the steps sent, and send those again that exceeded the capacity."""
@@ -282,7 +282,7 @@ class CudaModel:
 
     def _draw(self, view: FrameBuffers, with_values: bool) -> None:
         """Launch the kernels of a picture."""
-        self._project(view, self.sh_degree)
+        self._project_and_sort(view, self.sh_degree)
         view.images[with_values] = view.rasterizer.render(view.values if with_values else None)
 
     def render(self, camera: NDArray[np.float64], t: float, values: Floats | None = None) -> Floats:
@@ -308,7 +308,7 @@ class CudaModel:
         view = self._steer(camera, [t])
         wanted = torch.from_numpy(np.ascontiguousarray(cotangents, np.float32)).to(self.device)[None]
         while True:
-            self._project(view, 0)
+            self._project_and_sort(view, 0)
             found = view.rasterizer.cotangent_backward(wanted)
             if self._fitted(view):
                 break

@@ -1,7 +1,7 @@
 """The buffers of one image size and number of frames, and the calls of project, bin, blend and their gradients.
 
     rasterizer = CudaRasterizer(width, height, device, frames)
-    rasterizer.project(camera, state, opacity_logit, colour)
+    rasterizer.project_and_sort(camera, state, opacity_logit, colour)
     image = rasterizer.render()
     gradients = rasterizer.loss_backward(rgb, weight, inverse_depth, loss_settings, frame)
 
@@ -165,7 +165,7 @@ class CudaRasterizer:
         self.reset()
         return True
 
-    def project(self, camera: Tensor, state: Tensor, opacity_logit: Tensor, colour: Tensor) -> None:
+    def project_and_sort(self, camera: Tensor, state: Tensor, opacity_logit: Tensor, colour: Tensor) -> None:
         """Project onto every frame's camera, and list the splats of each tile, nearest first.
 
         camera: float64 [F, CAMERA], rows as camera_vector gives; state [F, 10 or more, N]; opacity_logit [N];
@@ -257,7 +257,7 @@ class CudaRasterizer:
         _check(loss_settings, "loss_settings", (self.frames, 5))
         _check(frame, "frame", (self.frames,), torch.int32)
         self._blend(LOSS, self._nothing, False, (rgb, weight, inverse_depth, loss_settings, frame))
-        return self._carry_back(pose)
+        return self._project_backward(pose)
 
     def cotangent_backward(self, cotangents: Tensor, *, pose: bool = False) -> Gradients:
         """Gradients of sum(cotangents * image), cotangents [F, 5, H, W].
@@ -267,9 +267,9 @@ class CudaRasterizer:
         """
         _check(cotangents, "cotangents", (self.frames, 5, self.height, self.width))
         self._blend(COTANGENT, cotangents, False)
-        return self._carry_back(pose)
+        return self._project_backward(pose)
 
-    def _carry_back(self, pose: bool) -> Gradients:
+    def _project_backward(self, pose: bool) -> Gradients:
         """Gradients of the Gaussians' parameters from those of the slots, which blend has written."""
         out, splats = self.gradients, self.frames * self.gaussians
         if splats == 0:

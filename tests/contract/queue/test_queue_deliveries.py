@@ -10,7 +10,7 @@ import pytest
 import redis
 
 from contract.queue import redis_deliveries
-from contract.queue.deliveries import Loan
+from contract.queue.deliveries import ClaimedDelivery
 from contract.queue.interface import MAX_ATTEMPTS, Claim, Queue
 from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.wire.job import JobRecord, JobState
@@ -22,22 +22,22 @@ CALLBACK = "https://his.example/done"
 TOKENS = (f"{number:032x}" for number in count())
 
 
-def lent(queue: Queue, *passed: str) -> Loan | None:
-    return queue.lend_delivery(next(TOKENS), passed)
+def claim_due(queue: Queue, *skipped: str) -> ClaimedDelivery | None:
+    return queue.claim_delivery(next(TOKENS), skipped)
 
 
-def tried(queue: Queue, loan: Loan, failure: TryFailure | None, wait_s: float | None) -> bool:
+def tried(queue: Queue, claim: ClaimedDelivery, failure: TryFailure | None, wait_s: float | None) -> bool:
     status = (
         DeliveryStatus.OWED if wait_s is not None else DeliveryStatus.FAILED if failure else DeliveryStatus.DELIVERED
     )
-    tries = (*loan.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
-    return queue.note_try(loan, loan.delivery.model_copy(update={"tries": tries, "status": status}), wait_s)
+    tries = (*claim.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
+    return queue.record_try(claim, claim.delivery.model_copy(update={"tries": tries, "status": status}), wait_s)
 
 
 @pytest.fixture
-def lending_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def leases_of_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (memory_deliveries, redis_deliveries):
-        monkeypatch.setattr(module, "LOAN_S", 0.001)
+        monkeypatch.setattr(module, "DELIVERY_LEASE_S", 0.001)
 
 
 def die(queue: Queue, claim: Claim) -> None:
@@ -65,24 +65,24 @@ def test_a_job_with_a_callback_owes_a_webhook_as_soon_as_it_has_ended_and_not_be
     submitted = queue.submit(job(callback_url=CALLBACK))
     record, claim = claimed(queue)
     assert record.callback_url == submitted.callback_url == CALLBACK
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     assert queue.deliveries(record.job_id) == []
     act(queue, claim)
-    loan = lent(queue)
-    assert loan is not None
-    assert (loan.url, loan.tenant, loan.delivery.job_id) == (CALLBACK, "ward-1", record.job_id)
-    assert (loan.delivery.state, loan.delivery.error_code) == (state, code)
-    assert lent(queue) is None
+    due = claim_due(queue)
+    assert due is not None
+    assert (due.url, due.tenant, due.delivery.job_id) == (CALLBACK, "ward-1", record.job_id)
+    assert (due.delivery.state, due.delivery.error_code) == (state, code)
+    assert claim_due(queue) is None
 
 
 def test_a_queued_job_that_is_cancelled_owes_one_and_a_job_without_a_callback_owes_none(queue: Queue) -> None:
     first, second = queue.submit(job(callback_url=CALLBACK)), queue.submit(job())
     for record in (second, first):
         queue.cancel(record.job_id)
-    loan = lent(queue)
-    assert loan is not None
-    assert loan.delivery.job_id == first.job_id
-    assert lent(queue) is None
+    claim = claim_due(queue)
+    assert claim is not None
+    assert claim.delivery.job_id == first.job_id
+    assert claim_due(queue) is None
     assert queue.deliveries(second.job_id) == []
 
 
@@ -93,12 +93,12 @@ def test_a_job_that_is_set_aside_because_its_record_is_damaged_owes_a_webhook(
     job_id = served.submit(job(callback_url=CALLBACK)).job_id
     client.hset(f"{PREFIX}job:{job_id}", mapping=damage)
     assert served.claim("worker-1", 0.0) is None
-    loan = lent(served)
-    assert loan is not None
-    assert (loan.url, loan.tenant, loan.delivery.job_id) == (CALLBACK, "ward-1", job_id)
-    assert (loan.delivery.state, loan.delivery.error_code) == (JobState.FAILED, "record_unreadable")
-    assert loan.delivery.ended_at_s == pytest.approx(time.time(), abs=60.0)
-    assert tried(served, loan, None, None)
+    claim = claim_due(served)
+    assert claim is not None
+    assert (claim.url, claim.tenant, claim.delivery.job_id) == (CALLBACK, "ward-1", job_id)
+    assert (claim.delivery.state, claim.delivery.error_code) == (JobState.FAILED, "record_unreadable")
+    assert claim.delivery.ended_at_s == pytest.approx(time.time(), abs=60.0)
+    assert tried(served, claim, None, None)
     assert [each.status for each in served.deliveries(job_id)] == [DeliveryStatus.DELIVERED]
     assert served.forget(job_id)
 
@@ -112,17 +112,17 @@ def test_deliveries_that_cannot_be_read_are_given_up_at_once_and_logged_once_eac
         served.cancel(job_id)
     for job_id in damaged:
         client.hset(f"{PREFIX}deliveries:{job_id}", f"{job_id}.0.cancelled", '{"of": "a later version"}')
-    loan = lent(served)
-    assert loan is not None
-    assert loan.delivery.job_id == whole
+    claim = claim_due(served)
+    assert claim is not None
+    assert claim.delivery.job_id == whole
     assert [each.__dict__["job_id"] for each in caplog.records] == damaged
-    assert lent(served) is None
+    assert claim_due(served) is None
     assert served.figures().webhooks == {DeliveryStatus.OWED: 1, DeliveryStatus.FAILED: 3}
     assert served.deliveries(damaged[0]) == []
     assert len(caplog.records) == len(damaged)
 
 
-def test_what_earlier_workers_owe_in_one_set_of_all_tenants_is_lent(served: RedisQueue, client: redis.Redis) -> None:
+def test_what_earlier_workers_owe_in_one_set_of_all_tenants_is_claimed(served: RedisQueue, client: redis.Redis) -> None:
     owed = [served.submit(job(callback_url=CALLBACK, tenant=each)).job_id for each in ("a", "b")]
     for job_id, tenant in zip(owed, "ab", strict=True):
         served.cancel(job_id)
@@ -131,51 +131,54 @@ def test_what_earlier_workers_owe_in_one_set_of_all_tenants_is_lent(served: Redi
         client.hdel(f"{PREFIX}owed-by", tenant)
     client.zadd(f"{PREFIX}owed", {"gone.1.done": 1.0})
     assert served.figures().webhooks == {DeliveryStatus.OWED: 0}
-    loans = [loan for loan in (lent(served), lent(served)) if loan]
-    assert [(loan.delivery.job_id, loan.tenant) for loan in loans] == list(zip(owed, "ab", strict=True))
-    assert all(tried(served, loan, None, None) for loan in loans)
+    claims = [claim for claim in (claim_due(served), claim_due(served)) if claim]
+    assert [(claim.delivery.job_id, claim.tenant) for claim in claims] == list(zip(owed, "ab", strict=True))
+    assert all(tried(served, claim, None, None) for claim in claims)
     assert not client.exists(f"{PREFIX}owed", f"{PREFIX}owed-by")
 
 
-def test_a_failed_delivery_is_lent_again_when_it_is_due_and_a_delivered_one_never(queue: Queue) -> None:
+def test_a_failed_delivery_is_claimed_again_when_it_is_due_and_a_delivered_one_never(queue: Queue) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
-    first = lent(queue)
+    first = claim_due(queue)
     assert first is not None
     assert tried(queue, first, TryFailure.TIMEOUT, 0.0)
-    second = lent(queue)
+    second = claim_due(queue)
     assert second is not None
     assert second.delivery.event_id == first.delivery.event_id
     assert [each.failure for each in second.delivery.tries] == [TryFailure.TIMEOUT]
     assert tried(queue, second, TryFailure.STATUS, 60.0)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     (delivery,) = queue.deliveries(job_id)
     assert len(delivery.tries) == 2
     assert delivery.next_try_at_s is not None
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 1}
 
 
-def test_a_delivery_that_is_lent_has_no_next_try_until_the_loan_ends(queue: Queue) -> None:
+def test_a_delivery_that_is_claimed_has_no_next_try_until_the_claim_ends(queue: Queue) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
     assert queue.deliveries(job_id)[0].next_try_at_s is not None
-    loan = lent(queue)
-    assert loan is not None
+    claim = claim_due(queue)
+    assert claim is not None
     assert [(each.status, each.next_try_at_s) for each in queue.deliveries(job_id)] == [(DeliveryStatus.OWED, None)]
-    assert tried(queue, loan, TryFailure.TIMEOUT, 60.0)
+    assert tried(queue, claim, TryFailure.TIMEOUT, 60.0)
     assert queue.deliveries(job_id)[0].next_try_at_s is not None
 
 
-def test_tenants_that_are_passed_wait_and_the_others_deliveries_are_lent(queue: Queue) -> None:
+def test_tenants_that_are_skipped_wait_and_the_others_deliveries_are_claimed(queue: Queue) -> None:
     first, second, third = (queue.submit(job(callback_url=CALLBACK, tenant=each)) for each in ("a", "a", "b"))
     for record in (first, second, third):
         queue.cancel(record.job_id)
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 3}
-    loan = lent(queue, "a", "c")
-    assert loan is not None
-    assert loan.delivery.job_id == third.job_id
-    assert lent(queue, "a") is None
-    assert [loan.delivery.job_id for loan in (lent(queue), lent(queue, "b")) if loan] == [first.job_id, second.job_id]
+    claim = claim_due(queue, "a", "c")
+    assert claim is not None
+    assert claim.delivery.job_id == third.job_id
+    assert claim_due(queue, "a") is None
+    assert [claim.delivery.job_id for claim in (claim_due(queue), claim_due(queue, "b")) if claim] == [
+        first.job_id,
+        second.job_id,
+    ]
     assert queue.forget(first.job_id)
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 2}
 
@@ -184,23 +187,23 @@ def test_a_delivered_and_a_given_up_webhook_are_counted_and_stay_in_the_log(queu
     for failure in (None, TryFailure.STATUS):
         job_id = queue.submit(job(callback_url=CALLBACK)).job_id
         queue.cancel(job_id)
-        loan = lent(queue)
-        assert loan is not None
-        assert tried(queue, loan, failure, None)
+        claim = claim_due(queue)
+        assert claim is not None
+        assert tried(queue, claim, failure, None)
         (delivery,) = queue.deliveries(job_id)
         assert delivery.next_try_at_s is None
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     counted = {DeliveryStatus.OWED: 0, DeliveryStatus.DELIVERED: 1, DeliveryStatus.FAILED: 1}
     assert queue.figures().webhooks == counted
 
 
-@pytest.mark.usefixtures("lending_for_no_time")
-def test_a_loan_that_has_run_out_is_lent_to_another_and_what_the_first_notes_does_not_count(queue: Queue) -> None:
+@pytest.mark.usefixtures("leases_of_no_time")
+def test_a_claim_that_has_expired_goes_to_another_and_what_the_first_notes_does_not_count(queue: Queue) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
-    first = second = lent(queue)
+    first = second = claim_due(queue)
     while second is None or second == first:
-        second = lent(queue)
+        second = claim_due(queue)
     assert first is not None
     assert first.delivery == second.delivery
     assert not tried(queue, first, TryFailure.TIMEOUT, 60.0)
@@ -213,7 +216,7 @@ def test_a_job_that_fails_is_retried_and_is_done_owes_two_webhooks(queue: Queue)
     queue.fail(claimed(queue)[1], ERROR)
     queue.retry(job_id)
     queue.finish(claimed(queue)[1])
-    states = [loan.delivery.state for loan in (lent(queue), lent(queue)) if loan]
+    states = [claim.delivery.state for claim in (claim_due(queue), claim_due(queue)) if claim]
     assert states == [JobState.FAILED, JobState.DONE]
     assert [each.state for each in queue.deliveries(job_id)] == states
 
@@ -221,11 +224,11 @@ def test_a_job_that_fails_is_retried_and_is_done_owes_two_webhooks(queue: Queue)
 def test_a_job_that_is_forgotten_owes_nothing(queue: Queue) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
-    loan = lent(queue)
-    assert loan is not None
+    claim = claim_due(queue)
+    assert claim is not None
     queue.forget(job_id)
-    assert not tried(queue, loan, TryFailure.TIMEOUT, 0.0)
-    assert lent(queue) is None
+    assert not tried(queue, claim, TryFailure.TIMEOUT, 0.0)
+    assert claim_due(queue) is None
     assert queue.deliveries(job_id) == []
     assert queue.figures().webhooks == {DeliveryStatus.OWED: 0}
 
@@ -236,20 +239,20 @@ def test_a_job_that_the_queue_had_lost_owes_its_webhook_again_unless_it_ended_lo
     record = job(callback_url=CALLBACK).model_copy(update=ended)
     assert queue.restore(record)
     assert queue.restore(job(callback_url=CALLBACK).model_copy(update=ended | {"finished_at_s": 2000.0}))
-    loan = lent(queue)
-    assert loan is not None
-    assert loan.delivery.event_id == f"{record.job_id}.2.done"
-    assert loan.delivery.ended_at_s == ended_at_s
-    assert lent(queue) is None
+    claim = claim_due(queue)
+    assert claim is not None
+    assert claim.delivery.event_id == f"{record.job_id}.2.done"
+    assert claim.delivery.ended_at_s == ended_at_s
+    assert claim_due(queue) is None
 
 
 def given_up(queue: Queue) -> JobRecord:
     """A job whose webhook was given up after one try."""
     record = queue.submit(job(callback_url=CALLBACK))
     queue.cancel(record.job_id)
-    loan = lent(queue)
-    assert loan is not None
-    assert tried(queue, loan, TryFailure.STATUS, None)
+    claim = claim_due(queue)
+    assert claim is not None
+    assert tried(queue, claim, TryFailure.STATUS, None)
     return known(queue, record.job_id)
 
 
@@ -259,7 +262,7 @@ def test_a_webhook_that_was_given_up_or_delivered_is_due_once_more_under_its_id_
 ) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
-    first = lent(queue)
+    first = claim_due(queue)
     assert first is not None
     assert tried(queue, first, failure, None)
     for _ in range(2):
@@ -268,28 +271,30 @@ def test_a_webhook_that_was_given_up_or_delivered_is_due_once_more_under_its_id_
     assert (delivery.status, len(delivery.tries), delivery.forgiven_tries) == (DeliveryStatus.OWED, 1, 1)
     assert delivery.next_try_at_s is not None
     assert queue.figures().webhooks[DeliveryStatus.OWED] == 1
-    second = lent(queue)
+    second = claim_due(queue)
     assert second is not None
     assert second.delivery.event_id == first.delivery.event_id
     assert tried(queue, second, None, None)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     assert [len(each.tries) for each in queue.deliveries(job_id)] == [2]
 
 
-def test_a_webhook_that_waits_for_its_next_try_is_due_at_once_and_one_that_is_lent_stays_lent(queue: Queue) -> None:
+def test_a_webhook_that_waits_for_its_next_try_is_due_at_once_and_one_that_is_claimed_stays_claimed(
+    queue: Queue,
+) -> None:
     job_id = queue.submit(job(callback_url=CALLBACK)).job_id
     queue.cancel(job_id)
-    first = lent(queue)
+    first = claim_due(queue)
     assert first is not None
     queue.send_again(known(queue, job_id))
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     assert tried(queue, first, TryFailure.TIMEOUT, 3600.0)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     queue.send_again(known(queue, job_id))
-    second = lent(queue)
+    second = claim_due(queue)
     assert second is not None
     assert (len(second.delivery.tries), second.delivery.forgiven_tries) == (1, 1)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
 
 
 def test_only_the_last_end_is_sent_again_and_none_of_a_job_that_went_on_or_has_gone(queue: Queue) -> None:
@@ -297,17 +302,17 @@ def test_only_the_last_end_is_sent_again_and_none_of_a_job_that_went_on_or_has_g
     queue.fail(claimed(queue)[1], ERROR)
     failed = known(queue, job_id)
     queue.retry(job_id)
-    while loan := lent(queue):
-        assert tried(queue, loan, None, None)
+    while claim := claim_due(queue):
+        assert tried(queue, claim, None, None)
     queue.send_again(failed)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     queue.finish(claimed(queue)[1])
-    while loan := lent(queue):
-        assert tried(queue, loan, None, None)
+    while claim := claim_due(queue):
+        assert tried(queue, claim, None, None)
     queue.send_again(failed)
-    assert lent(queue) is None
+    assert claim_due(queue) is None
     queue.send_again(known(queue, job_id))
-    again = lent(queue)
+    again = claim_due(queue)
     assert again is not None
     assert again.delivery.state is JobState.DONE
     done = known(queue, job_id)
@@ -322,9 +327,9 @@ def test_a_webhook_that_a_lost_queue_no_longer_knows_is_sent_again(queue: Queue)
     assert queue.restore(record)
     assert queue.deliveries(record.job_id) == []
     queue.send_again(known(queue, record.job_id))
-    loan = lent(queue)
-    assert loan is not None
-    assert (loan.delivery.event_id, loan.delivery.ended_at_s) == (f"{record.job_id}.1.done", 2000.0)
+    claim = claim_due(queue)
+    assert claim is not None
+    assert (claim.delivery.event_id, claim.delivery.ended_at_s) == (f"{record.job_id}.1.done", 2000.0)
 
 
 def test_a_webhook_that_could_not_be_read_is_written_anew_and_sent_again(
@@ -333,9 +338,9 @@ def test_a_webhook_that_could_not_be_read_is_written_anew_and_sent_again(
     record = given_up(served)
     client.hset(f"{PREFIX}deliveries:{record.job_id}", f"{record.job_id}.0.cancelled", '{"of": "a later version"}')
     served.send_again(record)
-    loan = lent(served)
-    assert loan is not None
-    assert (loan.delivery.job_id, loan.delivery.tries) == (record.job_id, ())
+    claim = claim_due(served)
+    assert claim is not None
+    assert (claim.delivery.job_id, claim.delivery.tries) == (record.job_id, ())
 
 
 def test_a_late_repetition_does_not_send_again_what_was_tried_since(
@@ -350,10 +355,10 @@ def test_a_late_repetition_does_not_send_again_what_was_tried_since(
     monkeypatch.setattr(served._scripts, "run", noting)
     served.send_again(record)
     (repetition,) = calls
-    loan = lent(served)
-    assert loan is not None
+    claim = claim_due(served)
+    assert claim is not None
     run(*repetition)
-    assert tried(served, loan, None, None)
+    assert tried(served, claim, None, None)
     run(*repetition)
-    assert lent(served) is None
+    assert claim_due(served) is None
     assert [each.status for each in served.deliveries(record.job_id)] == [DeliveryStatus.DELIVERED]

@@ -75,39 +75,39 @@ def _restore(queue: Queue) -> tuple[Act, str]:
     return lambda lossy: lossy.restore(record), record.job_id
 
 
-def _lend(queue: Queue) -> tuple[Act, str]:
-    """Of two deliveries that are due, a repeated call is lent one."""
+def _claim_delivery(queue: Queue) -> tuple[Act, str]:
+    """Of two deliveries that are due, a repeated call claims one."""
     records = [queue.submit(job(callback_url="https://his.example/done")) for _ in range(2)]
     for record in records:
         queue.cancel(record.job_id)
 
-    def lend(lossy: Queue) -> object:
-        first, second = lossy.lend_delivery("a" * 32), queue.lend_delivery("b" * 32)
-        return sorted(loan.delivery.job_id for loan in (first, second) if loan) == sorted(r.job_id for r in records)
+    def claim(lossy: Queue) -> object:
+        first, second = lossy.claim_delivery("a" * 32), queue.claim_delivery("b" * 32)
+        return sorted(claim.delivery.job_id for claim in (first, second) if claim) == sorted(r.job_id for r in records)
 
-    return lend, records[0].job_id
+    return claim, records[0].job_id
 
 
 def _note(queue: Queue) -> tuple[Act, str]:
     record = queue.submit(job(callback_url="https://his.example/done"))
     queue.cancel(record.job_id)
-    loan = queue.lend_delivery("a" * 32)
-    assert loan is not None
-    noted = loan.delivery.model_copy(update={"status": DeliveryStatus.DELIVERED, "tries": (DeliveryTry(at_s=1.0),)})
-    return lambda lossy: lossy.note_try(loan, noted, None), record.job_id
+    claim = queue.claim_delivery("a" * 32)
+    assert claim is not None
+    noted = claim.delivery.model_copy(update={"status": DeliveryStatus.DELIVERED, "tries": (DeliveryTry(at_s=1.0),)})
+    return lambda lossy: lossy.record_try(claim, noted, None), record.job_id
 
 
 def _again(queue: Queue) -> tuple[Act, str]:
-    """A repeated call makes one delivery due, which is lent once."""
+    """A repeated call makes one delivery due, which is claimed once."""
     record = queue.submit(job(callback_url="https://his.example/done"))
     queue.cancel(record.job_id)
-    loan = queue.lend_delivery("a" * 32)
-    assert loan is not None
-    queue.note_try(loan, loan.delivery.model_copy(update={"status": DeliveryStatus.FAILED}), None)
+    claim = queue.claim_delivery("a" * 32)
+    assert claim is not None
+    queue.record_try(claim, claim.delivery.model_copy(update={"status": DeliveryStatus.FAILED}), None)
 
     def again(lossy: Queue) -> object:
         lossy.send_again(known(queue, record.job_id))
-        return [queue.lend_delivery(token * 32) is not None for token in "bc"]
+        return [queue.claim_delivery(token * 32) is not None for token in "bc"]
 
     return again, record.job_id
 
@@ -133,8 +133,8 @@ LOST_ANSWERS: dict[str, tuple[Lost, object, int]] = {
     "retry": (_retry, JobRecord, 4),
     "relabel": (_relabel, JobRecord, 2),
     "restore": (_restore, True, 1),
-    "lend": (_lend, True, 2),
-    "note": (_note, True, 2),
+    "claim_delivery": (_claim_delivery, True, 2),
+    "record_try": (_note, True, 2),
     "again": (_again, [True, False], 2),
     "forget": (_forget, True, 0),
 }

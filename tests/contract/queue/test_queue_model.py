@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from contract.queue.deliveries import Loan
+from contract.queue.deliveries import ClaimedDelivery
 from contract.queue.interface import Admission, Claim, Event, QueueFullError, place_of
 from contract.queue.redis_queue import HELD, PREFIX, QUEUED, RedisQueue
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, JobRecord, JobState
@@ -40,7 +40,7 @@ def timeless(answer: object) -> object:
     if isinstance(answer, Delivery):
         is_due = None if answer.next_try_at_s is None else 1.0
         return answer.model_copy(update={"ended_at_s": 1.0, "next_try_at_s": is_due})
-    if isinstance(answer, Loan):
+    if isinstance(answer, ClaimedDelivery):
         return timeless(answer.delivery), answer.url, answer.tenant
     if isinstance(answer, Event):
         return timeless(answer.record)
@@ -145,15 +145,15 @@ class BothQueues(RuleBasedStateMachine):
 
     @rule(failure=st.sampled_from([None, TryFailure.TIMEOUT]), wait_s=st.sampled_from([0.0, 60.0]))
     def deliver(self, failure: TryFailure | None, wait_s: float) -> None:
-        loans = {queue: queue.lend_delivery(uuid.uuid4().hex) for queue in (self.memory, self.server)}
-        lent = [timeless(loan) for loan in loans.values()]
-        assert lent[0] == lent[1]
-        for queue, loan in loans.items():
-            if loan is not None:
-                tries = (*loan.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
+        claims = {queue: queue.claim_delivery(uuid.uuid4().hex) for queue in (self.memory, self.server)}
+        same = [timeless(claim) for claim in claims.values()]
+        assert same[0] == same[1]
+        for queue, claim in claims.items():
+            if claim is not None:
+                tries = (*claim.delivery.tries, DeliveryTry(at_s=1.0, failure=failure))
                 status = DeliveryStatus.OWED if failure else DeliveryStatus.DELIVERED
-                noted = loan.delivery.model_copy(update={"tries": tries, "status": status})
-                assert queue.note_try(loan, noted, wait_s if failure else None)
+                noted = claim.delivery.model_copy(update={"tries": tries, "status": status})
+                assert queue.record_try(claim, noted, wait_s if failure else None)
 
     @rule(pick=PICK)
     def send_again(self, pick: int) -> None:

@@ -73,7 +73,9 @@ def resources(binary: bytes) -> dict[str, int]:
 def projected(count: int, width: int, height: int, frames: int) -> CudaRasterizer:
     rasterizer = CudaRasterizer(width, height, "cpu", frames=frames)
     camera = torch.zeros(frames, CAMERA, dtype=torch.float64)
-    rasterizer.project(camera, torch.zeros(frames, ROWS, count), torch.zeros(count), torch.zeros(frames, 3, count))
+    rasterizer.project_and_sort(
+        camera, torch.zeros(frames, ROWS, count), torch.zeros(count), torch.zeros(frames, 3, count)
+    )
     return rasterizer
 
 

@@ -132,7 +132,7 @@ def project_with(rasterizer: Rasterizer, scene: SplatScene) -> None:
 
     state = np.concatenate([rows(scene.mean, 0.0), rows(scene.quaternion, 1.0), rows(scene.scale.log(), 0.0)])
     logit = rows(torch.logit(scene.opacity)[:, None], -30.0)[0]
-    rasterizer.project(camera_vector(scene.camera), state, logit, rows(scene.colour, 0.0))
+    rasterizer.project_and_sort(camera_vector(scene.camera), state, logit, rows(scene.colour, 0.0))
 
 
 def outcome(rasterizer: Rasterizer, scene: SplatScene, frame: RawFrame) -> list[NDArray[np.float32]]:

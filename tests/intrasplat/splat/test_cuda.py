@@ -85,7 +85,7 @@ def loss_of(rasterizer: CudaRasterizer, frames: list[RawFrame], settings: LossSe
 
 def outcome(view: SceneFrames, rasterizer: CudaRasterizer, frames: list[RawFrame]) -> list[Tensor]:
     """Copies of everything a render and a loss leave behind for the caller."""
-    rasterizer.project(*view.arguments())
+    rasterizer.project_and_sort(*view.arguments())
     image = rasterizer.render().clone()
     gradients = loss_of(rasterizer, frames, NORMALISED, list(range(len(frames))))
     parts = [getattr(gradients, field.name) for field in dataclasses.fields(gradients)]
@@ -112,7 +112,7 @@ def test_what_the_buffers_held_before_changes_nothing(options: dict[str, float],
     frames = [random_frame(view.scenes[0].camera, np.zeros((HEIGHT, WIDTH), bool))]
     expected = outcome(view, view.rasterizer(), frames)
     used = view.rasterizer()
-    used.project(*view.arguments())
+    used.project_and_sort(*view.arguments())
     poison(used)
     assert_same_bits(outcome(view, used, frames), expected)
 
@@ -121,7 +121,7 @@ def test_a_rasterizer_that_saw_other_scenes_gives_the_same_bits(memory: str) -> 
     view, other = SceneFrames([scene_of()], memory), SceneFrames([scene_of(150, seed=31, pixels=3.0)], memory)
     frames = [random_frame(view.scenes[0].camera, np.zeros((HEIGHT, WIDTH), bool))]
     used = other.rasterizer()
-    used.project(*other.arguments())
+    used.project_and_sort(*other.arguments())
     used.grown()
     assert_same_bits(outcome(view, used, frames), outcome(view, view.rasterizer(), frames))
 
@@ -135,12 +135,12 @@ def test_several_frames_at_once_are_each_what_it_is_alone(memory: str) -> None:
     frames = [random_frame(first.camera, np.zeros((HEIGHT, WIDTH), bool)) for _ in scenes]
     frames[1] = dataclasses.replace(frames[1], tissue=~frames[1].tissue)
     together = SceneFrames(scenes, memory).rasterizer()
-    together.project(*SceneFrames(scenes, memory).arguments())
+    together.project_and_sort(*SceneFrames(scenes, memory).arguments())
     image = together.render().clone()
     got = loss_of(together, frames, NORMALISED, [1, 0])
     for f, scene in enumerate(scenes):
         alone = SceneFrames([scene], memory).rasterizer()
-        alone.project(*SceneFrames([scene], memory).arguments())
+        alone.project_and_sort(*SceneFrames([scene], memory).arguments())
         assert torch.equal(alone.render()[0], image[f])
         wanted = loss_of(alone, [frames[f]], NORMALISED, [0])
         for name in ("state", "opacity_logit", "colour", "mean2d_norm"):
@@ -155,7 +155,7 @@ def test_the_built_in_loss_has_the_gradients_of_the_loss(settings: LossSettings,
     scene = scene_of(90, seed=34)
     frame = random_frame(scene.camera, pixels_near_a_cut(scene))
     rasterizer = SceneFrames([scene], memory).rasterizer()
-    rasterizer.project(*SceneFrames([scene], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene], memory).arguments())
     got = loss_of(rasterizer, [frame], settings, [0])
 
     live = scene.to(torch.float64).differentiable()
@@ -187,7 +187,7 @@ def test_a_depth_of_half_precision_is_read_as_such(memory: str) -> None:
         torch.zeros(1, dtype=torch.int32, device=memory),
     )
     rasterizer = SceneFrames([scene], memory).rasterizer()
-    rasterizer.project(*SceneFrames([scene], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene], memory).arguments())
     wanted = rasterizer.loss_backward(rgb, weight, halved.float(), *rest).state.clone()
     assert torch.equal(rasterizer.loss_backward(rgb, weight, halved, *rest).state, wanted)
 
@@ -197,11 +197,11 @@ def test_what_the_kernels_would_misread_is_refused(memory: str) -> None:
     camera, state, logit, colour = view.arguments()
     rasterizer = view.rasterizer()
     with pytest.raises(ValueError, match=r"camera is contiguous torch.float32 \[1, 26\], not .* torch.float64"):
-        rasterizer.project(camera.float(), state, logit, colour)
+        rasterizer.project_and_sort(camera.float(), state, logit, colour)
     with pytest.raises(ValueError, match=r"state is strided"):
-        rasterizer.project(camera, state.transpose(1, 2).contiguous().transpose(1, 2), logit, colour)
+        rasterizer.project_and_sort(camera, state.transpose(1, 2).contiguous().transpose(1, 2), logit, colour)
     with pytest.raises(ValueError, match=r"colour is contiguous torch.float32 \[1, 4, 40\], not .* \[1, 3, 40\]"):
-        rasterizer.project(camera, state, logit, state[:, :4].contiguous())
+        rasterizer.project_and_sort(camera, state, logit, state[:, :4].contiguous())
     with pytest.raises(ValueError, match="cotangents is"):
         rasterizer.cotangent_backward(rasterizer.render().double())
 
@@ -211,10 +211,10 @@ def test_a_value_is_blended_as_colour_is_and_leaves_the_rest_as_it_was(memory: s
     values = torch.rand(len(scene.mean), generator=torch.Generator().manual_seed(0))
     grey = dataclasses.replace(scene, colour=values[:, None].repeat(1, 3))
     rasterizer = SceneFrames([scene], memory).rasterizer()
-    rasterizer.project(*SceneFrames([scene], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene], memory).arguments())
     without = rasterizer.render().clone()
     with_values = rasterizer.render(values.to(memory)).clone()
-    rasterizer.project(*SceneFrames([grey], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([grey], memory).arguments())
     assert torch.equal(with_values[:, :5], without)
     assert_close(with_values[:, 5], rasterizer.render()[:, 0], relative=1e-6)
 
@@ -222,23 +222,23 @@ def test_a_value_is_blended_as_colour_is_and_leaves_the_rest_as_it_was(memory: s
 def test_too_little_room_is_noticed_kept_in_mind_and_mended(memory: str) -> None:
     view = SceneFrames([scene_of(80, pixels=6.0)], memory)
     enough = view.rasterizer()
-    enough.project(*view.arguments())
+    enough.project_and_sort(*view.arguments())
     assert not enough.grown()
     expected = enough.render().clone()
     touched = int(enough.count.sum())
 
     small = view.rasterizer()
     small.reserve(80, touched - 1)
-    small.project(*view.arguments())
+    small.project_and_sort(*view.arguments())
     loss_of(small, [random_frame(view.scenes[0].camera, np.zeros((HEIGHT, WIDTH), bool))], NORMALISED, [0])
     assert int(small.ok) == 0
     assert int(small.needed) == touched
     empty = dataclasses.replace(view.scenes[0], opacity=torch.full((80,), 1e-4))
-    small.project(*SceneFrames([empty], memory).arguments())
+    small.project_and_sort(*SceneFrames([empty], memory).arguments())
     assert int(small.ok) == 0, "a later projection that fits does not undo it"
     assert small.grown()
     assert small.capacity >= touched
-    small.project(*view.arguments())
+    small.project_and_sort(*view.arguments())
     assert not small.grown()
     assert torch.equal(small.render(), expected)
 
@@ -246,10 +246,10 @@ def test_too_little_room_is_noticed_kept_in_mind_and_mended(memory: str) -> None
 def test_what_fits_exactly_fits(memory: str) -> None:
     view = SceneFrames([scene_of()], memory)
     enough = view.rasterizer()
-    enough.project(*view.arguments())
+    enough.project_and_sort(*view.arguments())
     exact = view.rasterizer()
     exact.reserve(40, int(enough.count.sum()))
-    exact.project(*view.arguments())
+    exact.project_and_sort(*view.arguments())
     assert not exact.grown()
     assert torch.equal(exact.render(), enough.render())
 
@@ -276,7 +276,7 @@ def test_every_tile_with_a_pixel_of_a_splat_has_it_and_few_others(
     view = random_scene(1, width=21, height=18).camera
     scene = needle(view, scale, turn)
     rasterizer = SceneFrames([scene], memory).rasterizer()
-    rasterizer.project(*SceneFrames([scene], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene], memory).arguments())
     drawn = scene.to(torch.float64).render().alpha > 0
     whole = torch.zeros(24, 24, dtype=torch.bool)
     whole[: view.height, : view.width] = drawn
@@ -303,10 +303,10 @@ def test_parameters_beyond_all_training_give_what_they_give_on_the_cpu(memory: s
     colour = random.uniform(size=(3, count)).astype(np.float32)
     cotangents = random.normal(size=(5, size, size)).astype(np.float32)
     there = cpu.Rasterizer(size, size)
-    there.project(view, state, logit, colour)
+    there.project_and_sort(view, state, logit, colour)
     here = CudaRasterizer(size, size, memory)
     given = [torch.from_numpy(each).to(memory) for each in (view[None], state[None], logit, colour[None])]
-    here.project(*given)
+    here.project_and_sort(*given)
     assert not here.grown()
     assert_close(here.render()[0], there.render(), name="image")
     got = here.cotangent_backward(torch.from_numpy(cotangents)[None].to(memory))
@@ -321,14 +321,14 @@ def test_a_gaussian_with_a_parameter_that_is_no_number_is_not_drawn(row: int | s
     view = SceneFrames([scene_of(12, pixels=3.0)], memory)
     camera, state, logit, colour = view.arguments()
     without = view.rasterizer()
-    without.project(camera, state, torch.where(torch.arange(12, device=memory) == 5, -30.0, logit), colour)
+    without.project_and_sort(camera, state, torch.where(torch.arange(12, device=memory) == 5, -30.0, logit), colour)
     state, logit = state.clone(), logit.clone()
     if isinstance(row, int):
         state[0, row, 5] = float("nan")
     else:
         logit[5] = float("nan")
     rasterizer = view.rasterizer()
-    rasterizer.project(camera, state, logit, colour)
+    rasterizer.project_and_sort(camera, state, logit, colour)
     assert int(rasterizer.count[0, 5]) == 0
     assert torch.equal(rasterizer.render(), without.render())
 
@@ -337,7 +337,7 @@ def test_more_tiles_than_16_bits_can_number_are_sorted_with_32(memory: str) -> N
     width, frames = 8 * 2100, MAX_FRAMES
     scene = random_scene(3, width=width, height=1, seed=3, pixels=4.0).to(torch.float32)
     rasterizer = CudaRasterizer(width, 1, memory, frames=frames)
-    rasterizer.project(*SceneFrames([scene] * frames, memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene] * frames, memory).arguments())
     of_frame = rasterizer._tile_start[:-1].reshape(frames, 2100).diff(dim=0)
     touched = int(rasterizer.count[0].sum())
     assert touched > 0
@@ -368,8 +368,8 @@ def test_no_gaussians_leave_the_tissue_a_hole(memory: str) -> None:
     scene = full.rows(torch.zeros(0, dtype=torch.long))
     frame = random_frame(scene.camera, np.zeros((HEIGHT, WIDTH), bool))
     rasterizer = SceneFrames([full], memory).rasterizer()
-    rasterizer.project(*SceneFrames([full], memory).arguments())
-    rasterizer.project(*SceneFrames([scene], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([full], memory).arguments())
+    rasterizer.project_and_sort(*SceneFrames([scene], memory).arguments())
     gradients = loss_of(rasterizer, [frame], NORMALISED, [0])
     assert not rasterizer.render().any()
     assert gradients.state.shape == (1, 10, 0)

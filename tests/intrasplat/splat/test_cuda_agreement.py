@@ -14,7 +14,7 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from intrasplat.errors import UnavailableError
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
-from intrasplat.pipeline import open_with_depth
+from intrasplat.pipeline import open_with_poses
 from intrasplat.splat.backend import Device, examine
 from intrasplat.splat.camera import Rendered
 from intrasplat.splat.cuda import agreement, rasterize
@@ -81,6 +81,6 @@ def test_one_that_does_not_matches_no_stereo_clip_either(
     stages: list[str] = []
     hooks = Hooks(on_progress=lambda progress: stages.append(progress.stage))
     with pytest.raises(UnavailableError, match="GPU 9001 is not to be trusted"):
-        open_with_depth(ReconstructionRequest(clip=tmp_path), hooks, Timings(), Device("cuda", "GPU 9001", device))
+        open_with_poses(ReconstructionRequest(clip=tmp_path), hooks, Timings(), Device("cuda", "GPU 9001", device))
     assert stages[-1] == "compile"
     assert "stereo" not in stages

@@ -228,7 +228,7 @@ def test_steps_are_answered_for_once_and_together(device: str) -> None:
     seen = frames(2)
     answers = [cpu.step([frame], LOSS, RATES, k + 1) for k, frame in enumerate(seen)]
     cuda = model(device, "shared")
-    assert cuda.answers_every == CHECK_EVERY
+    assert cuda.steps_a_report == CHECK_EVERY
     assert [cuda.step([frame], LOSS, RATES, k + 1) for k, frame in enumerate(seen)] == [None] * 2
     answer = cuda.wait()
     assert answer is not None

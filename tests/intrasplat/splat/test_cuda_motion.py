@@ -277,7 +277,7 @@ def test_harmonics_and_their_step_are_those_of_torch(degree: int, device: str) -
     rest[:, :, :COUNT] = gaussians.sh[:, 1:].permute(1, 2, 0)
     state, rest, centre = state.to(device), rest.to(device), centre.to(device)
     colour = torch.full((2, 3, columns), float("nan"), device=device)
-    harmonics.show(rest, state, centre, colour, degree)
+    harmonics.evaluate(rest, state, centre, colour, degree)
 
     sh, mean = gaussians.sh.double().requires_grad_(), gaussians.mean.double().requires_grad_()
     moved = dataclasses.replace(exact(gaussians), sh=sh, mean=mean)
@@ -294,7 +294,7 @@ def test_harmonics_and_their_step_are_those_of_torch(degree: int, device: str) -
     write_adam(control.rows[0], 0, RATES, 1)
     control.send(0)
     moments, ok = torch.zeros(2, *rest.shape, device=device), torch.ones(1, dtype=torch.int32, device=device)
-    harmonics.carry_back(rest, state, centre, colour, v_colour, v_state, degree)
+    harmonics.evaluate_backward(rest, state, centre, colour, v_colour, v_state, degree)
     harmonics.update(rest, moments, state, centre, colour, v_colour, ok, control.values, degree)
 
     (wanted * cotangent.double()).sum().backward()  # type: ignore[no-untyped-call]

@@ -28,7 +28,7 @@ def alpha_of(
     logits = np.full(LANES, -30.0, np.float32)
     logits[0] = logit
     rasterizer = Rasterizer(SIZE, SIZE)
-    rasterizer.project(VIEW, state, logits, np.ones((3, LANES), np.float32))
+    rasterizer.project_and_sort(VIEW, state, logits, np.ones((3, LANES), np.float32))
     alpha: NDArray[np.float32] = rasterizer.render()[4].copy()
     gradients = rasterizer.cotangent_backward(np.ones((5, SIZE, SIZE), np.float32))
     for field in dataclasses.fields(gradients):

@@ -12,7 +12,7 @@ from intrasplat.clip import DepthClip, held_out_frames
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.options import ReconstructionOptions
-from intrasplat.pipeline import open_with_depth
+from intrasplat.pipeline import open_with_poses
 from intrasplat.train.request import ReconstructionRequest
 from lab.phantom import PhantomSettings, make_phantom, write_stereomis
 
@@ -37,7 +37,7 @@ def test_held_out_frames_of_a_stereo_clip_change_no_bit_of_the_others(holdout: s
     request = ReconstructionRequest(tmp_path, ReconstructionOptions(holdout=holdout))
 
     def depth_clip() -> DepthClip:
-        return open_with_depth(request, Hooks(), Timings())
+        return open_with_poses(request, Hooks(), Timings())
 
     clean = depth_clip()
     held_out = held_out_frames(FRAMES, holdout)

@@ -31,7 +31,7 @@ LAG = 5
 class LaggingModel(CpuModel):
     """Answers as a device does that is asked at every LAG-th step."""
 
-    answers_every = LAG
+    steps_a_report = LAG
     steps_made = 0
 
     def step(  # type: ignore[override]
@@ -60,7 +60,7 @@ def lagging(iterations: int) -> tuple[Run, LaggingModel]:
 
 
 @pytest.mark.parametrize("iterations", [20, 23])
-def test_it_ends_with_the_bits_of_a_model_that_answers_every_step(iterations: int) -> None:
+def test_it_ends_with_the_bits_of_a_model_that_reports_every_step(iterations: int) -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=iterations)
     assert bits(trained(lagging(iterations)[0])) == bits(trained(run))

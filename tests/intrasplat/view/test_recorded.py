@@ -16,7 +16,7 @@ from intrasplat.errors import InputError, SceneError
 from intrasplat.picture import RecordedMasks
 from intrasplat.report import Masks
 from intrasplat.scene.recorded_file import MAX_FRAME_BYTES
-from intrasplat.view.recorded import EYES, MARK, MAX_MOMENTS, MAX_WIDTH, kept_frames, live_frame, stored_frame
+from intrasplat.view.recorded import EYES, MARK, MAX_MOMENTS, MAX_WIDTH, live_frame, stored_frame, zipped_frames
 
 FRAMES = 40
 
@@ -57,7 +57,7 @@ def two_eyes() -> DepthClip:
 
 def kept(tmp_path: Path, of: DepthClip, eyes: int = 1) -> Path:
     path = tmp_path / "recorded.zip"
-    path.write_bytes(kept_frames(of, EYES[:eyes])[0])
+    path.write_bytes(zipped_frames(of, EYES[:eyes])[0])
     return path
 
 
@@ -116,8 +116,8 @@ def test_a_mask_is_white_on_instruments_and_of_its_own_eye(tmp_path: Path) -> No
 def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Path) -> None:
     count = 3 * MAX_MOMENTS
     long = clip(frames=count, width=16, height=12, masks=Masks(source="given", share=0.33))
-    content, told = kept_frames(long, EYES[:1])
-    assert kept_frames(long, EYES[:1]) == (content, told)
+    content, told = zipped_frames(long, EYES[:1])
+    assert zipped_frames(long, EYES[:1]) == (content, told)
     assert len(told.frames) == MAX_MOMENTS
     assert (told.frames[0], told.frames[-1]) == (0, count - 1)
     assert max(np.diff(told.frames)) <= 4
@@ -130,14 +130,14 @@ def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Pa
 @pytest.mark.parametrize(("source", "frames"), [("found", 2 * FRAMES - 3), ("given", 2 * FRAMES)])
 def test_frames_that_nobody_looked_at_are_kept_where_their_masks_are_known(source: str, frames: int) -> None:
     masks = Masks(source=source, share=0.33)  # type: ignore[arg-type]
-    _, told = kept_frames(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), skipped=(4, 5, 6)), EYES[:1])
+    _, told = zipped_frames(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), skipped=(4, 5, 6)), EYES[:1])
     assert len(told.frames) == frames
 
 
 def test_a_clip_without_instruments_keeps_no_masks(tmp_path: Path) -> None:
     bare = clip()
     bare.tissue[:] = True
-    assert not kept_frames(bare, EYES[:1])[1].masks
+    assert not zipped_frames(bare, EYES[:1])[1].masks
     path = kept(tmp_path, bare)
     plain, marked = (
         stored_frame(path, FRAMES, 0.5, "left", each) for each in (RecordedMasks.OFF, RecordedMasks.MARKED)

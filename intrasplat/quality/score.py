@@ -22,7 +22,7 @@ from intrasplat.train.scoring import FrameRenderer, Mapping, PoseRenderer, sampl
 STAGE = "score"
 
 
-def judged(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRenderer, hooks: Hooks) -> Report:
+def score_model(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRenderer, hooks: Hooks) -> Report:
     """The report with the scores of the model's held-out frames, of the right eye's, and of the copy baselines.
 
     Args:

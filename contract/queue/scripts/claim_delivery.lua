@@ -1,11 +1,11 @@
 #!lua flags=allow-oom
--- LEND: lend a service the delivery that has been due for longest. Its score is then when the loan runs out.
--- ARGV   2 token of the call, 3 how long the loan lasts in ms, 4 and more: tenants whose deliveries are not lent
+-- CLAIM_DELIVERY: give a service the delivery that has been due for longest. Its score is then when the claim expires.
+-- ARGV   2 token of the call, 3 how long the claim lasts in ms, 4 and more: tenants to skip
 -- Keys   owed, owed-by, tenant:<tenant>:owed, lent:<token>, trying:<event>, deliveries:<id>, job:<id>
 -- Answer {event, delivery as JSON, callback, tenant, score, trace or ''}; {}: none is due.
 
-local lent, passed = P .. 'lent:' .. ARGV[2], {}
-for i = 4, #ARGV do passed[ARGV[i]] = true end
+local claimed, skipped = P .. 'lent:' .. ARGV[2], {}
+for i = 4, #ARGV do skipped[ARGV[i]] = true end
 
 local function answer(event)
   local id = job_of(event)
@@ -19,7 +19,7 @@ end
 local function first_due()
   local tenant, event, at
   for _, each in ipairs(redis.call('HKEYS', OWED)) do
-    local head = passed[each] and {} or redis.call('ZRANGE', owed_of(each), 0, 0, 'WITHSCORES')
+    local head = skipped[each] and {} or redis.call('ZRANGE', owed_of(each), 0, 0, 'WITHSCORES')
     if head[1] and (not at or tonumber(head[2]) < at) then tenant, event, at = each, head[1], tonumber(head[2]) end
   end
   if at and at <= tonumber(now()) then return tenant, event end
@@ -32,7 +32,7 @@ for _, event in ipairs(redis.call('ZRANGE', P .. 'owed', 0, 99)) do
   redis.call('ZREM', P .. 'owed', event)
 end
 
-local mine = redis.call('GET', lent)
+local mine = redis.call('GET', claimed)
 local mine_still = mine and answer(mine)
 if mine_still then return mine_still end
 while true do
@@ -41,7 +41,7 @@ while true do
   set_due(tenant, event, later(ARGV[3]))
   local found = answer(event)
   if found then
-    redis.call('SET', lent, event, 'PX', ARGV[3])
+    redis.call('SET', claimed, event, 'PX', ARGV[3])
     redis.call('SET', trying(event), '1', 'PX', ARGV[3])
     return found
   end
