@@ -58,8 +58,10 @@ class EmptyFrames:
             frames = sorted(index for index, why in self.reasons.items() if why == reason)
             named = ", ".join(str(index) for index in frames[:MAX_NAMED]) + (", ..." if len(frames) > MAX_NAMED else "")
             text = f"{len(frames)} of {frame_count:,} frames {reason} ({named}) and were left out"
-            code = NoticeCode.FRAMES_WITHOUT_TISSUE if reason == COVERED else NoticeCode.FRAMES_SHOW_NOTHING
-            found.append(Notice.warning(code, text))
+            if reason == COVERED:
+                found.append(Notice.warning(NoticeCode.FRAMES_WITHOUT_TISSUE, text))
+            else:
+                found.append(Notice.warning(NoticeCode.FRAMES_SHOW_NOTHING, text))
         return tuple(found)
 
 

@@ -157,7 +157,7 @@ def test_outside_a_round_field_there_is_nothing() -> None:
     view = scene.render(t=0.3)
     outside = ~round_field(41)  # a Gaussian of so small a picture is some pixels wide
     assert (view.confidence[outside] >= 0.5).mean() < 0.03
-    assert view.unseen[outside].mean() > 0.95
+    assert view.unseen[outside].mean() > 0.9
     assert view.unseen[round_field(30)].mean() < 0.2
     whole = isp.reconstruct(read(given), method="fast", iterations=4, fov="all", device="cpu")
     assert whole.report.field_of_view is not None
