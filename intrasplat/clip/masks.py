@@ -189,14 +189,6 @@ def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None)
     warnings = []
     if tissue.all():
         warnings.append(Notice.warning(NoticeCode.MASKS_MARK_NOTHING, "the masks mark no instrument in any frame"))
-    covered = int((~tissue.any(axis=(1, 2))).sum())
-    if covered:
-        warnings.append(
-            Notice.warning(
-                NoticeCode.FRAMES_WITHOUT_TISSUE,
-                f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from",
-            )
-        )
     return tuple(warnings)
 
 
