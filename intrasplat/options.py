@@ -158,4 +158,6 @@ def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Op
         problem = f"{first['msg'].removeprefix('Value error, ')} (given: {str(first['input'])[:80]!r})."
         named = model.model_fields.get(str(first["loc"][0])) if first["loc"] else None
         allowed = named.description if named and named.description else "a value that /openapi.json allows for it"
+        if first["type"] == "literal_error":
+            allowed = first["ctx"]["expected"]
         raise InputError(field, problem, f"Give {allowed}.") from error

@@ -225,7 +225,9 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
         remedy = "Ask again in some seconds, when another worker has claimed it."
         raise Problem(503, "The job's worker has ended, and the job is queued again.", field="scene", remedy=remedy)
     detail = f"The job is {record.state}; there is nothing to show."
-    raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene}.")
+    waits = record.state is JobState.QUEUED
+    remedy = f"Wait for its first view: GET /jobs/{scene}/events." if waits else f"GET /jobs/{scene} says why."
+    raise Problem(409, detail, field="scene", remedy=remedy)
 
 
 def _only(services: Deps, caller: Caller) -> Shown:

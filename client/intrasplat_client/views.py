@@ -52,6 +52,8 @@ class Image:
 
     state is "running" for a view of a job that still trains; iteration is then the step of the snapshot. unseen is the
     share of the view that no training frame saw, and camera the picture's; None: the service is too old to send them.
+    warning_codes are those of docs/codes.md, and warning their texts; they say nothing of the scene itself, as its
+    report does.
     """
 
     content: bytes
@@ -62,6 +64,7 @@ class Image:
     iteration: int | None = None
     unseen: float | None = None
     warning: str | None = None
+    warning_codes: tuple[str, ...] = ()
     etag: str | None = None
     render_ms: float | None = None
     camera: PictureCamera | None = None
@@ -121,6 +124,7 @@ def _image_of(response: httpx.Response) -> Image:
         iteration=int(about["iteration"]) if "iteration" in about else None,
         unseen=float(about["unseen"]) if "unseen" in about else None,
         warning=about.get("warning"),
+        warning_codes=tuple(filter(None, about.get("warning-codes", "").split(", "))),
         etag=about.get("etag"),
         render_ms=_duration_ms(about.get("server-timing", ""), "render"),
         camera=PictureCamera.of_document(json.loads(about.get("camera", "null"))),
@@ -153,6 +157,7 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             iteration=head["iteration"],
             unseen=head.get("unseen"),
             warning="; ".join(each["text"] for each in head["warnings"]) or None,
+            warning_codes=tuple(each["code"] for each in head["warnings"]),
             render_ms=head["render_ms"],
             camera=PictureCamera.of_document(head.get("camera")),
         )

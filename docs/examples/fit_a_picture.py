@@ -15,6 +15,7 @@ parser.add_argument("--gaussians", type=int, default=3000)
 parser.add_argument("--steps", type=int, default=400)
 parser.add_argument("--out", default="fit.png")
 options = parser.parse_args()
+torch.set_num_threads(1)  # the kernels have threads of their own
 target = torch.from_numpy(np.array(Image.open(options.picture).convert("RGB"))).float() / 255
 height, width, _ = target.shape
 K = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])

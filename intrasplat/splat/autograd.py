@@ -73,7 +73,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True: torch would treat the kernels' gradients as constants
-            raise RuntimeError("the kernels compute first derivatives only: differentiate twice with the reference")
+            raise RuntimeError("the kernels differentiate once: pass backend='reference' to differentiate twice")
         scale, logit, camera_from_world = ctx.saved_tensors
         v_state, v_logit, v_colour, v_pose = ctx.gradients(stacked(*cotangents))
         return (

@@ -217,8 +217,16 @@ def _check_shape(name: str, given: Tensor, *wanted: int | str) -> None:
         isinstance(size, str) or size == own for own, size in zip(given.shape, wanted, strict=True)
     )
     if not fits:
-        remedy = "Pass that shape; batches of scenes are not supported."
-        if name == "colors":
+        remedy = "Pass that shape."
+        if given.ndim > len(wanted):
+            remedy = "Pass that shape; batches of scenes are not supported."
+        if name == "opacities" and given.ndim == 2 and given.shape[1] == 1:
+            remedy = "Pass opacities[:, 0]."
+        elif name == "Ks" and given.shape == (1, 3, 3):
+            remedy = f"Pass a matrix for each camera: Ks.expand({wanted[0]}, 3, 3)."
+        elif name == "viewmats" and given.shape[-2:] == (3, 4):
+            remedy = "Append the row 0 0 0 1."
+        elif name == "colors":
             remedy = "Pass [N, D] or [C, N, D]; evaluate spherical harmonics first."
         elif name in ("viewmats", "Ks") and given.ndim == 2:
             remedy = f"Pass one camera as {name}[None]."

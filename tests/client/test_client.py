@@ -113,7 +113,8 @@ def test_a_render_comes_as_a_file_as_an_array_or_as_what_is_known(
     image = client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64)
     np.testing.assert_array_equal(image.array(), np.full((4, 6), 0.5, np.float32))
     np.testing.assert_array_equal(client.render_array(t=0.25, scene=job.id), np.full((4, 6), 0.25, np.float32))
-    assert (image.scene, image.t, image.state, image.warning) == (job.id, 0.5, "done", "seen from afar")
+    assert (image.scene, image.t, image.state) == (job.id, 0.5, "done")
+    assert (image.warning, image.warning_codes) == ("seen from afar", ("unclassified",))
     assert (image.unseen, client.render(t=0.5, scene=job.id, unseen="guess").unseen) == (0.25, 0.0)
     assert client.render(t=0.5, scene=job.id, layer="depth", format="npy", width=64, known=image) is image
     assert client.render(t=0.5, scene=job.id, layer="rgb", known=image) is not image
