@@ -40,9 +40,9 @@ MIN_OUTSIDE, MIN_FIELD = 0.002, 0.02
 """Shares of the picture: a smaller border is some dark pixels at an edge, a smaller field a light in a dark clip."""
 OPENED_SHARE = 0.02
 """Share of the width: narrower bright parts, such as text on black, do not belong to the field."""
-RIM_SHARE, MAX_RIM_SHARE, RIM_BRIGHTNESS = 0.005, 0.05, 0.9
-"""Least and greatest width of the rim that is taken off the field, as shares of the picture's width: codecs and lenses
-blur it. It ends where the field has this share of the brightness of its margin."""
+RIM_SHARE, MAX_RIM_SHARE, RIM_BRIGHTNESS = 0.005, 0.03, 0.75
+"""The rim that is taken off the field, for codecs and lenses blur it: its least width, as a share of the picture's; its
+greatest, as a share of the square root of the field's area. It ends where it has this share of the brightness within."""
 SLIVER_SHARE = 0.03
 """Share of the width: a dark part at the rim that cuts deeper into the field is tissue in shadow."""
 SAME_LEVELS = 3.0
@@ -145,9 +145,10 @@ def _without_rim(inside: Mask, brightest: Levels) -> Mask:
     width = inside.shape[1]
     frame = cv2.copyMakeBorder(inside.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     away_px = cv2.distanceTransform(frame, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-    usual = float(np.median(brightest[inside & (away_px <= 2 * MAX_RIM_SHARE * width)]))
+    most_px = MAX_RIM_SHARE * float(np.sqrt(np.count_nonzero(inside)))
+    usual = float(np.median(brightest[inside & (away_px > most_px) & (away_px <= 2 * most_px)]))
     rim_px = RIM_SHARE * width
-    while rim_px < MAX_RIM_SHARE * width:
+    while rim_px < most_px:
         ring = inside & (away_px > rim_px) & (away_px <= rim_px + 1)
         if not ring.any() or float(np.median(brightest[ring])) >= RIM_BRIGHTNESS * usual:
             break

