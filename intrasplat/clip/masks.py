@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from intrasplat.clip.files import FileTree, check_exists, open_tree
 from intrasplat.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
 from intrasplat.clip.naming import check_aligned, left_eye_only, right_eye_only
-from intrasplat.clip.packing import Packing, halves, packing_by_size
+from intrasplat.clip.packing import Packing, by_severity, halves, packing_by_size
 from intrasplat.clip.video import VideoFile, open_video, open_video_in
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
@@ -38,6 +38,7 @@ class TissueMasks:
     """Tissue pixels, tissue [T, H, W] bool, True = tissue, with the assumption behind them and warnings.
 
     right is the same for the right eye; None if the masks show the left eye alone. given: False if there are no masks.
+    remarks: what is good to know of masks in a video. damaged: indices of its damaged frames.
     """
 
     tissue: NDArray[np.bool_]
@@ -45,6 +46,8 @@ class TissueMasks:
     warnings: tuple[Notice, ...] = ()
     right: NDArray[np.bool_] | None = None
     given: bool = True
+    remarks: tuple[Notice, ...] = ()
+    damaged: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,12 @@ def tissue_from_masks(
             if eye is not None:
                 np.logical_not(eye, out=eye)
     assumption = Notice.info(NoticeCode.MASKS, f"masks: white is {bright} ({reason})")
-    return TissueMasks(white, assumption, _tissue_warnings(white, right), right)
+    sequences = (masks.frames,) if masks.right is None else (masks.frames, masks.right)
+    remarks, warnings = by_severity(sequences)
+    damaged = tuple(sorted({index for each in sequences for index in each.damaged}))
+    if damaged and not both_eyes:
+        raise InputError(_FIELD, f"{len(damaged)} of its frames are damaged.", "Export the masks again, as PNG.")
+    return TissueMasks(white, assumption, (*_tissue_warnings(white, right), *warnings), right, True, remarks, damaged)
 
 
 def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None) -> tuple[Notice, ...]:

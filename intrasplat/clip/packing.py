@@ -6,7 +6,7 @@ Symbols: T frames, H W pixels of one eye.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from intrasplat.clip.types import RgbFrame
 from intrasplat.errors import InputError
-from intrasplat.notices import Notice
+from intrasplat.notices import Notice, Severity
 
 Packing = Literal["sbs", "tb"]
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
@@ -32,7 +32,10 @@ _MAX_FRAMES_COMPARED = 30  # clips may start black
 
 
 class FrameSequence(Protocol):
-    """T RGB frames of one size: a video or images. Each call of frames() starts again from frame 0."""
+    """T RGB frames of one size: a video or images. Each call of frames() starts again from frame 0.
+
+    damaged: indices of frames from which nothing must be learnt. pixel_aspect: width / height of a pixel.
+    """
 
     @property
     def frame_count(self) -> int: ...
@@ -45,7 +48,11 @@ class FrameSequence(Protocol):
     @property
     def frame_times_s(self) -> NDArray[np.float64] | None: ...
     @property
-    def warnings(self) -> tuple[Notice, ...]: ...
+    def notices(self) -> tuple[Notice, ...]: ...
+    @property
+    def damaged(self) -> tuple[int, ...]: ...
+    @property
+    def pixel_aspect(self) -> float: ...
     def frames(self) -> Iterator[RgbFrame]: ...
 
 
@@ -57,8 +64,8 @@ class PackedPairs:
     packing: Packing
 
     @property
-    def warnings(self) -> tuple[Notice, ...]:
-        return self.sequence.warnings
+    def sequences(self) -> tuple[FrameSequence, ...]:
+        return (self.sequence,)
 
     @property
     def eye_size(self) -> tuple[int, int]:
@@ -79,11 +86,18 @@ class TwoSequences:
     right: FrameSequence
 
     @property
-    def warnings(self) -> tuple[Notice, ...]:
-        return self.left.warnings + self.right.warnings
+    def sequences(self) -> tuple[FrameSequence, ...]:
+        return (self.left, self.right)
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
         return zip(self.left.frames(), self.right.frames(), strict=True)
+
+
+def by_severity(sequences: Iterable[FrameSequence]) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
+    """The sequences' notices: those that are good to know, and warnings."""
+    notices = [notice for each in sequences for notice in each.notices]
+    infos = tuple(each for each in notices if each.severity is Severity.INFO)
+    return infos, tuple(each for each in notices if each.severity is Severity.WARNING)
 
 
 def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:

@@ -75,6 +75,7 @@ def estimate_depth(
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
     on all). Otherwise a frame's depth depends on its own pair only, so frames outside measured_frames do not change the
     depth of others. With skip_redundant, measured frames that show nothing new (clip/sampling.py) get no depth.
+    Damaged frames of the clip are neither measured nor matched.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -90,7 +91,8 @@ def estimate_depth(
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
-    measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
+    given = set(range(clip.frame_count) if measured_frames is None else measured_frames)
+    measured = sorted(given - set(clip.damaged))
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     aligned = spread(measured, ALIGNMENT_PAIRS)
@@ -105,7 +107,8 @@ def estimate_depth(
         )
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
+        skipped = {*unused.frames, *clip.damaged}
+        wanted = sorted(set(range(clip.frame_count)) - skipped)
         order = sorted(wanted, key=lambda i: i != first)  # frame `first` is shown as soon as it has depth
         jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
         for done, (i, job) in enumerate(jobs, start=1):
@@ -125,7 +128,7 @@ def estimate_depth(
         assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), assumption)
     return replace(
         work.matched,
-        skipped=unused.frames,
+        skipped=tuple(sorted(skipped)),
         masks=masks,
         rectification=clip.rectification,
         assumptions=(*assumptions, _scale_assumption(clip), *unused.notices(clip.frame_count)),

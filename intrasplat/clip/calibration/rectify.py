@@ -40,7 +40,7 @@ class RectifiedClip:
     pairs yields rectified (left, right) RGB uint8 frames, remapped on demand. tissue is [T, H, W] bool in the pixels of
     the rectified left eye (a read-only view if no masks were given), False where the rectified image extends beyond the
     recorded one. tissue_right is the same for the right eye, None if no masks show it. intrinsics are the left eye's.
-    rectification has the left eye's mapping; None: the frames are unchanged.
+    rectification has the left eye's mapping; None: the frames are unchanged. damaged: as in the recorded clip.
 
     equal_rows_px is y_right - y_left, in these frames, of points on equal rows of the recorded frames. If frames that
     were rectified already are rectified again, about this row shift is measured.
@@ -58,6 +58,7 @@ class RectifiedClip:
     equal_rows_px: float = 0.0
     tissue_right: NDArray[np.bool_] | None = None
     rectification: Rectification | None = None
+    damaged: tuple[int, ...] = ()
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -113,6 +114,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
         warnings=clip.warnings + _scale_warning(c) + _view_warning(c.fx_px, c.width),
         tissue_right=clip.tissue_right,
+        damaged=clip.damaged,
     )
 
 
@@ -157,6 +159,7 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
             rotation=_rows_of(left_r),
             projection=_rows_of(left_p),
         ),
+        damaged=clip.damaged,
     )
 
 

@@ -93,6 +93,7 @@ def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -
     return (
         Notice.info(NoticeCode.LAYOUT, f"layout: {TITLE}"),
         masks.assumption,
+        *masks.remarks,
         Notice.info(NoticeCode.POSES, f"poses: {convention} camera-to-world, {camera} camera"),
         Notice.info(NoticeCode.INTRINSICS, "intrinsics: principal point at the image centre"),
         Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),

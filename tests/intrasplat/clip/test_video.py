@@ -110,14 +110,6 @@ def test_vp9_opens_in_each_container(studio, suffix: str) -> None:
     assert np.abs(shown_right.astype(float) - right[0]).mean() < LOSSY_LEVELS
 
 
-def test_the_options_for_the_decoder_do_not_stay_in_the_environment(monkeypatch) -> None:
-    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "theirs;1")
-    monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
-    stereo(SBS_H264)
-    assert os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] == "theirs;1"
-    assert "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
-
-
 def test_a_told_packing_wins_over_what_the_frames_look_like() -> None:
     clip = stereo(SBS_H264, layout="tb")
     assert (clip.height, clip.width) == (40, 192)
