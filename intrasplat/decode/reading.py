@@ -111,4 +111,5 @@ def _calibration(path: Path | str | None, clip: StereoClip) -> dict[str, Any]:
         problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
         remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
         raise InputError("calibration", problem, remedy)
-    return load_calibration(path, eye_width=clip.width, eye_height=clip.height).model_dump(mode="json")
+    calibration = load_calibration(path, eye_width=clip.width, eye_height=clip.height, pixel_aspect=clip.pixel_aspect)
+    return calibration.model_dump(mode="json")
