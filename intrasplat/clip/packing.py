@@ -23,6 +23,8 @@ Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 
 PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb": "top-bottom, left eye on top"}
 
+MAX_RATE_RATIO = 1.1  # Matroska's milliseconds change a rate of 120 Hz by 4 %
+
 _EYE_ASPECTS = (0.8, 2.4)  # plausible width / height of an endoscope's eye; 5:4 and 16:9 are well inside
 _CLEAR_MARGIN = 0.15  # of correlation; with a larger one, content overrides the shape
 _MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
@@ -101,12 +103,19 @@ def by_severity(sequences: Iterable[FrameSequence]) -> tuple[tuple[Notice, ...],
 
 
 def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
-    """The frame pairs of a left and a right sequence. InputError if their lengths or sizes differ."""
+    """The frame pairs of a left and a right sequence. InputError if their lengths, rates or sizes differ."""
     if left.frame_count != right.frame_count:
         raise InputError(
             "right",
             f"the right eye has {right.frame_count} frames, the left {left.frame_count}.",
             "Cut both to the same frames.",
+        )
+    rates_hz = [_rate_hz(each) for each in (left, right)]
+    if 0 < min(rates_hz) * MAX_RATE_RATIO < max(rates_hz):
+        raise InputError(
+            "right",
+            f"the right eye has {rates_hz[1]:.4g} frames a second, the left {rates_hz[0]:.4g}.",
+            "Give both eyes at one rate, so that frame i of both shows one moment.",
         )
     if (left.height, left.width) != (right.height, right.width):
         raise InputError(
@@ -115,6 +124,12 @@ def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
             "Give both eyes in one size.",
         )
     return TwoSequences(left, right)
+
+
+def _rate_hz(sequence: FrameSequence) -> float:
+    """Frames a second by the median step between them; 0 if there are no times."""
+    times_s = sequence.frame_times_s
+    return 0.0 if times_s is None or len(times_s) < 2 else 1 / float(np.median(np.diff(times_s)))
 
 
 def halves(frame: NDArray[Pixel], packing: Packing) -> tuple[NDArray[Pixel], NDArray[Pixel]]:

@@ -243,6 +243,20 @@ def test_eyes_of_different_length_are_refused(studio) -> None:
     assert caught.value.field == "right"
 
 
+@pytest.mark.parametrize(("left_hz", "right_hz"), [(25.0, 50.0), (30.0, 25.0), (60.0, 50.0)])
+def test_eyes_of_different_rates_are_refused(studio, left_hz: float, right_hz: float) -> None:
+    left, right = studio.eyes()
+    with pytest.raises(InputError, match=f"right eye has {right_hz:g} frames a second, the left {left_hz:g}") as caught:
+        open_clip(studio.video("a.mp4", left, rate_hz=left_hz), studio.video("b.mp4", right, rate_hz=right_hz))
+    assert caught.value.field == "right"
+
+
+def test_eyes_in_different_containers_have_one_rate(studio) -> None:
+    left, right = studio.eyes()
+    clip = stereo(studio.video("a.mp4", left, rate_hz=120), right=studio.video("b.webm", right, rate_hz=120))
+    assert clip.frame_count == 6
+
+
 def test_eyes_of_different_size_are_refused(studio) -> None:
     left, right = studio.eyes()
     with pytest.raises(InputError, match="right eye is 80x80 pixels, the left 96x80"):
