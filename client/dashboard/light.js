@@ -12,7 +12,7 @@ const WEIGHTS = {
   ],
   "care": [
     "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "camera_or_tissue", "colour_changes",
-    "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "few_frames", "first_picture",
+    "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "eyes_out_of_step", "few_frames", "first_picture",
     "frames_without_tissue", "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "little_depth",
     "mask_gaps", "masks_mark_nothing", "masks_unsure", "no_instrument_masked", "no_texture", "out_of_focus",
     "outlier_frames", "pose_far", "pose_jitter", "poses_unsure", "repeated_frames", "right_eye_low", "stereo_unsure",

@@ -36,6 +36,7 @@ export const DE = {
     "depth_unusual": "Der Abstand zum Gewebe ist für ein Endoskop ungewöhnlich; prüfen Sie die Kalibrierung.",
     "eyes_coloured_apart": "Die beiden Augen hatten verschiedene Farben; das wurde korrigiert.",
     "eyes_disagree": "Die beiden Augen passen nicht zusammen: Aufnahme oder Kalibrierung ist fehlerhaft.",
+    "eyes_out_of_step": "Die beiden Augen liefen nicht im Gleichtakt; das wurde korrigiert.",
     "few_frames": "Der Clip hat wenige Bilder, aus denen gelernt werden kann.",
     "field_of_view_unusual": "Der Bildwinkel ist für ein Endoskop ungewöhnlich; prüfen Sie die Kalibrierung.",
     "frames_without_tissue": "Einige Masken verdecken das ganze Bild.",

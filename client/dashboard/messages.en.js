@@ -36,6 +36,7 @@ export const EN = {
     "depth_unusual": "The distance to the tissue is unusual for an endoscope; check the calibration.",
     "eyes_coloured_apart": "The two eyes differed in colour; that was corrected.",
     "eyes_disagree": "The two eyes do not fit together: something is wrong with recording or calibration.",
+    "eyes_out_of_step": "The two eyes were not in step; that was corrected.",
     "few_frames": "The clip has few frames to learn from.",
     "field_of_view_unusual": "The angle of view is unusual for an endoscope; check the calibration.",
     "frames_without_tissue": "Some masks cover the whole picture.",

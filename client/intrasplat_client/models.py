@@ -93,6 +93,7 @@ class NoticeCode(StrEnum):
     DEPTH_UNUSUAL = "depth_unusual"
     EYES_COLOURED_APART = "eyes_coloured_apart"
     EYES_DISAGREE = "eyes_disagree"
+    EYES_OUT_OF_STEP = "eyes_out_of_step"
     FEW_FRAMES = "few_frames"
     FIELD_OF_VIEW_UNUSUAL = "field_of_view_unusual"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"

@@ -38,6 +38,7 @@ from intrasplat.stereo.alignment import (
     outside_share,
 )
 from intrasplat.stereo.frames import FrameWork, grey_of
+from intrasplat.stereo.in_step import Lag, Profile, find_lag, move_frames, row_profile
 from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
@@ -75,7 +76,8 @@ def estimate_depth(
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
     on all). Otherwise a frame's depth depends on its own pair only, so frames outside measured_frames do not change the
     depth of others. With skip_redundant, measured frames that show nothing new (clip/sampling.py) get no depth.
-    Damaged frames of the clip are neither measured nor matched.
+    Damaged frames of the clip are neither measured nor matched. If the right eye is out of step (in_step.py), which all
+    frames tell, its frames are moved, and frames without a partner are skipped.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -97,7 +99,14 @@ def estimate_depth(
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     aligned = spread(measured, ALIGNMENT_PAIRS)
     with one_opencv_thread(), _pool() as pool:
-        rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
+        rgb, right_rgb, matches, lag = _receive(clip, aligned, pool, hooks)
+        unpaired: tuple[int, ...] = ()
+        if lag is not None:
+            sources = lag.sources(clip.frame_count)
+            unpaired = tuple(t for t, source in enumerate(sources) if source is None)
+            clip = _in_step(clip, right_rgb, sources)
+            measured = sorted(set(measured) - set(unpaired))
+            matches = _matches(rgb, right_rgb, spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
@@ -107,7 +116,7 @@ def estimate_depth(
         )
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        skipped = {*unused.frames, *clip.damaged}
+        skipped = {*unused.frames, *clip.damaged, *unpaired}
         wanted = sorted(set(range(clip.frame_count)) - skipped)
         order = sorted(wanted, key=lambda i: i != first)  # frame `first` is shown as soon as it has depth
         jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
@@ -133,6 +142,7 @@ def estimate_depth(
         rectification=clip.rectification,
         assumptions=(*assumptions, _scale_assumption(clip), *unused.notices(clip.frame_count)),
         warnings=clip.warnings
+        + (() if lag is None else (lag.notice(unpaired),))
         + mask_warnings
         + registration.notices
         + _warnings(sure_share)
@@ -151,21 +161,24 @@ def estimate_depth(
 
 def _receive(
     clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
-    """Left and right frames [T, H, W, 3] from one pass over the source, and feature matches [M, 4] of frames `aligned`.
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64], Lag | None]:
+    """Left and right frames [T, H, W, 3] from one pass over the source, feature matches [M, 4] of frames `aligned`, and
+    the lag of the right eye.
 
     Features are searched while later frames arrive.
     """
     shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width, 3)
     rgb, right = (mapped_zeros(shape, np.uint8) for _ in range(2))
     features: list[Future[Features]] = []
+    profiles: tuple[list[Profile], list[Profile]] = ([], [])
     decoded = 0
     for i, (left_frame, right_frame) in enumerate(clip.pairs()):
         if i >= clip.frame_count:
             break
         _check_stop(hooks)
-        for frames, frame in ((rgb, left_frame), (right, right_frame)):
+        for frames, frame, rows in ((rgb, left_frame, profiles[0]), (right, right_frame, profiles[1])):
             frames[i] = frame
+            rows.append(row_profile(frame))
             let_go(frames[i])
         if i in aligned:
             features += [pool.submit(find_features, grey_of(eye)) for eye in (left_frame, right_frame)]
@@ -175,7 +188,25 @@ def _receive(
     if decoded < clip.frame_count:
         raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
     found = [job.result() for job in features]
-    return rgb, right, np.concatenate(list(pool.map(match_features, found[::2], found[1::2])))
+    matches = np.concatenate(list(pool.map(match_features, found[::2], found[1::2])))
+    return rgb, right, matches, find_lag(*profiles)
+
+
+def _in_step(clip: RectifiedClip, right: NDArray[np.uint8], sources: Sequence[int | None]) -> RectifiedClip:
+    """The clip, whose right frames [T, H, W, 3] and right masks become those of `sources`."""
+    move_frames(right, sources)
+    if clip.tissue_right is None:
+        return clip
+    tissue_right = clip.tissue_right[[t if source is None else source for t, source in enumerate(sources)]]
+    return replace(clip, tissue_right=tissue_right)
+
+
+def _matches(
+    rgb: NDArray[np.uint8], right: NDArray[np.uint8], frames: Sequence[int], pool: ThreadPoolExecutor
+) -> NDArray[np.float64]:
+    """Feature matches [M, 4] of some frames."""
+    eyes = [[find_features(grey_of(each[i])) for i in frames] for each in (rgb, right)]
+    return np.concatenate(list(pool.map(match_features, *eyes)))
 
 
 def _plan(

@@ -397,5 +397,4 @@ def test_damaged_frames_are_neither_measured_nor_matched_and_change_no_bit_of_th
     pairs = [sound[0], (noise[0], noise[1]), *sound[1:]]
     depth = estimate_depth(replace(clip_of(pairs), damaged=(1,)))
     assert depth.skipped == (1,)
-    assert not depth.depth_mm[1].any()
     np.testing.assert_array_equal(depth.depth_mm[[0, 2, 3, 4]], estimate_depth(clip_of(sound)).depth_mm)
