@@ -39,7 +39,7 @@ def at_own_depth(*sequences: Pictures) -> tuple[Pictures, ...]:
     scaled: list[Pictures] = []
     for sequence in sequences:
         if isinstance(sequence, ImageSequence):
-            sequence = cast(Pictures, replace(sequence, white=white, warnings=(*sequence.warnings, *told)))
+            sequence = cast(Pictures, replace(sequence, white=white, notices=(*sequence.notices, *told)))
             told = []
         scaled.append(sequence)
     return tuple(scaled)

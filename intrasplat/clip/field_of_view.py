@@ -42,7 +42,7 @@ OPENED_SHARE = 0.02
 """Share of the width: narrower bright parts, such as text on black, do not belong to the field."""
 RIM_SHARE, MAX_RIM_SHARE, RIM_BRIGHTNESS = 0.005, 0.03, 0.75
 """The rim that is taken off the field, for codecs and lenses blur it: its least width, as a share of the picture's; its
-greatest, as a share of the square root of the field's area. It ends where it has this share of the brightness within."""
+greatest, as a share of the square root of the field's area. It ends at this share of the field's brightness."""
 SLIVER_SHARE = 0.03
 """Share of the width: a dark part at the rim that cuts deeper into the field is tissue in shadow."""
 SAME_LEVELS = 3.0

@@ -37,7 +37,9 @@ class ImageSequence:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None = None  # images carry no time
-    warnings: tuple[Notice, ...] = ()
+    notices: tuple[Notice, ...] = ()
+    damaged: tuple[int, ...] = ()
+    pixel_aspect: float = 1.0
     white: int = MAX_16_BIT
     """The value of white in 16-bit pictures (bit_depth.py)."""
 

@@ -19,7 +19,7 @@ from intrasplat.clip.files import FileTree, check_exists, open_tree
 from intrasplat.clip.images import ImageSequence, open_images
 from intrasplat.clip.mask_levels import MASK_THRESHOLD, MaskLevels, read_levels
 from intrasplat.clip.naming import check_aligned, left_eye_only, right_eye_only
-from intrasplat.clip.packing import Packing, halves, packing_by_size
+from intrasplat.clip.packing import Packing, by_severity, halves, packing_by_size
 from intrasplat.clip.video import VideoFile, open_video, open_video_in
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
@@ -44,6 +44,7 @@ class TissueMasks:
     """Tissue pixels, tissue [T, H, W] bool, True = tissue, with the assumption behind them and warnings.
 
     right is the same for the right eye; None if the masks show the left eye alone. given: False if there are no masks.
+    remarks: what is good to know of masks in a video. damaged: indices of its damaged frames.
     """
 
     tissue: NDArray[np.bool_]
@@ -51,6 +52,8 @@ class TissueMasks:
     warnings: tuple[Notice, ...] = ()
     right: NDArray[np.bool_] | None = None
     given: bool = True
+    remarks: tuple[Notice, ...] = ()
+    damaged: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -155,8 +158,13 @@ def tissue_from_masks(
             if eye is not None:
                 np.logical_not(eye, out=eye)
     assumption = Notice.info(NoticeCode.MASKS, f"masks: {_classes(levels, bright)} ({reason})")
-    warnings = (*_level_warnings(levels, bright), *_tissue_warnings(tissue, right))
-    return TissueMasks(tissue, assumption, warnings, right)
+    sequences = (masks.frames,) if masks.right is None else (masks.frames, masks.right)
+    remarks, doubts = by_severity(sequences)
+    warnings = (*_level_warnings(levels, bright), *_tissue_warnings(tissue, right), *doubts)
+    damaged = tuple(sorted({index for each in sequences for index in each.damaged}))
+    if damaged and not both_eyes:
+        raise InputError(_FIELD, f"{len(damaged)} of its frames are damaged.", "Export the masks again, as PNG.")
+    return TissueMasks(tissue, assumption, warnings, right, True, remarks, damaged)
 
 
 def _classes(levels: MaskLevels, bright: BrightClass) -> str:

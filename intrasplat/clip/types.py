@@ -37,6 +37,8 @@ class StereoClip:
     tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
     tissue_right is the same for the right eye, or None if the masks show the left eye alone.
     frame_times_s is [T] float64, from the container, or i / 30 if it has none.
+    damaged lists frames with a damaged picture or mask, rising. No stage reads them.
+    pixel_aspect is width / height of a pixel by the container.
     """
 
     frame_count: int
@@ -48,6 +50,8 @@ class StereoClip:
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     tissue_right: NDArray[np.bool_] | None = None
+    damaged: tuple[int, ...] = ()
+    pixel_aspect: float = 1.0
 
 
 @dataclass(frozen=True)

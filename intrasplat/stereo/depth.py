@@ -42,6 +42,7 @@ from intrasplat.stereo.alignment import (
     outside_share,
 )
 from intrasplat.stereo.frames import FrameWork, grey_of
+from intrasplat.stereo.in_step import Profile, find_lag, move_frames, row_profile
 from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
@@ -80,9 +81,10 @@ def estimate_depth(
 
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
     on all), and so is the field of view with `fov` "auto". Otherwise a frame's depth depends on its own pair only, so
-    frames outside measured_frames do not change the depth of others. Frames that show no whole scene
+    frames outside measured_frames do not change the depth of others. Frames that are damaged or show no whole scene
     (clip/empty_frames.py) get no depth, nor, with skip_redundant, measured frames that show nothing new
-    (clip/sampling.py).
+    (clip/sampling.py). If the right eye is out of step (in_step.py), which all frames tell, its frames are moved, and
+    frames without a partner are skipped.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -98,11 +100,19 @@ def estimate_depth(
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
-    measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
+    given = set(range(clip.frame_count) if measured_frames is None else measured_frames)
+    measured = sorted(given - set(clip.damaged))
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
     with one_opencv_thread(), _pool() as pool:
         received = _receive(clip, spread(measured, ALIGNMENT_PAIRS), pool, hooks)
+        lag = find_lag(*received.profiles)
+        unpaired: tuple[int, ...] = ()
+        if lag is not None:
+            sources = lag.sources(clip.frame_count)
+            unpaired = tuple(t for t, source in enumerate(sources) if source is None)
+            clip = _in_step(clip, received, sources)
+            measured = sorted(set(measured) - set(unpaired))
         rgb, right_rgb = received.rgb, received.right_rgb
         shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
         empty = find_empty(received.thumbnails, measured, tissue_shares=shares)
@@ -119,7 +129,7 @@ def estimate_depth(
         )
         work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, fields, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        skipped = tuple(sorted({*empty.frames, *unused.frames}))
+        skipped = tuple(sorted({*empty.frames, *unused.frames, *clip.damaged, *unpaired}))
         wanted = sorted(set(range(clip.frame_count)) - set(skipped))
         order = sorted(wanted, key=lambda i: i != first)  # frame `first` is shown as soon as it has depth
         jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
@@ -146,6 +156,7 @@ def estimate_depth(
         assumptions=(*assumptions, _scale_assumption(clip), *fields.notices, *unused.notices(clip.frame_count)),
         warnings=clip.warnings
         + empty.notices(clip.frame_count)
+        + (() if lag is None else (lag.notice(unpaired),))
         + mask_warnings
         + registration.notices
         + _warnings(sure_share)
@@ -168,12 +179,14 @@ class _Received:
 
     rgb, right_rgb  [T, H, W, 3]
     thumbnails      T thumbnails of each eye (clip/sampling.py)
+    profiles        T profiles of each eye's rows (in_step.py)
     features        of some frames, by index: those of both eyes
     """
 
     rgb: NDArray[np.uint8]
     right_rgb: NDArray[np.uint8]
     thumbnails: tuple[list[Thumbnail], list[Thumbnail]]
+    profiles: tuple[list[Profile], list[Profile]]
     features: dict[int, tuple[Future[Features], Future[Features]]]
 
     def matches(self, frames: Sequence[int], pool: ThreadPoolExecutor) -> NDArray[np.float64]:
@@ -200,13 +213,15 @@ def _receive(clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecut
     rgb, right = (mapped_zeros(shape, np.uint8) for _ in range(2))
     features: dict[int, tuple[Future[Features], Future[Features]]] = {}
     thumbnails: tuple[list[Future[Thumbnail]], list[Future[Thumbnail]]] = ([], [])
+    profiles: tuple[list[Profile], list[Profile]] = ([], [])
     decoded = 0
     for i, (left_frame, right_frame) in enumerate(clip.pairs()):
         if i >= clip.frame_count:
             break
         _check_stop(hooks)
-        for frames, frame in ((rgb, left_frame), (right, right_frame)):
+        for frames, frame, rows in ((rgb, left_frame, profiles[0]), (right, right_frame, profiles[1])):
             frames[i] = frame
+            rows.append(row_profile(frame))
             let_go(frames[i])
         for eye, frame in zip(thumbnails, (left_frame, right_frame), strict=True):
             eye.append(pool.submit(thumbnail, frame))
@@ -218,7 +233,16 @@ def _receive(clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecut
     if decoded < clip.frame_count:
         raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
     left_small, right_small = ([job.result() for job in eye] for eye in thumbnails)
-    return _Received(rgb, right, (left_small, right_small), features)
+    return _Received(rgb, right, (left_small, right_small), profiles, features)
+
+
+def _in_step(clip: RectifiedClip, received: _Received, sources: Sequence[int | None]) -> RectifiedClip:
+    """The clip, whose right frames, their thumbnails and masks become those of `sources`; features are found anew."""
+    move_frames(received.right_rgb, sources)
+    chosen = [t if source is None else source for t, source in enumerate(sources)]
+    received.thumbnails[1][:] = [received.thumbnails[1][source] for source in chosen]
+    received.features.clear()
+    return clip if clip.tissue_right is None else replace(clip, tissue_right=clip.tissue_right[chosen])
 
 
 def _plan(

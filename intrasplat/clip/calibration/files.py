@@ -25,10 +25,13 @@ from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
 from intrasplat.intake.sniff import check_calibration_text
 
 
-def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> StereoCalibration:
+def load_calibration(
+    path: Path | str, *, eye_width: int, eye_height: int, pixel_aspect: float = 1.0
+) -> StereoCalibration:
     """The calibration in a file, for eyes of eye_width x eye_height pixels.
 
-    A file for another size of the same view is scaled, which `scaled_from` records. A file without size is used
+    A file for another size of the same view is scaled, which `scaled_from` records, also to pixels that are
+    pixel_aspect times as wide as high, or to eyes that are squeezed to half (see fitted). A file without size is used
     unchanged, which `assumptions` record.
 
     Raises:
@@ -45,7 +48,7 @@ def load_calibration(path: Path | str, *, eye_width: int, eye_height: int) -> St
         size_known = "width" in value or value.get("model") != "raw"
         calibration = checked_calibration(with_size(value, eye_width, eye_height) if not size_known else value)
         if size_known:
-            return fitted(calibration, eye_width, eye_height)
+            return fitted(calibration, eye_width, eye_height, pixel_aspect)
         check_centred(calibration)
     assumption = f"calibration names no image size: taken as {eye_width}x{eye_height}"
     return calibration.model_copy(update={"assumptions": (assumption,)})

@@ -94,8 +94,8 @@ def _open(files: ClipFiles) -> DepthClip:
         world_from_camera=poses.world_from_camera,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
         masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
-        assumptions=_assumptions(masks, poses, convention),
-        warnings=(*images.warnings, *masks.warnings, *_depth_warnings(depth_mm, masks.tissue), *doubts),
+        assumptions=(*_assumptions(masks, poses, convention), *images.notices),
+        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue), *doubts),
     )
 
 
@@ -104,6 +104,7 @@ def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -
     return (
         Notice.info(NoticeCode.LAYOUT, f"layout: {TITLE}"),
         masks.assumption,
+        *masks.remarks,
         Notice.info(NoticeCode.POSES, f"poses: {convention} camera-to-world, {camera} camera"),
         Notice.info(NoticeCode.INTRINSICS, "intrinsics: principal point at the image centre"),
         Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),
