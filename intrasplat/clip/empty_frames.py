@@ -20,7 +20,7 @@ PATCH_PX = 4
 EMPTY, FADED = 0.2, 0.8
 """Contrast of an empty frame, and of a frame beside one that is still fading, as shares of the clip's median."""
 KNOWN_PERCENTILE, UNKNOWN_PERCENTILE = 50.0, 95.0
-"""Of the patches, where the field of view is known, and where most of the picture may lie outside it."""
+"""Of the patches, where the field of view is known; where most of the picture may be outside it, or have no texture."""
 FEW_PERCENTILE, MIN_CONTRAST_LEVELS = 90.0, 0.3
 """Of the training frames' contrast, where half of them are empty; the least contrast of one that shows something."""
 MIN_TISSUE = 0.005
@@ -82,12 +82,15 @@ def find_empty(
     count = len(eyes[0])
     faded, torn = np.zeros((2, count), np.bool_)
     empty = np.zeros((len(eyes), count), np.bool_)
-    percentile = KNOWN_PERCENTILE if fields else UNKNOWN_PERCENTILE
     for eye, (thumbnails, inside) in enumerate(zip(eyes, fields or [None] * len(eyes), strict=True)):
-        contrast = np.array([_contrast(each, inside, percentile) for each in thumbnails])
-        usual = float(np.median(contrast[train]))
-        if usual < MIN_CONTRAST_LEVELS:  # most frames may be empty
-            usual = max(float(np.percentile(contrast[train], FEW_PERCENTILE)), MIN_CONTRAST_LEVELS)
+        for percentile in (KNOWN_PERCENTILE, UNKNOWN_PERCENTILE) if fields else (UNKNOWN_PERCENTILE,):
+            contrast = np.array([_contrast(each, inside, percentile) for each in thumbnails])
+            usual = float(np.median(contrast[train]))
+            if usual < MIN_CONTRAST_LEVELS:  # most frames may be empty
+                usual = float(np.percentile(contrast[train], FEW_PERCENTILE))
+            if usual >= MIN_CONTRAST_LEVELS:
+                break
+        usual = max(usual, MIN_CONTRAST_LEVELS)
         empty[eye] = contrast < EMPTY * usual
         faint = contrast < FADED * usual
         faded[train] |= _fading(empty[eye][train], faint[train])

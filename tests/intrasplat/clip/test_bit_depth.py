@@ -22,7 +22,7 @@ def deep(frames: NDArray[np.uint8], bits: int) -> NDArray[np.uint16]:
 
 
 def told(clip: StereoClip | DepthClip) -> list[str]:
-    return [each.text for each in clip.warnings if each.code is NoticeCode.BIT_DEPTH]
+    return [each.text for each in clip.assumptions if each.code is NoticeCode.BIT_DEPTH]
 
 
 def write(studio, left: NDArray[np.uint16], right: NDArray[np.uint16]) -> Path:

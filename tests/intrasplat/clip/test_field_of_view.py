@@ -93,7 +93,7 @@ def test_a_soft_rim_is_left_out() -> None:
     pictures = (tissue() * gain[..., None]).astype(np.uint8)
     found = find_field(pictures)
     assert np.percentile(gain[found], 2) > 0.5
-    assert agreement(found, disc(52)) > 0.9
+    assert agreement(found, disc(52)) > 0.85
 
 
 def test_text_in_the_border_and_flashes_change_nothing() -> None:

@@ -117,13 +117,6 @@ def test_told_masks_may_mark_no_tool_but_not_everything(studio, frames: Path) ->
         open_with(frames, masks=masks, mask_polarity="tissue")
 
 
-def test_a_frame_that_is_all_tool_is_warned_about(studio, frames: Path) -> None:
-    tool = studio.tool()
-    tool[2] = True
-    clip = open_clip(frames, masks=studio.masks("masks", tool))
-    assert "1 of 6 frames are all tool in their masks and cannot be learnt from" in texts(clip.warnings)
-
-
 def test_grey_edges_are_cut_at_half(studio, frames: Path) -> None:
     tool = studio.tool()
     grey = np.where(tool, np.uint8(128), np.uint8(127))
