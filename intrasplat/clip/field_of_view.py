@@ -147,7 +147,7 @@ def _without_rim(inside: Mask, brightest: Levels) -> Mask:
     away_px = cv2.distanceTransform(frame, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
     most_px = MAX_RIM_SHARE * float(np.sqrt(np.count_nonzero(inside)))
     usual = float(np.median(brightest[inside & (away_px > most_px) & (away_px <= 2 * most_px)]))
-    rim_px = max(RIM_SHARE * width, BLUR_PX / 2)
+    rim_px = max(RIM_SHARE * width, BLUR_PX / 2 + 1)
     while rim_px < most_px:
         ring = inside & (away_px > rim_px) & (away_px <= rim_px + 1)
         if not ring.any() or float(np.median(brightest[ring])) >= RIM_BRIGHTNESS * usual:
