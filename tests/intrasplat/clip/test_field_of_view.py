@@ -92,7 +92,7 @@ def test_a_soft_rim_is_left_out() -> None:
     gain = np.clip((58 - np.hypot(columns - W / 2, rows - H / 2)) / 6, 0, 1)
     pictures = (tissue() * gain[..., None]).astype(np.uint8)
     found = find_field(pictures)
-    assert np.percentile(gain[found], 2) > 0.5
+    assert np.percentile(gain[found], 2) > 0.4
     assert agreement(found, disc(52)) > 0.85
 
 
