@@ -3,10 +3,10 @@
     python -m lab.benchmarks.bm_field [--clip d4d_stereo] [--iterations 300] [--radius 0.47] [--out lab/rows/field.csv]
 
 Cuts both eyes of a stereo recording to a disc, with a rim of 12 px on which light falls to black, and noise outside.
-Then it trains `fast` on the whole clip, on the disc, and on the disc with fov=all. Each row has held-out psnr_tissue of the
-left eye inside the disc, less its rim, against the whole recording; of what lies outside, the shares that claim a
-confidence of at least 0.5 and that are marked as unseen; and the field that was found. psnr_tissue of the report is of
-the field alone.
+Then it trains `fast` on the whole clip, on the disc, and on the disc with fov=all. Each row has held-out psnr_tissue of
+the left eye inside the disc, less its rim, against the whole recording; of what lies outside, the shares that claim a
+confidence of at least 0.5 and that are marked as unseen; and the field that was found. psnr_tissue of the report is
+that of the field alone.
 """
 
 from __future__ import annotations
