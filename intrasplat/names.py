@@ -32,6 +32,9 @@ auto: the same, and without either they are found by colour and depth. none: eve
 PoseConvention = Literal["opengl", "llff"]
 """Axes of the poses in an EndoNeRF folder: as EndoNeRF writes them, or as LLFF does (docs/conventions.md)."""
 
+Fov = Literal["auto", "all"]
+"""The part of the pictures that shows the scene. auto: all but black borders, bars and labels. all: everything."""
+
 Poses = Literal["auto", "given", "fixed", "estimate"]
 """Where the camera's poses come from. given: from the clip. fixed: the camera does not move. estimate: from the
 pictures. auto: from the clip; if it has none, check whether the camera is fixed, and estimate its path if it is not."""

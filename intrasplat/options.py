@@ -14,7 +14,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core.core_schema import ValidationInfo
 
 from intrasplat.errors import InputError
-from intrasplat.names import Eyes, Keep, Layout, MaskPolarity, MaskSource, PoseConvention, Poses, PresetName, UsedFrames
+from intrasplat.names import (
+    Eyes,
+    Fov,
+    Keep,
+    Layout,
+    MaskPolarity,
+    MaskSource,
+    PoseConvention,
+    Poses,
+    PresetName,
+    UsedFrames,
+)
 
 Priority = Literal["standard", "high"]
 """high: runs before all standard jobs, and interrupts one that is running, which resumes later."""
@@ -72,6 +83,11 @@ class ReconstructionOptions(ClipOptions):
     poses: Poses = Field(
         default="auto",
         description="the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out",
+    )
+    fov: Fov = Field(
+        default="auto",
+        description="the part of the pictures that shows the scene: auto leaves out borders, bars and labels; all: "
+        "everything",
     )
     min_depth_mm: float = Field(default=MIN_DEPTH_MM, gt=0, description="nearest depth that stereo may find, in mm")
     max_depth_mm: float = Field(

@@ -15,7 +15,8 @@ from pathlib import Path
 import torch
 
 from intrasplat.clip import DepthClip, FrameSplit, split_frames, training_frames
-from intrasplat.clip.sampling import most_frames, sampled
+from intrasplat.clip.sampling import most_frames
+from intrasplat.clip.shown import with_shown_parts
 from intrasplat.errors import Cancelled, InputError, TrainingDiverged
 from intrasplat.instruments import zipped_masks
 from intrasplat.machine.cores import cores
@@ -181,7 +182,7 @@ def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timin
     On a GPU the splatting kernels are checked before stereo matching.
     """
     if isinstance(request.clip, DepthClip):
-        clip = request.clip if request.clip.skipped else sampled(request.clip, request.options)
+        clip = request.clip if request.clip.fov is not None else with_shown_parts(request.clip, request.options)
         return with_poses(clip, request.options, hooks, timings)
 
     def examined() -> None:

@@ -102,6 +102,7 @@ class Clip:
                 skip_redundant=chosen.use_frames == "new",
                 device=where.kind,
                 depth_range_mm=(chosen.min_depth_mm, chosen.max_depth_mm),
+                fov=chosen.fov,
                 mask_source=chosen.mask_source,
                 segmenter=self.segmenter,
             )

@@ -86,7 +86,7 @@ class Masks(BaseModel):
         description="given with the clip; found by colour and depth; by this installation's segmenter; none: every "
         "pixel counts as tissue"
     )
-    share: float = Field(default=0.0, ge=0, le=1, description="share of the left eye's pixels that are no tissue")
+    share: float = Field(default=0.0, ge=0, le=1, description="share of the left eye's field of view that is no tissue")
     sure: float | None = Field(
         default=None,
         ge=0,
@@ -98,6 +98,21 @@ class Masks(BaseModel):
     def are_found(self) -> bool:
         """Whether this program, or a segmenter, found them in the pictures."""
         return self.source in ("found", "segmenter")
+
+
+FieldShape = Literal["whole", "round", "rectangular", "other"]
+
+
+class FieldOfView(BaseModel):
+    """The part of the pictures that shows the scene. Outside it the model has nothing (docs/conventions.md)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    source: Literal["found", "all"] = Field(description="found in the pictures; all: the whole picture, as asked")
+    share: float = Field(ge=0, le=1, description="share of the left eye's picture")
+    shape: FieldShape = Field(description="whole: nothing of the picture was left out")
+    right_share: float | None = Field(default=None, ge=0, le=1, description="share of the right eye's; None: one eye")
+    label_share: float = Field(default=0.0, ge=0, le=1, description="share of the picture under labels and menus")
 
 
 class CameraPoses(BaseModel):
@@ -205,6 +220,9 @@ class Report(BaseModel):
         default=None, description="how it was registered; None for a clip of one eye, or whose depth was given"
     )
     masks: Masks | None = Field(default=None, description="how instruments were masked; None: a report of version 0.2")
+    field_of_view: FieldOfView | None = Field(
+        default=None, description="what of the pictures shows the scene; None: a report of version 0.3"
+    )
     poses: CameraPoses | None = Field(default=None, description="the endoscope's path; None: a report of version 0.2")
     recorded: Recorded | None = Field(
         default=None, description="recorded frames kept with the scene; None: keep_recorded was off, or version 0.2"

@@ -137,7 +137,7 @@ HOSTILE: dict[str, tuple[Callable[[Files], bytes], str]] = {
     "a file more": (lambda files: zipped({**files, "evil.py": b"x"}), "no file of a scene"),
     "out of the folder": (first_renamed("../manifest.json"), r'"\.\."'),
     "absolute": (first_renamed("/etc/manifest.json"), "absolute path"),
-    "a backslash": (first_renamed("..\\manifest.json"), "backslash"),
+    "backslashes": (first_renamed("..\\manifest.json"), r'"\.\."'),
     "a subfolder": (first_renamed("scene/manifest.json"), "no file of a scene"),
     "a link": (lambda files: zipped(files, kind=stat.S_IFLNK), "symbolic link"),
     "a device": (lambda files: zipped(files, kind=stat.S_IFCHR), "not a plain file"),

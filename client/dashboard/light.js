@@ -7,15 +7,17 @@ import { noticeWords, words } from "./messages.js";
 /** What a warning of each code does to the light. A code that is not here, of a newer service, asks for care. */
 const WEIGHTS = {
   "bad": [
-    "depth_disagrees", "eyes_disagree", "field_of_view_unusual", "held_out_score_low", "held_out_without_tissue",
-    "little_stereo_depth", "little_tissue", "nothing_held_out", "scores_failed", "training_score_low"
+    "depth_disagrees", "depth_inverted", "eyes_disagree", "field_of_view_unusual", "held_out_score_low",
+    "held_out_without_tissue", "little_stereo_depth", "little_tissue", "nothing_held_out", "scores_failed",
+    "training_score_low"
   ],
   "care": [
     "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "camera_or_tissue", "colour_changes",
-    "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "few_frames", "first_picture",
-    "frames_without_tissue", "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "little_depth",
-    "mask_gaps", "masks_mark_nothing", "masks_unsure", "no_instrument_masked", "no_texture", "out_of_focus",
-    "outlier_frames", "pose_far", "pose_jitter", "poses_unsure", "repeated_frames", "right_eye_low", "stereo_unsure",
+    "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual",
+    "eyes_out_of_step", "few_frames", "first_picture", "frames_show_nothing", "frames_without_tissue",
+    "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "little_depth", "mask_gaps", "mask_levels",
+    "masks_mark_nothing", "masks_unsure", "no_instrument_masked", "no_texture", "out_of_focus", "outlier_frames",
+    "pose_far", "pose_jitter", "poses_unsure", "repeated_frames", "right_eye_low", "stereo_unsure",
     "time_outside_clip", "time_too_short", "training_goes_on", "unclassified", "unseen", "veiled"
   ],
   "fine": [

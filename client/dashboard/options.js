@@ -4,7 +4,7 @@ import { hasWords, words } from "./messages.js";
 import { LIMITS } from "./wire.js";
 
 export const OPTIONS = [
-  ...["preset", "budget_s", "layout", "eyes", "poses", "priority", "mask_source", "mask_polarity", "keep_recorded"],
+  ...["preset", "budget_s", "layout", "eyes", "poses", "fov", "priority", "mask_source", "mask_polarity", "keep_recorded"],
 ];
 
 /** Give the form's fields the choices and limits of the service's options. @param {HTMLFormElement} form */

@@ -26,11 +26,13 @@ const cameraWords = ({ source, path_mm: mm }, isDoubted) =>
 /** What can be trusted, a sentence each, in mm, seconds and shares of the picture. @param {Report} report */
 function trusted(report) {
   const { frame_count: frames, frame_times_s: times, eyes, poses, masks, coverage, depth_agreement_mm: depth_mm } = report;
+  const { field_of_view: field } = report;
   const seconds = figure((times.at(-1) ?? 0) - (times[0] ?? 0), 1);
   const sentences = [words(`report.clip${eyes ? `_${eyes}` : ""}`, { frames: figure(frames), seconds })];
   const isMeasured = Number.isFinite(depth_mm);
   sentences.push(words(isMeasured ? "report.depth" : "report.no_depth", { mm: figure(depth_mm ?? 0, 1) }));
   if (Number.isFinite(coverage)) sentences.push(words("report.covered", { share: percent(coverage) }));
+  if (field && field.share < 1) sentences.push(words("report.field_of_view", { share: percent(field.share) }));
   if (masks) sentences.push(words(masks.source === "none" ? "report.no_masks" : "report.masks", { share: percent(masks.share) }));
   if (poses && !report.warnings.some(doubtsCamera(report))) sentences.push(cameraWords(poses, false));
   return sentences;

@@ -49,6 +49,15 @@
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
+ *   source: "found"|"all",
+ *   share: number,
+ *   shape: "whole"|"round"|"rectangular"|"other",
+ *   right_share?: number | null,
+ *   label_share?: number,
+ * }} FieldOfView
+ */
+/**
+ * @typedef {{
  *   frame: number,
  *   scored?: boolean,
  *   psnr_tissue_db: number | null,
@@ -87,6 +96,7 @@
  *   eyes?: "left"|"both",
  *   use_frames?: "new"|"all",
  *   poses?: "auto"|"given"|"fixed"|"estimate",
+ *   fov?: "auto"|"all",
  *   min_depth_mm?: number,
  *   max_depth_mm?: number,
  *   iterations?: number | null,
@@ -174,7 +184,7 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"calibration"|"decoding"|"depth_unit"|"frame_times"|"imported"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"poses"|"rectification"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"few_frames"|"field_of_view_unusual"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"bit_depth"|"calibration"|"decoding"|"depth_unit"|"field_of_view"|"frame_times"|"imported"|"interlaced"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"pixel_aspect"|"poses"|"rectification"|"rotation"|"synthetic"|"bases"|"early_stopping"|"spacing"|"stored_precision"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"damaged_frames"|"depth_inverted"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"eyes_coloured_apart"|"eyes_disagree"|"eyes_out_of_step"|"few_frames"|"field_of_view_unusual"|"frames_show_nothing"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"mask_levels"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   frames: number[],
@@ -219,6 +229,7 @@
  *   assumptions: Notice[],
  *   right_eye?: RightEye | null,
  *   masks?: Masks | null,
+ *   field_of_view?: FieldOfView | null,
  *   poses?: CameraPoses | null,
  *   recorded?: Recorded | null,
  *   measurements?: Record<string, number>,
@@ -285,6 +296,7 @@ export const LIMITS = {
   eyes: {"default": "both", "choices": ["left", "both"]},
   use_frames: {"default": "new", "choices": ["new", "all"]},
   poses: {"default": "auto", "choices": ["auto", "given", "fixed", "estimate"]},
+  fov: {"default": "auto", "choices": ["auto", "all"]},
   min_depth_mm: {"default": 10.0, "above": 0},
   max_depth_mm: {"default": 300.0, "above": 0},
   iterations: {"default": null, "min": 1, "max": 1000000},

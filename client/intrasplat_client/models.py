@@ -60,17 +60,22 @@ class NoticeCode(StrEnum):
     """The kind of a notice. Two notices of one code differ in their numbers and names only."""
 
     BASELINE = "baseline"
+    BIT_DEPTH = "bit_depth"
     CALIBRATION = "calibration"
     DECODING = "decoding"
     DEPTH_UNIT = "depth_unit"
+    FIELD_OF_VIEW = "field_of_view"
     FRAME_TIMES = "frame_times"
     IMPORTED = "imported"
+    INTERLACED = "interlaced"
     INTRINSICS = "intrinsics"
     LAYOUT = "layout"
     MASKS = "masks"
     MIDDLE_LINE_UNUSED = "middle_line_unused"
+    PIXEL_ASPECT = "pixel_aspect"
     POSES = "poses"
     RECTIFICATION = "rectification"
+    ROTATION = "rotation"
     SYNTHETIC = "synthetic"
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
@@ -84,13 +89,17 @@ class NoticeCode(StrEnum):
     CALIBRATION_SCALED = "calibration_scaled"
     COLOURS_UNKNOWN = "colours_unknown"
     COLOUR_CHANGES = "colour_changes"
+    DAMAGED_FRAMES = "damaged_frames"
+    DEPTH_INVERTED = "depth_inverted"
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
     EYES_COLOURED_APART = "eyes_coloured_apart"
     EYES_DISAGREE = "eyes_disagree"
+    EYES_OUT_OF_STEP = "eyes_out_of_step"
     FEW_FRAMES = "few_frames"
     FIELD_OF_VIEW_UNUSUAL = "field_of_view_unusual"
+    FRAMES_SHOW_NOTHING = "frames_show_nothing"
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
     FRAME_COUNT_UNKNOWN = "frame_count_unknown"
     HIDDEN_AT_FIRST = "hidden_at_first"
@@ -101,6 +110,7 @@ class NoticeCode(StrEnum):
     MASKS_MARK_NOTHING = "masks_mark_nothing"
     MASKS_UNSURE = "masks_unsure"
     MASK_GAPS = "mask_gaps"
+    MASK_LEVELS = "mask_levels"
     NO_INSTRUMENT_MASKED = "no_instrument_masked"
     NO_TEXTURE = "no_texture"
     NO_TIME = "no_time"
@@ -238,6 +248,21 @@ class DeliveryTry(Model):
     """for how long a receiver that answered 429 or 503 asked to be left alone (Retry-After)"""
 
 
+class FieldOfView(Model):
+    """The part of the pictures that shows the scene. Outside it the model has nothing (docs/conventions.md)."""
+
+    source: str
+    """found in the pictures; all: the whole picture, as asked"""
+    share: float
+    """share of the left eye's picture"""
+    shape: str
+    """whole: nothing of the picture was left out"""
+    right_share: float | None = None
+    """share of the right eye's; None: one eye"""
+    label_share: float = 0.0
+    """share of the picture under labels and menus"""
+
+
 class FrameScore(Model):
     """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
@@ -299,6 +324,8 @@ class JobOptions(Model):
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     poses: str = "auto"
     """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
+    fov: str = "auto"
+    """the part of the pictures that shows the scene: auto leaves out borders, bars and labels; all: everything"""
     min_depth_mm: float = 10.0
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: float = 300.0
@@ -362,7 +389,7 @@ class Masks(Model):
     as tissue
     """
     share: float = 0.0
-    """share of the left eye's pixels that are no tissue"""
+    """share of the left eye's field of view that is no tissue"""
     sure: float | None = None
     """how clearly found instruments were distinguished from tissue; None: no masks were found"""
 
@@ -510,6 +537,8 @@ class Report(Model):
     """how it was registered; None for a clip of one eye, or whose depth was given"""
     masks: Masks | None = None
     """how instruments were masked; None: a report of version 0.2"""
+    field_of_view: FieldOfView | None = None
+    """what of the pictures shows the scene; None: a report of version 0.3"""
     poses: CameraPoses | None = None
     """the endoscope's path; None: a report of version 0.2"""
     recorded: Recorded | None = None
@@ -632,6 +661,8 @@ class GivenOptions(TypedDict, total=False):
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     poses: Literal["auto", "given", "fixed", "estimate"]
     """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
+    fov: Literal["auto", "all"]
+    """the part of the pictures that shows the scene: auto leaves out borders, bars and labels; all: everything"""
     min_depth_mm: Annotated[float, Field(gt=0)]
     """nearest depth that stereo may find, in mm"""
     max_depth_mm: Annotated[float, Field(gt=0)]

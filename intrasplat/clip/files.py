@@ -30,8 +30,11 @@ _Item = TypeVar("_Item")
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts frame9 before frame10."""
-    parts = re.split(r"(\d+)", name.lower())
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+    parts = re.split(r"([0-9]+)", name.lower())
+    numbers = (part.lstrip("0") for part in parts[1::2])
+    keys: list[tuple[int, int, str]] = [(1, 0, part) for part in parts]
+    keys[1::2] = [(0, len(number), number) for number in numbers]
+    return tuple(keys)
 
 
 @dataclass(frozen=True)

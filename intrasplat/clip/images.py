@@ -20,9 +20,11 @@ from intrasplat.intake.limits import MAX_IMAGE_BYTES
 from intrasplat.intake.sniff import JPEG_MAGIC, PNG_MAGIC, png_size
 from intrasplat.notices import Notice
 
-MASK_THRESHOLD = 128  # of 255: masks are binary, but lossy video and resizing make grey edges
+MAX_16_BIT = (1 << 16) - 1
 _HEADER_BYTES = 1 << 16  # a JPEG's size comes after its metadata blocks, each of up to 64 kB
 _PNG_END = b"IEND\xaeB`\x82"
+_JPEG_END = b"\xff\xd9"  # after the start of the scan: thumbnails before it have ends of their own
+_JPEG_SCAN = 0xDA
 _JPEG_NOT_SIZES = frozenset({0xC4, 0xC8, 0xCC})  # markers in the range of frame headers that are no frame headers
 
 
@@ -35,7 +37,11 @@ class ImageSequence:
     height: int
     width: int
     frame_times_s: NDArray[np.float64] | None = None  # images carry no time
-    warnings: tuple[Notice, ...] = ()
+    notices: tuple[Notice, ...] = ()
+    damaged: tuple[int, ...] = ()
+    pixel_aspect: float = 1.0
+    white: int = MAX_16_BIT
+    """The value of white in 16-bit pictures (bit_depth.py)."""
 
     @property
     def frame_count(self) -> int:
@@ -48,7 +54,11 @@ class ImageSequence:
     def frames(self) -> Iterator[RgbFrame]:
         """The frames, RGB uint8 [H, W, 3], from the first on. InputError if an image is damaged."""
         for name in self.names:
-            yield as_rgb(self.decode(name), self.tree.field, name)
+            yield self.picture(name)
+
+    def picture(self, name: str) -> RgbFrame:
+        """One frame, RGB uint8 [H, W, 3]. InputError if it is damaged."""
+        return as_rgb(self.decode(name), self.white)
 
     def decode(self, name: str) -> NDArray[Any]:
         """The pixels as stored, with their size checked: [H, W] or [H, W, channels], uint8 or uint16, BGR order."""
@@ -79,33 +89,32 @@ def open_images(tree: FileTree, names: tuple[str, ...]) -> ImageSequence:
 
 
 def decode_image(data: bytes, field: str, name: str) -> NDArray[Any]:
-    """Pixels of a PNG or JPEG as stored (BGR order). InputError if it is cut short or damaged."""
-    whole = _PNG_END in data[-64:] if data.startswith(PNG_MAGIC) else b"\xff\xd9" in data[-64:]
+    """Pixels of a PNG or JPEG as stored (BGR order); bytes after its end do not count. InputError if damaged."""
+    whole = _PNG_END in data if data.startswith(PNG_MAGIC) else data.find(_JPEG_END, _jpeg_scan(data)) >= 0
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if image is None:
+        if whole and (bits := _jpeg_bits(data)) not in (None, 8):
+            raise InputError(field, f"{name} is a JPEG of {bits} bits a colour.", "Write it as a PNG of 16 bits.")
         raise InputError(field, f"{name} is damaged or cut short.", "Write the image again.")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(field, f"{name} has pixels of type {image.dtype}.", "Give 8-bit or 16-bit images.")
     return np.asarray(image)
 
 
-def as_rgb(image: NDArray[Any], field: str, name: str) -> RgbFrame:
-    """A decoded image as RGB uint8 [H, W, 3]: grey is repeated, alpha dropped, 16 bit scaled to 8."""
+def as_rgb(image: NDArray[Any], white: int = MAX_16_BIT) -> RgbFrame:
+    """A decoded image as RGB uint8 [H, W, 3]: grey is repeated, alpha dropped, 16 bit scaled so that white is 255."""
     if image.dtype == np.uint16:
-        if 0 < image.max() <= 255:
-            raise InputError(
-                field, f"{name} stores 8-bit values in 16 bits (largest {image.max()}).", "Write it as 8-bit."
-            )
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        image = ((np.minimum(image, white).astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8)
     to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
     return np.asarray(cv2.cvtColor(image, to_rgb[1 if image.ndim == 2 else image.shape[2]]))
 
 
-def as_mask(image: NDArray[Any]) -> NDArray[np.bool_]:
-    """A decoded mask as bool [H, W]: True where any colour channel reaches half of its range."""
-    threshold = MASK_THRESHOLD * 257 if image.dtype == np.uint16 else MASK_THRESHOLD
-    colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
-    return np.asarray(colours >= threshold)
+def as_levels(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """A decoded mask as uint8 [H, W] or [H, W, 3]: without alpha, 16 bit scaled to 8 unless all are below 256."""
+    levels = image if image.ndim == 2 else image[:, :, :3]
+    if image.dtype == np.uint16 and levels.max() > 255:
+        levels = levels // 257
+    return levels.astype(np.uint8)
 
 
 def as_depth_mm(image: NDArray[Any], field: str, name: str) -> NDArray[np.float32]:
@@ -133,10 +142,33 @@ def _size_of(tree: FileTree, name: str) -> tuple[int, int]:
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """(width, height) of a JPEG; walks the marker segments up to the frame header (ITU T.81, B.2)."""
+    if (at := _jpeg_frame(data)) is None:
+        return None
+    return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+
+
+def _jpeg_bits(data: bytes) -> int | None:
+    """Bits of a colour in a JPEG; None if it has no frame header."""
+    at = _jpeg_frame(data)
+    return None if at is None else data[at + 4]
+
+
+def _jpeg_frame(data: bytes) -> int | None:
+    """Where the frame header of a JPEG starts."""
+    found = (at for at, marker in _jpeg_segments(data) if 0xC0 <= marker <= 0xCF and marker not in _JPEG_NOT_SIZES)
+    return next(found, None)
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Where the pixels of a JPEG start; its length if there are none."""
+    return next((at for at, marker in _jpeg_segments(data) if marker == _JPEG_SCAN), len(data))
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """(place, marker) of each segment before the pixels, which come after the marker _JPEG_SCAN."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in _JPEG_NOT_SIZES:
-            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        yield at, data[at + 1]
+        if data[at + 1] == _JPEG_SCAN:
+            return
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None

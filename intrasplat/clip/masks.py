@@ -8,18 +8,18 @@ Symbols: T frames, H W pixels of one eye.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.files import FileTree, check_exists, open_tree
-from intrasplat.clip.images import MASK_THRESHOLD, ImageSequence, as_mask, open_images
+from intrasplat.clip.images import ImageSequence, open_images
+from intrasplat.clip.mask_levels import MASK_THRESHOLD, MaskLevels, read_levels
 from intrasplat.clip.naming import check_aligned, left_eye_only, right_eye_only
-from intrasplat.clip.packing import Packing, halves, packing_by_size
+from intrasplat.clip.packing import Packing, by_severity, halves, packing_by_size
 from intrasplat.clip.video import VideoFile, open_video, open_video_in
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import ClipLimits
@@ -29,8 +29,14 @@ from intrasplat.notices import Notice, NoticeCode
 BrightClass = Literal["tool", "tissue"]  # what a white pixel means
 
 MAX_TOOL_SHARE = 0.4  # of the area: by look, a larger class is never taken as the instrument
+MAX_PARTS = 4
+"""Classes besides tissue: shaft, wrist, jaws and another part. Where there are more, some may be organs."""
 _FIELD = "masks"
 _POLARITY_REMEDY = 'Say mask_polarity "tool" if white marks instruments, "tissue" if white marks tissue.'
+_LEVELS_REMEDY = (
+    'Write 255 on instruments and 0 elsewhere; or say mask_polarity "tool" if all levels but the lowest are '
+    'instruments, "tissue" if all but the highest are.'
+)
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,7 @@ class TissueMasks:
     """Tissue pixels, tissue [T, H, W] bool, True = tissue, with the assumption behind them and warnings.
 
     right is the same for the right eye; None if the masks show the left eye alone. given: False if there are no masks.
+    remarks: what is good to know of masks in a video. damaged: indices of its damaged frames.
     """
 
     tissue: NDArray[np.bool_]
@@ -45,6 +52,8 @@ class TissueMasks:
     warnings: tuple[Notice, ...] = ()
     right: NDArray[np.bool_] | None = None
     given: bool = True
+    remarks: tuple[Notice, ...] = ()
+    damaged: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -134,14 +143,49 @@ def tissue_from_masks(
     _check_shape(masks.shape, (shape[0], *masks.shape[1:]) if packing else shape, "left")
     if both_eyes and masks.right is not None:
         _check_shape((masks.right.frame_count, masks.right.height, masks.right.width), shape, "right")
-    white, right = _white_of_eyes(masks, packing, both_eyes=both_eyes)
-    bright, reason = _bright_class(white, polarity, by_layout)
+    levels, right_values = _levels_of_eyes(masks, packing, both_eyes=both_eyes)
+    above_lowest, highest = levels.thresholds
+    white_tissue = levels.values >= highest if levels.several else None
+    white_tool = _white(levels.values, above_lowest)
+    bright, reason = _bright_class(white_tool, white_tissue, levels, polarity, by_layout)
+    if levels.has_colours and bright == "tissue":
+        problem = f"the masks have {levels.colours} colours, and it is not clear which are tissue."
+        raise InputError(_FIELD, problem, "Write 255 on instruments and 0 elsewhere.")
+    tissue = white_tool if white_tissue is None or bright == "tool" else white_tissue
+    right = None if right_values is None else _white(right_values, above_lowest if bright == "tool" else highest)
     if bright == "tool":
-        for eye in (white, right):
+        for eye in (tissue, right):
             if eye is not None:
                 np.logical_not(eye, out=eye)
-    assumption = Notice.info(NoticeCode.MASKS, f"masks: white is {bright} ({reason})")
-    return TissueMasks(white, assumption, _tissue_warnings(white, right), right)
+    assumption = Notice.info(NoticeCode.MASKS, f"masks: {_classes(levels, bright)} ({reason})")
+    sequences = (masks.frames,) if masks.right is None else (masks.frames, masks.right)
+    remarks, doubts = by_severity(sequences)
+    warnings = (*_level_warnings(levels, bright), *_tissue_warnings(tissue, right), *doubts)
+    damaged = tuple(sorted({index for each in sequences for index in each.damaged}))
+    if damaged and not both_eyes:
+        raise InputError(_FIELD, f"{len(damaged)} of its frames are damaged.", "Export the masks again, as PNG.")
+    return TissueMasks(tissue, assumption, warnings, right, True, remarks, damaged)
+
+
+def _classes(levels: MaskLevels, bright: BrightClass) -> str:
+    """Which levels are the instrument, as text."""
+    if set(levels.thresholds) == {MASK_THRESHOLD}:
+        return f"white is {bright}"
+    tissue = levels.levels[0 if bright == "tool" else -1]
+    others = [str(each) for each in levels.levels if each != tissue]
+    one = len(others) == 1
+    return f"level{'' if one else 's'} {', '.join(others)} {'is' if one else 'are'} instrument, {tissue} is tissue"
+
+
+def _level_warnings(levels: MaskLevels, bright: BrightClass) -> tuple[Notice, ...]:
+    if not levels.several:
+        return ()
+    classes = "all colours but black are instrument" if levels.has_colours else _classes(levels, bright)
+    text = (
+        f"the masks have {levels.colours} classes, taken as parts of instruments: {classes}; if one of them "
+        "is an organ, give masks of the instruments alone"
+    )
+    return (Notice.warning(NoticeCode.MASK_LEVELS, text),)
 
 
 def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None) -> tuple[Notice, ...]:
@@ -153,83 +197,85 @@ def _tissue_warnings(tissue: NDArray[np.bool_], right: NDArray[np.bool_] | None)
     warnings = []
     if tissue.all():
         warnings.append(Notice.warning(NoticeCode.MASKS_MARK_NOTHING, "the masks mark no instrument in any frame"))
-    covered = int((~tissue.any(axis=(1, 2))).sum())
-    if covered:
-        warnings.append(
-            Notice.warning(
-                NoticeCode.FRAMES_WITHOUT_TISSUE,
-                f"{covered} of {len(tissue)} frames are all tool in their masks and cannot be learnt from",
-            )
-        )
     return tuple(warnings)
 
 
-def _white_of_eyes(
+def _levels_of_eyes(
     masks: MaskFrames, packing: Packing | None, *, both_eyes: bool
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-    """White pixels [T, H, W] of the left eye, and of the right eye if masks show it and both_eyes is set."""
-    white = _white(masks.frames)
-    if packing is not None:
-        left, right = (np.stack(eye) for eye in zip(*(halves(each, packing) for each in white), strict=True))
-        return left, right
-    return white, _white(masks.right) if both_eyes and masks.right is not None else None
+) -> tuple[MaskLevels, NDArray[np.uint8] | None]:
+    """The left eye's masks, and the right eye's values [T, H, W] if masks show it and both_eyes is set.
 
-
-def _white(frames: ImageSequence | VideoFile) -> NDArray[np.bool_]:
-    """White pixels [T, H, W]. InputError if the images have nonzero values but no white."""
-    decoded: Iterator[NDArray[Any]]
-    decoded = map(frames.decode, frames.names) if isinstance(frames, ImageSequence) else frames.frames()
-    white = np.empty((frames.frame_count, frames.height, frames.width), dtype=np.bool_)
-    largest = 0
-    for index, image in enumerate(decoded):
-        white[index] = as_mask(image)
-        largest = max(largest, int(image.max()) // (257 if image.dtype == np.uint16 else 1))
-    if isinstance(frames, ImageSequence) and 0 < largest < MASK_THRESHOLD:
+    InputError if the images have nonzero values but no level that could be white.
+    """
+    read = read_levels(masks.frames)
+    largest = int(read.values.max())
+    if isinstance(masks.frames, ImageSequence) and len(read.levels) < 2 and 0 < largest < MASK_THRESHOLD:
         raise InputError(
             _FIELD, f"the largest value in the masks is {largest} of 255.", "Write masks with the values 0 and 255."
         )
-    return white
+    if packing is not None:
+        left, right = (np.stack(eye) for eye in zip(*(halves(each, packing) for each in read.values), strict=True))
+        return replace(read, values=left), right
+    return read, read_levels(masks.right).values if both_eyes and masks.right is not None else None
+
+
+def _white(values: NDArray[np.uint8], threshold: int) -> NDArray[np.bool_]:
+    """Where values reach the threshold, in the place of the values: masks may fill much of the memory."""
+    return np.greater_equal(values, threshold, out=values.view(np.bool_))
 
 
 def _bright_class(
-    white: NDArray[np.bool_], polarity: MaskPolarity, by_layout: tuple[str, BrightClass] | None
+    white_tool: NDArray[np.bool_],
+    white_tissue: NDArray[np.bool_] | None,
+    levels: MaskLevels,
+    polarity: MaskPolarity,
+    by_layout: tuple[str, BrightClass] | None,
 ) -> tuple[BrightClass, str]:
-    """What white means, and the reason as text."""
+    """What white means, and the reason as text.
+
+    white_tool are the bright pixels if these are the instrument, white_tissue if they are tissue; None: the same.
+    """
     if polarity != "auto":
         return polarity, "as specified"
-    if white.all() or not white.any():
-        colour = "white" if white.any() else "black"
+    if white_tool.all() or not white_tool.any():
+        colour = "white" if white_tool.any() else "black"
         raise InputError(
             _FIELD,
             f"every mask is {colour} all over, so nothing is marked.",
             "Leave the masks out if no instrument shows. " + _POLARITY_REMEDY,
         )
-    look = _bright_class_by_look(white)
-    share = f"white covers {100 * white.mean():.0f} % of the area"
+    remedy, share = _POLARITY_REMEDY, f"white covers {100 * white_tool.mean():.0f} % of the area"
+    if levels.several:
+        remedy, share = _LEVELS_REMEDY, f"levels of 255: {levels}"
+        if levels.colours - 1 > MAX_PARTS:
+            problem = f"the masks have {levels.colours} classes, perhaps organs among them ({share})."
+            raise InputError(_FIELD, problem, remedy)
+    look = _bright_class_by_look(white_tool, white_tool if white_tissue is None else white_tissue)
     if by_layout is not None:
         layout, bright = by_layout
         if look in (None, bright):
             return bright, f"the {layout} layout's rule"
         raise InputError(
-            _FIELD, f"the {layout} layout says white is {bright}, the masks look inverted ({share}).", _POLARITY_REMEDY
+            _FIELD, f"the {layout} layout says white is {bright}, the masks look inverted ({share}).", remedy
         )
     if look is None:
-        raise InputError(
-            _FIELD, f"cannot tell whether white or black marks the instrument ({share}).", _POLARITY_REMEDY
-        )
+        which = "which levels mark" if levels.several else "whether white or black marks"
+        raise InputError(_FIELD, f"cannot tell {which} the instrument ({share}).", remedy)
     return look, f"the instrument enters from the border and covers less than {100 * MAX_TOOL_SHARE:.0f} %; {share}"
 
 
-def _bright_class_by_look(white: NDArray[np.bool_]) -> BrightClass | None:
+def _bright_class_by_look(white_tool: NDArray[np.bool_], white_tissue: NDArray[np.bool_]) -> BrightClass | None:
     """What white means, if one class covers little area and touches the border in most of its frames; else None."""
-    border = np.concatenate([white[:, 0], white[:, -1], white[:, :, 0], white[:, :, -1]], axis=1)
-    if white.mean() < MAX_TOOL_SHARE:
-        touches = 2 * border.any(axis=1).sum() > white.any(axis=(1, 2)).sum()
-        return "tool" if touches else None
-    if 1.0 - white.mean() < MAX_TOOL_SHARE:
-        touches = 2 * (~border).any(axis=1).sum() > (~white.all(axis=(1, 2))).sum()
-        return "tissue" if touches else None
-    return None
+    if _looks_like_instrument(white_tool):
+        return "tool"
+    return "tissue" if _looks_like_instrument(~white_tissue) else None
+
+
+def _looks_like_instrument(marked: NDArray[np.bool_]) -> bool:
+    if marked.mean() >= MAX_TOOL_SHARE:
+        return False
+    border = np.concatenate([marked[:, 0], marked[:, -1], marked[:, :, 0], marked[:, :, -1]], axis=1)
+    return bool(2 * border.any(axis=1).sum() > marked.any(axis=(1, 2)).sum())
 
 
 def _check_shape(given: tuple[int, int, int], shape: tuple[int, int, int], eye: str) -> None:

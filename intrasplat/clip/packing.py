@@ -6,7 +6,7 @@ Symbols: T frames, H W pixels of one eye.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar
 
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from intrasplat.clip.types import RgbFrame
 from intrasplat.errors import InputError
-from intrasplat.notices import Notice
+from intrasplat.notices import Notice, Severity
 
 Packing = Literal["sbs", "tb"]
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 
 PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb": "top-bottom, left eye on top"}
+
+MAX_RATE_RATIO = 1.1  # Matroska's milliseconds change a rate of 120 Hz by 4 %
 
 _EYE_ASPECTS = (0.8, 2.4)  # plausible width / height of an endoscope's eye; 5:4 and 16:9 are well inside
 _CLEAR_MARGIN = 0.15  # of correlation; with a larger one, content overrides the shape
@@ -32,7 +34,10 @@ _MAX_FRAMES_COMPARED = 30  # clips may start black
 
 
 class FrameSequence(Protocol):
-    """T RGB frames of one size: a video or images. Each call of frames() starts again from frame 0."""
+    """T RGB frames of one size: a video or images. Each call of frames() starts again from frame 0.
+
+    damaged: indices of frames from which nothing must be learnt. pixel_aspect: width / height of a pixel.
+    """
 
     @property
     def frame_count(self) -> int: ...
@@ -45,7 +50,11 @@ class FrameSequence(Protocol):
     @property
     def frame_times_s(self) -> NDArray[np.float64] | None: ...
     @property
-    def warnings(self) -> tuple[Notice, ...]: ...
+    def notices(self) -> tuple[Notice, ...]: ...
+    @property
+    def damaged(self) -> tuple[int, ...]: ...
+    @property
+    def pixel_aspect(self) -> float: ...
     def frames(self) -> Iterator[RgbFrame]: ...
 
 
@@ -57,8 +66,8 @@ class PackedPairs:
     packing: Packing
 
     @property
-    def warnings(self) -> tuple[Notice, ...]:
-        return self.sequence.warnings
+    def sequences(self) -> tuple[FrameSequence, ...]:
+        return (self.sequence,)
 
     @property
     def eye_size(self) -> tuple[int, int]:
@@ -79,20 +88,34 @@ class TwoSequences:
     right: FrameSequence
 
     @property
-    def warnings(self) -> tuple[Notice, ...]:
-        return self.left.warnings + self.right.warnings
+    def sequences(self) -> tuple[FrameSequence, ...]:
+        return (self.left, self.right)
 
     def __call__(self) -> Iterator[tuple[RgbFrame, RgbFrame]]:
         return zip(self.left.frames(), self.right.frames(), strict=True)
 
 
+def by_severity(sequences: Iterable[FrameSequence]) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
+    """The sequences' notices: those that are good to know, and warnings."""
+    notices = [notice for each in sequences for notice in each.notices]
+    infos = tuple(each for each in notices if each.severity is Severity.INFO)
+    return infos, tuple(each for each in notices if each.severity is Severity.WARNING)
+
+
 def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
-    """The frame pairs of a left and a right sequence. InputError if their lengths or sizes differ."""
+    """The frame pairs of a left and a right sequence. InputError if their lengths, rates or sizes differ."""
     if left.frame_count != right.frame_count:
         raise InputError(
             "right",
             f"the right eye has {right.frame_count} frames, the left {left.frame_count}.",
             "Cut both to the same frames.",
+        )
+    rates_hz = [_rate_hz(each) for each in (left, right)]
+    if 0 < min(rates_hz) * MAX_RATE_RATIO < max(rates_hz):
+        raise InputError(
+            "right",
+            f"the right eye has {rates_hz[1]:.4g} frames a second, the left {rates_hz[0]:.4g}.",
+            "Give both eyes at one rate, so that frame i of both shows one moment.",
         )
     if (left.height, left.width) != (right.height, right.width):
         raise InputError(
@@ -101,6 +124,12 @@ def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
             "Give both eyes in one size.",
         )
     return TwoSequences(left, right)
+
+
+def _rate_hz(sequence: FrameSequence) -> float:
+    """Frames a second by the median step between them; 0 if there are no times."""
+    times_s = sequence.frame_times_s
+    return 0.0 if times_s is None or len(times_s) < 2 else 1 / float(np.median(np.diff(times_s)))
 
 
 def halves(frame: NDArray[Pixel], packing: Packing) -> tuple[NDArray[Pixel], NDArray[Pixel]]:
@@ -138,7 +167,8 @@ def detect_packing(sequence: FrameSequence) -> Packing:
         raise InputError(
             "clip",
             f"{sequence.label} does not look like two eyes in one picture ({figures}).",
-            'Give the right eye as a second file, or say layout "sbs" or "tb" if the clip is stereo.',
+            'Give the right eye as a second file, or both in folders left/ and right/, or say layout "sbs" or "tb" '
+            "if the clip is stereo.",
         )
     if by_shape in (None, by_content) or abs(likeness["sbs"] - likeness["tb"]) >= _CLEAR_MARGIN:
         return by_content

@@ -7,7 +7,7 @@ Symbols: T frames, h w pixels of a thumbnail, P patches of PATCH x PATCH pixels 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -130,13 +130,15 @@ def most_frames(options: ReconstructionOptions) -> int | None:
     return max(LEAST_FRAMES, round(FRAMES_A_SECOND * (options.budget_s or BUDGETS_S[options.preset])))
 
 
-def sampled(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
-    """A clip with depth, with skipped training frames in skipped."""
+def sampled(clip: DepthClip, options: ReconstructionOptions, empty: Collection[int] = ()) -> DepthClip:
+    """A clip with depth, with its empty frames and skipped training frames in skipped."""
     if options.use_frames == "all":
-        return clip
-    found = skippable_frames(clip.rgb, training_frames(clip.frame_count, options.holdout), most_frames(options))
+        return replace(clip, skipped=tuple(sorted(empty)))
+    train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(empty))
+    found = skippable_frames(clip.rgb, train, most_frames(options))
     assumptions = tuple(each for each in clip.assumptions if each.code not in SKIPPED_CODES)
-    return replace(clip, skipped=found.frames, assumptions=(*assumptions, *found.notices(clip.frame_count)))
+    skipped = tuple(sorted({*empty, *found.frames}))
+    return replace(clip, skipped=skipped, assumptions=(*assumptions, *found.notices(clip.frame_count)))
 
 
 def _noise(thumbnails: Sequence[Thumbnail]) -> NDArray[np.float64]:

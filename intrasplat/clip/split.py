@@ -49,7 +49,7 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     Clips under 9 frames have no held-out frames, with a warning. InputError for unknown rules and missing frames.
     """
     count = clip.frame_count
-    held_out = held_out_frames(count, holdout)
+    held_out = [index for index in held_out_frames(count, holdout) if index not in clip.skipped]
     train = sorted(set(range(count)) - set(held_out) - set(clip.skipped))
     if holdout == "none":
         return FrameSplit(train, [], list(clip.skipped))

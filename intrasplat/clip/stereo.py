@@ -9,11 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames, tissue_from_masks
-from intrasplat.clip.naming import eye_of, left_eye_only, pair_names
-from intrasplat.clip.packing import PACKING_WORDS, FrameSequence, PackedPairs, Packing, TwoSequences, pair_sequences
+from intrasplat.clip.naming import eye_folders, eye_of, left_eye_only, pair_names
+from intrasplat.clip.packing import (
+    PACKING_WORDS,
+    FrameSequence,
+    PackedPairs,
+    Packing,
+    TwoSequences,
+    by_severity,
+    pair_sequences,
+)
 from intrasplat.clip.types import StereoClip
 from intrasplat.clip.video import FALLBACK_RATE_HZ, open_video_in
 from intrasplat.errors import InputError
@@ -39,12 +48,13 @@ def packed_clip(
 
 def two_sequence_clip(left: FrameSequence, right: FrameSequence, assumption: Notice, limits: ClipLimits) -> StereoClip:
     """The clip of one sequence per eye. InputError if their lengths or sizes differ."""
-    return _stereo_clip(pair_sequences(left, right), (assumption,), limits)
+    return _stereo_clip(pair_sequences(*at_own_depth(left, right)), (assumption,), limits)
 
 
 def two_video_clip(tree: FileTree, videos: tuple[str, ...]) -> StereoClip:
     """The clip of two videos in a tree whose names give the eye. InputError if there are other videos."""
-    eyes = {found[0] for name in videos if (found := eye_of(name))}
+    folders = eye_folders(videos)
+    eyes = {found[0] for name in videos if (found := eye_of(name, folders))}
     if len(videos) != 2 or eyes != {"left", "right"}:
         raise InputError(
             "clip",
@@ -85,13 +95,14 @@ def with_masks(
         clip,
         tissue=masks.tissue,
         tissue_right=masks.right,
-        assumptions=(*clip.assumptions, masks.assumption, right),
+        assumptions=(*clip.assumptions, masks.assumption, right, *masks.remarks),
         warnings=(*clip.warnings, *masks.warnings),
+        damaged=tuple(sorted({*clip.damaged, *masks.damaged})),
     )
 
 
 def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[Notice, ...], limits: ClipLimits) -> StereoClip:
-    first = pairs.sequence if isinstance(pairs, PackedPairs) else pairs.left
+    first = pairs.sequences[0]
     height, width = pairs.eye_size if isinstance(pairs, PackedPairs) else (first.height, first.width)
     if min(height, width) < MIN_SIDE_PX:
         raise InputError("clip", f"one eye is {width}x{height} pixels.", f"Give at least {MIN_SIDE_PX} a side.")
@@ -101,4 +112,16 @@ def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[Notice, .
         frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ
         text = f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none"
         assumptions = (*assumptions, Notice.info(NoticeCode.FRAME_TIMES, text))
-    return StereoClip(first.frame_count, height, width, pairs, None, frame_times_s, assumptions, pairs.warnings)
+    infos, warnings = by_severity(pairs.sequences)
+    return StereoClip(
+        frame_count=first.frame_count,
+        height=height,
+        width=width,
+        pairs=pairs,
+        tissue=None,
+        frame_times_s=frame_times_s,
+        assumptions=(*assumptions, *infos),
+        warnings=warnings,
+        damaged=tuple(sorted({index for each in pairs.sequences for index in each.damaged})),
+        pixel_aspect=first.pixel_aspect,
+    )

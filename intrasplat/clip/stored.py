@@ -22,14 +22,14 @@ from intrasplat.clip.types import PIXELS, DepthClip, Eye
 from intrasplat.files.durable import flush, replace_file
 from intrasplat.machine.mapped import let_go
 from intrasplat.notices import Notice
-from intrasplat.report import CameraPoses, Masks, RightEye
+from intrasplat.report import CameraPoses, FieldOfView, Masks, RightEye
 
-VERSION = 5
+VERSION = 6
 """Format version, raised with every change of the folder's content; no version reads another's folder."""
 MANIFEST = "manifest.json"
 EYES = ("left", "right")
 ARRAYS = (*PIXELS, "world_from_camera")
-TIMES = "frame_times_s"
+TIMES, FIELD = "frame_times_s", "field_of_view"
 
 
 def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callable[[], bool] = lambda: False) -> None:
@@ -58,6 +58,7 @@ def save_clip(folder: Path, clip: DepthClip, identity: str, should_stop: Callabl
         "intrinsics": [eye.intrinsics.numbers() for eye in clip.eyes],
         "registration": clip.registration and clip.registration.model_dump(),
         "masks": clip.masks and clip.masks.model_dump(),
+        "fov": clip.fov and clip.fov.model_dump(),
         "rectification": clip.rectification and clip.rectification.numbers(),
         "poses": clip.poses and clip.poses.model_dump(),
         "left_out": clip.skipped,
@@ -84,6 +85,7 @@ def load_clip(folder: Path, identity: str) -> DepthClip | None:
             right=Eye(**eyes[1]) if len(eyes) > 1 else None,
             registration=manifest["registration"] and RightEye.model_validate(manifest["registration"]),
             masks=manifest["masks"] and Masks.model_validate(manifest["masks"]),
+            fov=manifest["fov"] and FieldOfView.model_validate(manifest["fov"]),
             rectification=manifest["rectification"] and Rectification.parsed(manifest["rectification"]),
             poses=manifest["poses"] and CameraPoses.model_validate(manifest["poses"]),
             skipped=tuple(manifest["left_out"]),
@@ -99,12 +101,15 @@ def _arrays(clip: DepthClip) -> dict[str, NDArray[Any]]:
     arrays = {
         f"{side}_{name}": getattr(eye, name) for side, eye in zip(EYES, clip.eyes, strict=False) for name in ARRAYS
     }
-    return arrays | {TIMES: clip.frame_times_s}
+    fields = {f"{side}_{FIELD}": eye.field_of_view for side, eye in zip(EYES, clip.eyes, strict=False)}
+    return arrays | {name: each for name, each in fields.items() if each is not None} | {TIMES: clip.frame_times_s}
 
 
 def _eye(folder: Path, side: str, intrinsics: dict[str, Any]) -> dict[str, Any]:
     arrays = {name: np.asarray(np.load(folder / f"{side}_{name}.npy", mmap_mode="r+")) for name in ARRAYS}
-    return {**arrays, "intrinsics": Intrinsics.parsed(intrinsics)}
+    file = folder / f"{side}_{FIELD}.npy"
+    field = np.load(file) if file.exists() else None
+    return {**arrays, FIELD: field, "intrinsics": Intrinsics.parsed(intrinsics)}
 
 
 def _write(path: Path, array: NDArray[Any], should_stop: Callable[[], bool]) -> bool:

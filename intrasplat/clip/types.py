@@ -16,7 +16,7 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip.recorded_masks import Rectification
 from intrasplat.machine.mapped import let_go
 from intrasplat.notices import Notice
-from intrasplat.report import CameraPoses, Masks, RightEye
+from intrasplat.report import CameraPoses, FieldOfView, Masks, RightEye
 
 PIXELS = ("rgb", "tissue", "depth_mm", "depth_confidence")
 """Names of an eye's arrays [T, H, W, ...]. They may be mapped from files (intrasplat/machine/mapped.py)."""
@@ -37,6 +37,8 @@ class StereoClip:
     tissue is [T, H, W] bool (True = tissue) in the pixels of the recorded left eye, or None without masks.
     tissue_right is the same for the right eye, or None if the masks show the left eye alone.
     frame_times_s is [T] float64, from the container, or i / 30 if it has none.
+    damaged lists frames with a damaged picture or mask, rising. No stage reads them.
+    pixel_aspect is width / height of a pixel by the container.
     """
 
     frame_count: int
@@ -48,6 +50,8 @@ class StereoClip:
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     tissue_right: NDArray[np.bool_] | None = None
+    damaged: tuple[int, ...] = ()
+    pixel_aspect: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Eye:
     depth_mm         [T, H, W]    float32, camera z in mm, 0 = invalid
     depth_confidence [T, H, W]    uint8, 255 = left-right consistent and textured, 0 where depth is invalid
     world_from_camera [T, 4, 4]   float64, mm, OpenCV axes; the world is the left camera of frame 0
+    field_of_view    [H, W]       bool, False where no frame shows the scene, nor has tissue; None: the whole picture
     """
 
     rgb: NDArray[np.uint8]
@@ -67,6 +72,7 @@ class Eye:
     depth_confidence: NDArray[np.uint8]
     intrinsics: Intrinsics
     world_from_camera: NDArray[np.float64]
+    field_of_view: NDArray[np.bool_] | None = field(default=None, kw_only=True)
 
     @property
     def frame_count(self) -> int:
@@ -101,6 +107,7 @@ class DepthClip(Eye):
     right            the same times and size; None for a clip of one eye
     registration     corrections of the right eye's camera and colours; None for a clip of one eye
     masks            source of `tissue`
+    fov              entry of the field of view for the report; None: it was not looked for
     rectification    rectification of the recorded left eye; None: it is as recorded
     poses            source of world_from_camera; None: poses are not set yet
     skipped         skipped frames (sampling.py): no stage reads them, and stereo gives them no depth
@@ -110,6 +117,7 @@ class DepthClip(Eye):
     right: Eye | None = None
     registration: RightEye | None = None
     masks: Masks | None = None
+    fov: FieldOfView | None = None
     rectification: Rectification | None = None
     poses: CameraPoses | None = None
     skipped: tuple[int, ...] = ()

@@ -25,6 +25,7 @@ PACKAGES = (
     "numba",
     "scipy",
     "opencv-contrib-python-headless",
+    "av",
     "pydantic",
     "safetensors",
 )
@@ -40,7 +41,7 @@ INSTALL_REMEDY = "in a checkout, run `make setup`, or `pip install .`"
 FIXED_FFMPEG = (8, 1, 2)
 """First FFmpeg without CVE-2026-8461, a write out of bounds in one of its video decoders."""
 
-OPENCV_REQUIREMENT = "pip install 'opencv-contrib-python-headless>=4.14.0.94,<5'"
+AV_REQUIREMENT = "pip install 'av>=18.1,<19'"
 
 MIN_PYTHON = (3, 11)
 
@@ -127,26 +128,20 @@ def device_finding(asked: str, gpu: Gpu) -> Diagnosis:
 
 def _video() -> list[Diagnosis]:
     try:
-        cv2 = importlib.import_module("cv2")
+        found = str(importlib.import_module("av").ffmpeg_version_info)
     except ImportError:
         return []  # said above
-    if not re.search(r"FFMPEG:\s+YES", cv2.getBuildInformation()):
-        return [Diagnosis("video decoder", "this OpenCV has no FFmpeg", OPENCV_REQUIREMENT, blocks=True)]
-    found = bundled_ffmpeg(Path(str(cv2.__file__)).parent.parent)
-    if found is None:
-        return [Diagnosis("video decoder", "FFmpeg of the system", "make sure it is 8.1.2 or newer (CVE-2026-8461)")]
-    shown = "FFmpeg " + ".".join(str(part) for part in found)
-    remedy = None if found >= FIXED_FFMPEG else f"open to CVE-2026-8461: {OPENCV_REQUIREMENT}"
-    return [Diagnosis("video decoder", shown, remedy)]
+    return [video_finding(found)]
 
 
-def bundled_ffmpeg(site_packages: Path) -> tuple[int, ...] | None:
-    """Version of the FFmpeg inside OpenCV's wheel, which cv2 does not report; None if the wheel has no FFmpeg."""
-    for library in site_packages.glob("opencv_*.libs/libavutil*"):
-        found = re.search(rb"FFmpeg version n?(\d+(?:\.\d+)+)", library.read_bytes())
-        if found:
-            return tuple(int(part) for part in found[1].split(b"."))
-    return None
+def video_finding(release: str) -> Diagnosis:
+    """The decoder of videos, by the release that PyAV's FFmpeg names."""
+    numbers = re.match(r"n?(\d+(?:\.\d+)+)", release)
+    if numbers is None:
+        return Diagnosis("video decoder", f"FFmpeg {release}", "make sure it is 8.1.2 or newer (CVE-2026-8461)")
+    is_fixed = tuple(map(int, numbers[1].split("."))) >= FIXED_FFMPEG
+    remedy = None if is_fixed else f"open to CVE-2026-8461: {AV_REQUIREMENT}"
+    return Diagnosis("video decoder", f"FFmpeg {numbers[1]}", remedy)
 
 
 def _segmenter(path: Path | None) -> list[Diagnosis]:

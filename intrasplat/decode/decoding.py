@@ -181,8 +181,11 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
         decoder.close()
         return whole
     tissue, tissue_right = (_tissue(folder, name, size) if name in described["masked"] else None for name in MASKS)
+    damaged = tuple(int(each) for each in described["damaged"])
+    if not set(damaged) <= set(range(frames)):
+        raise ValueError(f"damaged frames that are not some of {frames}")
     pairs = _ArrivingPairs(decoder, size)
-    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right)
+    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right, damaged)
     return StereoRecording(clip, _calibration(described["calibration"]), decoder.close)
 
 

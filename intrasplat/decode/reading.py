@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import av  # noqa: F401 (loaded before the process is confined)
 import cv2
 from numpy.typing import NDArray
 
@@ -63,6 +64,7 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
         "size": [clip.frame_count, height, width],
         "assumptions": [each.model_dump() for each in clip.assumptions],
         "warnings": [each.model_dump() for each in clip.warnings],
+        "damaged": [] if isinstance(clip, DepthClip) else list(clip.damaged),
     }
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
@@ -109,4 +111,5 @@ def _calibration(path: Path | str | None, clip: StereoClip) -> dict[str, Any]:
         problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
         remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
         raise InputError("calibration", problem, remedy)
-    return load_calibration(path, eye_width=clip.width, eye_height=clip.height).model_dump(mode="json")
+    calibration = load_calibration(path, eye_width=clip.width, eye_height=clip.height, pixel_aspect=clip.pixel_aspect)
+    return calibration.model_dump(mode="json")

@@ -216,7 +216,7 @@ class _Cells:
 
     world_mm  [M, 3]  tissue in the middle of the cell, at completed depth
     pixels    [M]     flat index of the middle pixel, or of the nearest pixel in the image
-    in_view   [M]     whether the cell lies in the image
+    in_view   [M]     whether the cell lies in the image, in its field of view
     """
 
     world_mm: NDArray[np.float32]
@@ -229,7 +229,7 @@ class _Cells:
 
 
 def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
-    """The cells without tissue in the first frame, and the cells of the MARGIN around it."""
+    """The cells without tissue in the first frame, and those of the MARGIN around it or around its field of view."""
     k, measured = clip.intrinsics, is_measured(clip, first)
     sides = (k.height, k.width)
     beyond = [-(-int(side * MARGIN) // stride) * stride for side in sides]
@@ -241,6 +241,11 @@ def _hidden_cells(clip: DepthClip, first: int, stride: int) -> _Cells:
     nearest_row, nearest_column = np.clip(row, 0, k.height - 1), np.clip(column, 0, k.width - 1)
     in_view = (nearest_row == row) & (nearest_column == column)
     hidden = ~(in_view & clip.tissue[first][nearest_row, nearest_column])
+    if clip.field_of_view is not None:
+        in_view &= clip.field_of_view[nearest_row, nearest_column]
+        margin = np.ones([2 * extra + 1 for extra in beyond], np.uint8)
+        around = cv2.dilate(clip.field_of_view.astype(np.uint8), margin) > 0
+        hidden &= around[nearest_row, nearest_column]
     row, column = row[hidden], column[hidden]
     at_mm = depth_mm[row + beyond[0], column + beyond[1]]
     world_mm = unproject_at(column + 0.5, row + 0.5, at_mm, k, clip.world_from_camera[first])

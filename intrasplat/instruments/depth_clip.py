@@ -38,10 +38,11 @@ def with_instruments_found(
     Raises:
         Cancelled: hooks.should_stop said so.
     """
-    finder = Finder.of((clip.rgb[i] for i in looked_at(measured)), segmenter)
+    finder = Finder.of((clip.rgb[i] for i in looked_at(measured)), clip.field_of_view, segmenter)
     tissue = mapped_zeros(clip.tissue.shape, np.bool_)
     wanted = clip.used
     evidence = np.zeros((clip.frame_count, 3))
+    field_pixels = tissue[0].size if clip.field_of_view is None else np.count_nonzero(clip.field_of_view)
 
     def find(i: int) -> float:
         if hooks.should_stop():
@@ -49,7 +50,7 @@ def with_instruments_found(
         found: FoundMask = finder(clip.rgb[i], lambda coarse: nearness_of(coarse, clip.depth_mm[i]))
         tissue[i] = clip.tissue[i] & ~found.tool
         evidence[i] = found.seen, found.clear, found.missed
-        masked = 1 - float(tissue[i].mean())
+        masked = 1 - np.count_nonzero(tissue[i]) / field_pixels
         let_go(tissue[i])
         clip.let_go(i)
         return masked

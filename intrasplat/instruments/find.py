@@ -43,6 +43,8 @@ ZONE_SHARE, TIP_SHARE, TIP_QUANTILE, LOCAL_SHARE = 0.0125, 0.05, 0.85, 0.2
 from the entry (quantile) where the tip starts; window of the surrounding tissue's redness."""
 MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
 """Upper limit of the surrounding tissue's redness; minimum relative nearness of pixels added at a tip."""
+BORDER_PX = 2
+"""Width of the coarse picture's border."""
 CLOSED_PX, GROWN_PX = 3, 3
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
 """Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
@@ -56,19 +58,34 @@ UNSURE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """A picture of H W pixels, reduced to FINE_WIDTH and to COARSE_WIDTH."""
+    """A picture of H W pixels, reduced to FINE_WIDTH and to COARSE_WIDTH.
+
+    field  [h, w] of the coarse picture: its field of view
+    """
 
     size: tuple[int, int]
     fine: Rgb
     coarse: Rgb
+    field: Mask
 
     @classmethod
-    def at(cls, rgb: Rgb) -> Looked:
-        """The reduced forms of a picture [H, W, 3]."""
+    def at(cls, rgb: Rgb, field: Mask | None = None) -> Looked:
+        """The reduced forms of a picture [H, W, 3]. field: [H, W]; None: the whole picture."""
         height, width = rgb.shape[:2]
         fine = cv2.resize(rgb, (FINE_WIDTH, round(height * FINE_WIDTH / width)), interpolation=cv2.INTER_AREA)
         coarse_size = (COARSE_WIDTH, round(height * COARSE_WIDTH / width))
-        return cls((height, width), fine, cv2.resize(fine, coarse_size, interpolation=cv2.INTER_AREA))
+        inside = np.ones(coarse_size[::-1], np.bool_)
+        if field is not None:
+            inside = (
+                cv2.resize(field.astype(np.uint8) * np.uint8(255), coarse_size, interpolation=cv2.INTER_AREA) == 255
+            )
+        return cls((height, width), fine, cv2.resize(fine, coarse_size, interpolation=cv2.INTER_AREA), inside)
+
+    @property
+    def border(self) -> Mask:
+        """The pixels [h, w] of the coarse picture at its border, or at that of its field of view."""
+        frame = cv2.copyMakeBorder(self.field.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+        return np.asarray(cv2.erode(frame, _box(2 * BORDER_PX + 1))[1:-1, 1:-1] == 0)
 
 
 @dataclass(frozen=True)
@@ -78,9 +95,10 @@ class TissueLook:
     redness: float
 
     @classmethod
-    def of(cls, pictures: Iterable[Rgb]) -> TissueLook:
-        """The tissue's colour in pictures [H, W, 3] that mostly show tissue."""
-        return cls(float(np.median([np.median(_redness(Looked.at(each).coarse)) for each in pictures])))
+    def of(cls, pictures: Iterable[Rgb], field: Mask | None = None) -> TissueLook:
+        """The tissue's colour in pictures [H, W, 3] whose field of view [H, W] mostly shows tissue."""
+        looked = (Looked.at(each, field) for each in pictures)
+        return cls(float(np.median([np.median(_redness(each.coarse)[each.field]) for each in looked])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +155,17 @@ def _candidates(picture: Looked, nearness: Image, look: TissueLook) -> list[_Can
     redness = cv2.GaussianBlur(_redness(picture.coarse), (3, 3), 0)
     grey = cv2.morphologyEx((redness < GREY * look.redness).astype(np.uint8), cv2.MORPH_OPEN, _box(2))
     front = _in_front(nearness)
-    part = _closed(grey, 5) & (front > SLIGHTLY_FRONT)
+    part = _closed(grey, 5) & (front > SLIGHTLY_FRONT) & picture.field
     part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
     redness /= np.float32(look.redness)
-    found = [_Candidate(each, _likely(each, front, nearness, redness)) for each in _areas(part, at_border=True)]
+    found = [_Candidate(each, _likely(each, front, nearness, redness)) for each in _areas(part, picture.border)]
     taken = np.zeros(part.shape, np.uint8)
     for each in found:
         taken |= each.pixels & (each.likely >= UNSURE)
     free = cv2.dilate(taken, _box(2 * GAP_PX + 1)) == 0
-    part = _closed((redness < REDDISH).astype(np.uint8), 5) & (front > SLIGHTLY_FRONT) & free
+    part = _closed((redness < REDDISH).astype(np.uint8), 5) & (front > SLIGHTLY_FRONT) & free & picture.field
     part = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, _box(3))
-    reddish = (each for each in _areas(part, at_border=True) if _mirrors(each, front, nearness, redness))
+    reddish = (each for each in _areas(part, picture.border) if _mirrors(each, front, nearness, redness))
     return found + [_Candidate(each, UNSURE) for each in reddish]
 
 
@@ -159,15 +177,13 @@ def _mirrors(pixels: Mask, front: Image, nearness: Image, redness: Image) -> boo
     return _by_depth(front[pixels], near, beyond) >= MIN_IN_FRONT
 
 
-def _areas(part: Bits, *, at_border: bool) -> Iterator[Mask]:
-    """The connected areas [h, w] of at least MIN_AREA; at_border: only those that touch the picture's border."""
-    height, width = part.shape
-    count, label, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
+def _areas(part: Bits, border: Mask | None = None) -> Iterator[Mask]:
+    """The connected areas [h, w] of at least MIN_AREA that touch the border [h, w]; None: wherever they are."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(np.asarray(part, np.uint8), connectivity=4)
     for j in range(1, count):
-        left, top, across, down, area = stats[j]
-        touches = left <= 1 or top <= 1 or left + across >= width - 1 or top + down >= height - 1
-        if (touches or not at_border) and area >= MIN_AREA * height * width:
-            yield label == j
+        pixels = label == j
+        if stats[j, cv2.CC_STAT_AREA] >= MIN_AREA * part.size and (border is None or (border & pixels).any()):
+            yield pixels
 
 
 def _missed(picture: Looked, look: TissueLook, tool: Mask) -> float:
@@ -179,7 +195,7 @@ def _missed(picture: Looked, look: TissueLook, tool: Mask) -> float:
     light = cv2.GaussianBlur(picture.coarse.max(axis=2).astype(np.float32), (3, 3), 0)
     colourless = cv2.morphologyEx((redness < COLOURLESS).astype(np.uint8), cv2.MORPH_OPEN, _box(3))
     share = 0.0
-    for pixels in _areas(colourless & free, at_border=False):
+    for pixels in _areas(colourless & free & picture.field):
         ((own, around),) = _across_outline(pixels, redness)
         if own.size and float((around - own > REDNESS_STEP).mean()) > MIN_COLOURED:
             share += float(pixels.mean()) * float(np.median(light[pixels]) < MAX_LIGHT * np.median(light))
@@ -255,7 +271,7 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
     for each, whole in zip(candidates, enlarged, strict=True):
         core = cv2.erode(whole, _box(3), borderValue=1)
         own = float(np.median(redness[core > 0])) if core.any() else 0.2
-        zone = cv2.dilate(whole, _box(zone_px)) | _resized(_around_tip(each.pixels) & in_front, size)
+        zone = cv2.dilate(whole, _box(zone_px)) | _resized(_around_tip(each.pixels, picture.border) & in_front, size)
         like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
         count, label = cv2.connectedComponents(like, connectivity=8)
         connected = np.zeros(count, np.bool_)
@@ -267,16 +283,15 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
     return tool
 
 
-def _around_tip(pixels: Mask) -> Mask:
+def _around_tip(pixels: Mask, border: Mask) -> Mask:
     """Pixels [h, w] near an instrument's tip, the part farthest from where it enters the picture."""
     row, column = np.nonzero(pixels)
-    height, width = pixels.shape
-    enters = np.minimum.reduce([row, column, height - 1 - row, width - 1 - column]) <= 1
+    enters = border[row, column]
     away = np.hypot(row - row[enters].mean(), column - column[enters].mean())
     far = away >= np.quantile(away, TIP_QUANTILE)
     other = np.ones(pixels.shape, np.uint8)
     other[row[far], column[far]] = 0
-    near: Mask = cv2.distanceTransform(other, cv2.DIST_L2, 3) <= TIP_SHARE * width
+    near: Mask = cv2.distanceTransform(other, cv2.DIST_L2, 3) <= TIP_SHARE * pixels.shape[1]
     return near
 
 

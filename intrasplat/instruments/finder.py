@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.instruments.find import FoundMask, Image, Looked, Rgb, TissueLook, find_instruments
+from intrasplat.instruments.find import FoundMask, Image, Looked, Mask, Rgb, TissueLook, find_instruments
 from intrasplat.instruments.segmenter import Segmenter
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import Masks
@@ -26,22 +26,26 @@ LOOKED_AT = 7
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds instruments in single pictures of one clip: by the segmenter if there is one, else by colour and depth."""
+    """Finds instruments in single pictures of one clip: by the segmenter if there is one, else by colour and depth.
+
+    field  [H, W] field of view; None: the whole picture
+    """
 
     look: TissueLook | None
     segmenter: Segmenter | None = None
+    field: Mask | None = None
 
     @classmethod
-    def of(cls, pictures: Iterable[Rgb], segmenter: Segmenter | None = None) -> Finder:
-        """The finder of a clip, from some of its pictures [H, W, 3]."""
-        return cls(TissueLook.of(pictures) if segmenter is None else None, segmenter)
+    def of(cls, pictures: Iterable[Rgb], field: Mask | None = None, segmenter: Segmenter | None = None) -> Finder:
+        """The finder of a clip, from some of its pictures [H, W, 3] and their field of view."""
+        return cls(TissueLook.of(pictures, field) if segmenter is None else None, segmenter, field)
 
     def __call__(self, rgb: Rgb, nearness: Callable[[Rgb], Image]) -> FoundMask:
         """The instruments in a picture [H, W, 3]; nearness(coarse) returns the nearness of its coarse form."""
         if self.segmenter is not None:
             return self.segmenter(rgb)
         assert self.look is not None
-        picture = Looked.at(rgb)
+        picture = Looked.at(rgb, self.field)
         return find_instruments(picture, nearness(picture.coarse), self.look)
 
     def report(self, share: float, found: NDArray[np.float64]) -> tuple[Masks, Notice, tuple[Notice, ...]]:

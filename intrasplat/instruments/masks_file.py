@@ -46,6 +46,6 @@ def _recorded_tools(clip: DepthClip) -> Iterator[NDArray[np.bool_]]:
     looked_at = np.array(clip.used)
     for index in range(clip.frame_count):
         nearest = int(looked_at[np.abs(looked_at - index).argmin()])
-        tool = ~clip.tissue[nearest]
+        tool = ~clip.tissue[nearest] if clip.field_of_view is None else ~clip.tissue[nearest] & clip.field_of_view
         let_go(clip.tissue[nearest])
         yield tool if maps is None else as_recorded(tool, maps)

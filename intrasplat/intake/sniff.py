@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from intrasplat.errors import InputError, LimitError
+from intrasplat.intake.calibration.encoding import decoded_text, named_errors
 from intrasplat.intake.calibration.opencv import look_at_calibration
 from intrasplat.intake.limits import MAX_CALIBRATION_BYTES, ClipLimits
 from intrasplat.intake.nesting import nesting
@@ -46,7 +47,8 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     if part == "calibration":
         text = _text_of(path, part)
         check_calibration_file(text, part, path.name)
-        look_at_calibration(text)
+        with named_errors(path.name):
+            look_at_calibration(text)
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:
@@ -60,6 +62,11 @@ def png_size(head: bytes) -> tuple[int, int] | None:
     if not head.startswith(PNG_MAGIC) or len(head) < 24:
         return None
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+
+
+def png_bits(head: bytes) -> int | None:
+    """Bits of a colour in a PNG's first 25 bytes; None if it is no PNG."""
+    return head[24] if head.startswith(PNG_MAGIC) and len(head) > 24 else None
 
 
 def check_calibration_text(text: str, field: str, label: str) -> None:
@@ -104,10 +111,7 @@ def _text_of(path: Path, part: str) -> str:
     if size > MAX_CALIBRATION_BYTES:
         problem = f"{path.name} has {size} bytes; the limit is {MAX_CALIBRATION_BYTES}."
         raise LimitError(part, problem, _PLAIN_TEXT_REMEDY)
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        return "\0"
+    return decoded_text(path.read_bytes()) or "\0"
 
 
 def check_head(head: bytes, suffix: str, part: str, label: str) -> None:

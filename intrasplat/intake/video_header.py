@@ -38,20 +38,23 @@ OTHER_CODECS = {  # codecs that users are likely to bring, with names for errors
 REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
 
 EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
+_PICTURE_BOXES = (b"mdat", b"moof", b"sidx", b"styp", b"free", b"skip", b"wide")  # they may follow the header
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _MAX_HEADER_BYTES = 32 << 20  # of moov, or before Matroska's first pictures; 1000 frames take some kB
 _MAX_PARTS = 10_000  # boxes or elements read
 _ACCEPTED = frozenset(name for names in CODECS.values() for name in names)
 
-_SEGMENT, _INFO, _TRACKS, _CLUSTER = 0x18538067, 0x1549A966, 0x1654AE6B, 0x1F43B675
+_SEGMENT, _TRACKS, _CLUSTER = 0x18538067, 0x1654AE6B, 0x1F43B675
 _TRACK_ENTRY, _TRACK_TYPE, _CODEC_ID, _VIDEO, _WIDTH, _HEIGHT = 0xAE, 0x83, 0x86, 0xE0, 0xB0, 0xBA
-_TICK_NS, _DURATION = 0x2AD7B1, 0x4489
 _VIDEO_TYPE = 1
 
 
 @dataclass(frozen=True)
 class VideoTrack:
-    """A video track. Numbers are 0 if the header lacks them; `shown` is the display size."""
+    """A video track. Numbers are 0 if the header lacks them; `shown` is the display size.
+
+    is_bounded: False if nothing tells where the file ends, as in a live stream.
+    """
 
     codec: bytes
     width: int = 0
@@ -59,6 +62,7 @@ class VideoTrack:
     shown: tuple[int, int] = (0, 0)
     frames: int = 0
     duration_s: float = 0.0
+    is_bounded: bool = True
 
 
 def is_video(head: bytes) -> bool:
@@ -121,22 +125,28 @@ def video_tracks(file: BinaryIO) -> list[VideoTrack]:
 
 
 def _iso_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
-    start = 0
+    start, tracks = 0, None
     for _ in range(_MAX_PARTS):
         if start + 8 > file_bytes:
             break
         file.seek(start)
         head = file.read(16)
+        if tracks is not None and head[4:8] not in _PICTURE_BOXES:
+            break
         header_bytes, size = _box_size(head, file_bytes - start)
+        if head[4:8] == b"mdat" and start + size > file_bytes:
+            raise ValueError("its media data (mdat) ends after the file does")
         if head[4:8] == b"moov":
             if start + size > file_bytes:
                 raise ValueError("its header (moov) ends after the file does")
             if size > _MAX_HEADER_BYTES:
                 raise ValueError(f"its header (moov) has {size} bytes")
             file.seek(start + header_bytes)
-            return _moov_tracks(file.read(size - header_bytes))
+            tracks = _moov_tracks(file.read(size - header_bytes))
         start += size
-    raise ValueError("it has no header (moov)")
+    if tracks is None:
+        raise ValueError("it has no header (moov)")
+    return tracks
 
 
 def _box_size(head: bytes, max_bytes: int) -> tuple[int, int]:
@@ -216,32 +226,28 @@ def _duration_s(trak: bytes) -> float:
 
 
 def _matroska_tracks(file: BinaryIO, file_bytes: int) -> list[VideoTrack]:
-    """The tracks that are described before the first pictures. ValueError if there are none."""
+    """The tracks that are described before the first pictures. ValueError if there are none, or the file is cut.
+
+    The duration is that of the longest track, from a clock that may start anywhere, so it tells nothing.
+    """
     data = file.read(min(file_bytes, _MAX_HEADER_BYTES))
     tracks: list[VideoTrack] = []
-    duration_s = 0.0
-    for segment, content in _elements(data):
+    is_bounded = True
+    for segment, content, end in _elements_to(data):
         if segment != _SEGMENT:
             continue
+        is_bounded = end is not None
+        if end is not None and end > file_bytes:
+            raise ValueError("its segment ends after the file does")
         for element, inner in _elements(content):
             if element == _CLUSTER:
                 break
-            if element == _INFO:
-                duration_s = _segment_duration_s(inner)
-            elif element == _TRACKS:
+            if element == _TRACKS:
                 tracks = [track for each, entry in _elements(inner) if each == _TRACK_ENTRY for track in _track(entry)]
+        break
     if not tracks:
         raise ValueError("it describes no video track before its pictures")
-    return [replace(track, duration_s=duration_s) for track in tracks]
-
-
-def _segment_duration_s(info: bytes) -> float:
-    values = dict(_elements(info))
-    ticks = values.get(_DURATION, b"")
-    if len(ticks) not in (4, 8):
-        return 0.0
-    (duration,) = struct.unpack(">f" if len(ticks) == 4 else ">d", ticks)
-    return float(duration) * int.from_bytes(values.get(_TICK_NS, (1_000_000).to_bytes(3, "big")), "big") * 1e-9
+    return [replace(track, is_bounded=is_bounded) for track in tracks]
 
 
 def _track(entry: bytes) -> Iterator[VideoTrack]:
@@ -254,6 +260,12 @@ def _track(entry: bytes) -> Iterator[VideoTrack]:
 
 def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The (id, content) of consecutive elements in data; the last may be cut off or of unknown size."""
+    for name, content, _ in _elements_to(data):
+        yield name, content
+
+
+def _elements_to(data: bytes) -> Iterator[tuple[int, bytes, int | None]]:
+    """Like _elements, with the place where each says that it ends; None if it does not say so."""
     start = 0
     for _ in range(_MAX_PARTS):
         if start >= len(data):
@@ -266,8 +278,10 @@ def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
         content_at = size_at + size_bytes
         mask = (1 << 7 * size_bytes) - 1
         size = int.from_bytes(data[size_at:content_at], "big") & mask
-        end = len(data) if size == mask else content_at + size
-        yield int.from_bytes(data[start:size_at], "big"), data[content_at:end]
+        end = None if size == mask else content_at + size
+        yield int.from_bytes(data[start:size_at], "big"), data[content_at:end], end
+        if end is None:
+            return
         start = end
     raise ValueError(f"it has more than {_MAX_PARTS} elements in one")
 

@@ -115,13 +115,16 @@ def _directory_size(file: BinaryIO, file_bytes: int) -> tuple[int, int]:
 
 
 def _check_member(entry: zipfile.ZipInfo, field: str, label: str, nested: Collection[str]) -> None:
-    """InputError for a member that could escape the archive or hide its content."""
-    name = entry.filename
+    """InputError for a member that could escape the archive or hide its content.
+
+    Programs of Windows write backslashes between folders; they become slashes here, before the checks.
+    """
+    name = entry.filename = entry.filename.replace("\\", "/")
     problem = None
     kind = stat.S_IFMT(entry.external_attr >> 16)
     # zipfile truncates names at NUL, so the stored name is checked, too
-    if any(ord(letter) < 32 for letter in entry.orig_filename) or "\\" in entry.orig_filename:
-        problem = "has a name with a backslash or a control character"
+    if any(ord(letter) < 32 for letter in entry.orig_filename):
+        problem = "has a name with a control character"
     elif name.startswith("/") or re.match(r"[A-Za-z]:", name):
         problem = "has an absolute path"
     elif ".." in name.split("/"):

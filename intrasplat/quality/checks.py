@@ -70,16 +70,17 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
             )
         )
-    tissue_share = float(np.mean([clip.tissue[index].mean() for index in clip.one_by_one(train)]))
+    field_share = 1.0 if clip.field_of_view is None else float(clip.field_of_view.mean())
+    tissue_share = float(np.mean([clip.tissue[index].mean() for index in clip.one_by_one(train)])) / field_share
     if tissue_share < MIN_TISSUE_SHARE:
         found.append(
             Notice.warning(
                 NoticeCode.LITTLE_TISSUE,
-                f"Only {tissue_share:.0%} of the picture counts as tissue. If the masks are inverted, "
+                f"Only {tissue_share:.0%} of the field of view counts as tissue. If the masks are inverted, "
                 "set mask_polarity.",
             )
         )
-    if all(clip.tissue[index].all() for index in clip.one_by_one(train)):
+    if tissue_share > 1 - 1e-9:
         text = "No instrument is masked anywhere: an instrument in the clip is modelled as if it were tissue."
         if clip.masks is not None and clip.masks.source == "none":
             text += ' Give masks, or let mask_source "auto" find them.'

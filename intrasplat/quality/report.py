@@ -154,6 +154,7 @@ def first_report(clip: DepthClip, split: FrameSplit, training: Training, warning
         assumptions=tuple(dict.fromkeys((*clip.assumptions, *training.assumptions))),
         right_eye=clip.registration,
         masks=clip.masks,
+        field_of_view=clip.fov,
         poses=clip.poses,
         measurements={**clip.measurements, **training.measurements},
         **{name: value for name, value in vars(training).items() if name not in _MERGED_FIELDS},

@@ -8,14 +8,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.clip.sampling import SkippedFrames, skippable_frames
+from intrasplat.clip.empty_frames import find_empty
+from intrasplat.clip.field_of_view import Fields, find_fields
+from intrasplat.clip.sampling import SkippedFrames, Thumbnail, skippable_frames, thumbnail
+from intrasplat.clip.shown import shown_frames
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import Cancelled, InputError
@@ -24,6 +27,7 @@ from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.names import Fov
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from intrasplat.report import Masks
@@ -38,6 +42,7 @@ from intrasplat.stereo.alignment import (
     outside_share,
 )
 from intrasplat.stereo.frames import FrameWork, grey_of
+from intrasplat.stereo.in_step import Profile, find_lag, move_frames, row_profile
 from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
@@ -45,7 +50,8 @@ from intrasplat.stereo.registration import MatchedPair, Registration
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
 
-FinderOf = Callable[[Iterable[NDArray[np.uint8]]], Finder]
+FinderOf = Callable[[Iterable[NDArray[np.uint8]], NDArray[np.bool_] | None], Finder]
+"""The signature of Finder.of: some pictures, and their field of view."""
 
 STAGE = "stereo"
 COMPILATION = "compile"
@@ -68,13 +74,17 @@ def estimate_depth(
     most_frames: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    fov: Fov = "all",
     finder_of: FinderOf | None = None,
 ) -> DepthClip:
     """Depth (mm) and confidence of every frame, corrected for rotation, row shift (up to 8 px) and colour of the eyes.
 
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
-    on all). Otherwise a frame's depth depends on its own pair only, so frames outside measured_frames do not change the
-    depth of others. With skip_redundant, measured frames that show nothing new (clip/sampling.py) get no depth.
+    on all), and so is the field of view with `fov` "auto". Otherwise a frame's depth depends on its own pair only, so
+    frames outside measured_frames do not change the depth of others. Frames that are damaged or show no whole scene
+    (clip/empty_frames.py) get no depth, nor, with skip_redundant, measured frames that show nothing new
+    (clip/sampling.py). If the right eye is out of step (in_step.py), which all frames tell, its frames are moved, and
+    frames without a partner are skipped.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -85,27 +95,42 @@ def estimate_depth(
 
     Raises:
         ValueError: measured_frames is empty or contains a frame that does not exist.
-        InputError: there is no depth, the frames are rectified already, the eyes seem to be swapped, or their rows
-            differ by more than 8 px.
+        InputError: no frame shows anything, there is no depth, the frames are rectified already, the eyes seem to be
+            swapped, or their rows differ by more than 8 px.
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
-    measured = sorted(set(range(clip.frame_count) if measured_frames is None else measured_frames))
+    given = set(range(clip.frame_count) if measured_frames is None else measured_frames)
+    measured = sorted(given - set(clip.damaged))
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
-    aligned = spread(measured, ALIGNMENT_PAIRS)
     with one_opencv_thread(), _pool() as pool:
-        rgb, right_rgb, matches = _receive(clip, aligned, pool, hooks)
+        received = _receive(clip, spread(measured, ALIGNMENT_PAIRS), pool, hooks)
+        lag = find_lag(*received.profiles)
+        unpaired: tuple[int, ...] = ()
+        if lag is not None:
+            sources = lag.sources(clip.frame_count)
+            unpaired = tuple(t for t, source in enumerate(sources) if source is None)
+            clip = _in_step(clip, received, sources)
+            measured = sorted(set(measured) - set(unpaired))
+        rgb, right_rgb = received.rgb, received.right_rgb
+        shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
+        empty = find_empty(received.thumbnails, measured, tissue_shares=shares)
+        fields = find_fields([rgb, right_rgb], shown_frames(measured, empty.frames), fov, pool.map)
+        empty = find_empty(received.thumbnails, measured, [fields.left, fields.right], shares)
+        measured = shown_frames(measured, empty.frames)
+        matches = received.matches(spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
-        finder = None if finder_of is None else finder_of(rgb[i] for i in looked_at(measured))
+        finder = None if finder_of is None else finder_of((rgb[i] for i in looked_at(measured)), fields.left)
         registration, plan, outside = _plan(
-            clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder
+            clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder, fields
         )
-        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, finder)
+        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, fields, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
-        wanted = sorted(set(range(clip.frame_count)) - set(unused.frames))
+        skipped = tuple(sorted({*empty.frames, *unused.frames, *clip.damaged, *unpaired}))
+        wanted = sorted(set(range(clip.frame_count)) - set(skipped))
         order = sorted(wanted, key=lambda i: i != first)  # frame `first` is shown as soon as it has depth
         jobs = _match_on_device(work, order, pool, hooks) if device == "cuda" else _match_all(work, order, pool)
         for done, (i, job) in enumerate(jobs, start=1):
@@ -117,7 +142,7 @@ def estimate_depth(
     pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
     valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
     _check_depth(sure_share)
-    share = 1 - pixels / (len(wanted) * clip.tissue[0].size)
+    share = 1 - pixels / (len(wanted) * work.field_pixels)
     masks, assumptions = Masks(source="given", share=share), clip.assumptions
     mask_warnings: tuple[Notice, ...] = ()
     if finder is not None:
@@ -125,11 +150,13 @@ def estimate_depth(
         assumptions = (*(each for each in assumptions if each.code is not NoticeCode.MASKS), assumption)
     return replace(
         work.matched,
-        skipped=unused.frames,
+        skipped=skipped,
         masks=masks,
         rectification=clip.rectification,
-        assumptions=(*assumptions, _scale_assumption(clip), *unused.notices(clip.frame_count)),
+        assumptions=(*assumptions, _scale_assumption(clip), *fields.notices, *unused.notices(clip.frame_count)),
         warnings=clip.warnings
+        + empty.notices(clip.frame_count)
+        + (() if lag is None else (lag.notice(unpaired),))
         + mask_warnings
         + registration.notices
         + _warnings(sure_share)
@@ -146,33 +173,76 @@ def estimate_depth(
     )
 
 
-def _receive(
-    clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
-    """Left and right frames [T, H, W, 3] from one pass over the source, and feature matches [M, 4] of frames `aligned`.
+@dataclass(frozen=True, eq=False)
+class _Received:
+    """The frames of both eyes.
 
-    Features are searched while later frames arrive.
+    rgb, right_rgb  [T, H, W, 3]
+    thumbnails      T thumbnails of each eye (clip/sampling.py)
+    profiles        T profiles of each eye's rows (in_step.py)
+    features        of some frames, by index: those of both eyes
+    """
+
+    rgb: NDArray[np.uint8]
+    right_rgb: NDArray[np.uint8]
+    thumbnails: tuple[list[Thumbnail], list[Thumbnail]]
+    profiles: tuple[list[Profile], list[Profile]]
+    features: dict[int, tuple[Future[Features], Future[Features]]]
+
+    def matches(self, frames: Sequence[int], pool: ThreadPoolExecutor) -> NDArray[np.float64]:
+        """Feature matches [M, 4] of these frames; those without features get theirs now."""
+        for i in frames:
+            if i not in self.features:
+                self.features[i] = _features(self.rgb[i], self.right_rgb[i], pool)
+        pairs = [[job.result() for job in self.features[i]] for i in frames]
+        return np.concatenate(list(pool.map(match_features, *zip(*pairs, strict=True))))
+
+
+def _features(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], pool: ThreadPoolExecutor
+) -> tuple[Future[Features], Future[Features]]:
+    return pool.submit(find_features, grey_of(left)), pool.submit(find_features, grey_of(right))
+
+
+def _receive(clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecutor, hooks: Hooks) -> _Received:
+    """The frames from one pass over the source, and the features of frames `aligned`.
+
+    Thumbnails are made and features are searched while later frames arrive.
     """
     shape = (clip.frame_count, clip.intrinsics.height, clip.intrinsics.width, 3)
     rgb, right = (mapped_zeros(shape, np.uint8) for _ in range(2))
-    features: list[Future[Features]] = []
+    features: dict[int, tuple[Future[Features], Future[Features]]] = {}
+    thumbnails: tuple[list[Future[Thumbnail]], list[Future[Thumbnail]]] = ([], [])
+    profiles: tuple[list[Profile], list[Profile]] = ([], [])
     decoded = 0
     for i, (left_frame, right_frame) in enumerate(clip.pairs()):
         if i >= clip.frame_count:
             break
         _check_stop(hooks)
-        for frames, frame in ((rgb, left_frame), (right, right_frame)):
+        for frames, frame, rows in ((rgb, left_frame, profiles[0]), (right, right_frame, profiles[1])):
             frames[i] = frame
+            rows.append(row_profile(frame))
             let_go(frames[i])
+        for eye, frame in zip(thumbnails, (left_frame, right_frame), strict=True):
+            eye.append(pool.submit(thumbnail, frame))
         if i in aligned:
-            features += [pool.submit(find_features, grey_of(eye)) for eye in (left_frame, right_frame)]
+            features[i] = _features(left_frame, right_frame, pool)
         decoded = i + 1
         share = DECODING_SHARE * decoded / clip.frame_count
         hooks.on_progress(Progress(STAGE, share, frames=clip.frame_count, megapixels=rgb.size / 3e6))
     if decoded < clip.frame_count:
         raise InputError("clip", f"it ended after {decoded} of {clip.frame_count} frames.", "Give the whole recording.")
-    found = [job.result() for job in features]
-    return rgb, right, np.concatenate(list(pool.map(match_features, found[::2], found[1::2])))
+    left_small, right_small = ([job.result() for job in eye] for eye in thumbnails)
+    return _Received(rgb, right, (left_small, right_small), profiles, features)
+
+
+def _in_step(clip: RectifiedClip, received: _Received, sources: Sequence[int | None]) -> RectifiedClip:
+    """The clip, whose right frames, their thumbnails and masks become those of `sources`; features are found anew."""
+    move_frames(received.right_rgb, sources)
+    chosen = [t if source is None else source for t, source in enumerate(sources)]
+    received.thumbnails[1][:] = [received.thumbnails[1][source] for source in chosen]
+    received.features.clear()
+    return clip if clip.tissue_right is None else replace(clip, tissue_right=clip.tissue_right[chosen])
 
 
 def _plan(
@@ -185,6 +255,7 @@ def _plan(
     device: str,
     depth_range_mm: tuple[float, float],
     finder: Finder | None,
+    fields: Fields,
 ) -> tuple[Registration, MatchPlan, float]:
     """The registration of the eyes and the disparity range, from a few pairs of the measured frames; outside_share."""
     shift = measure_row_shift(matches, clip.disparity_offset_px, clip.equal_rows_px)
@@ -202,7 +273,7 @@ def _plan(
     )
 
     def matched_pair(i: int) -> MatchedPair:
-        tissue, rectified = clip.tissue[i], coarse.rectified(right[i])
+        tissue, rectified = fields.tissue(clip.tissue[i]), coarse.rectified(right[i])
         if finder is not None:
             grey, offset_px = grey_of(rectified), clip.disparity_offset_px
             tissue = tissue & ~finder(rgb[i], lambda picture: nearness(picture, grey, plan, offset_px)).tool

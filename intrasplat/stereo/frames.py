@@ -7,25 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.field_of_view import Fields, filled
 from intrasplat.clip.types import DepthClip, Eye
 from intrasplat.instruments import Finder
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import Registration
-from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over
+from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over, seen_nowhere
 
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
 
 SURE = 128
 """Minimum confidence, of 255, of a reliable depth."""
+GAP_SHARE = 0.03
+"""Share of the width: gaps in stereo depth that are closed to find what both eyes see."""
 BESIDE_PX = 6
 """Tissue this near to an instrument gets no depth: matching windows overlap the edge and match the instrument."""
 
@@ -42,6 +46,7 @@ class FrameWork:
 
     matched  the clip with both eyes; it has all pictures, and each frame's depth after finish(i)
     label    [H, W] labels that are painted into both eyes' pictures
+    fields   the eyes' fields of view
     finder   finds the instruments of a clip without masks; None: the clip has masks
     counts   [T, 3] number of tissue pixels, of those with depth, of those with sure depth
     sure     [T, 3] `seen`, `clear` and `missed` of each FoundMask
@@ -53,6 +58,7 @@ class FrameWork:
     matched: DepthClip
     right: Eye
     label: NDArray[np.bool_]
+    fields: Fields
     finder: Finder | None = None
     counts: NDArray[np.int64] = field(init=False)
     sure: NDArray[np.float64] = field(init=False)
@@ -70,6 +76,7 @@ class FrameWork:
         measured: Sequence[int],
         registration: Registration,
         plan: MatchPlan,
+        fields: Fields,
         finder: Finder | None = None,
     ) -> FrameWork:
         """The work before its first frame. The right eye has the calibrated baseline and the measured rotation.
@@ -89,6 +96,7 @@ class FrameWork:
             depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=registration.camera,
             world_from_camera=np.tile(registration.left_from_right, (count, 1, 1)),
+            field_of_view=fields.right,
         )
         matched = DepthClip(
             rgb=rgb,
@@ -100,8 +108,21 @@ class FrameWork:
             frame_times_s=clip.frame_times_s,
             right=right,
             registration=registration.report_entry,
+            field_of_view=fields.left,
+            fov=fields.entry,
         )
-        return cls(clip, plan, registration, matched, right, label, finder)
+        return cls(clip, plan, registration, matched, right, label, fields, finder)
+
+    @property
+    def field_pixels(self) -> int:
+        """The pixels in the left eye's field of view."""
+        return self.clip.tissue[0].size if self.fields.left is None else int(np.count_nonzero(self.fields.left))
+
+    @cached_property
+    def _supported(self) -> NDArray[np.uint8] | None:
+        """[H, W] 1 in the right eye's field of view, in the calibrated eye's pixels; None: the whole picture."""
+        field = self.fields.right
+        return None if field is None else self.registration.rectified(field.astype(np.uint8))
 
     def greys(self, i: int) -> tuple[Grey, Grey]:
         """The pair to match. Sets the final colours of the right picture."""
@@ -112,7 +133,9 @@ class FrameWork:
         """The tissue [H, W] of a frame's left eye, which is also stored in the matched clip. right: of greys(i)."""
         tissue: NDArray[np.bool_] = self.matched.tissue[i]
         if self.matched.tissue is not self.clip.tissue:
-            tissue[:] = self.clip.tissue[i]
+            tissue[:] = self.fields.tissue(self.clip.tissue[i])
+        elif self.fields.left is not None:
+            tissue &= self.fields.left
         if self.finder is not None:
             rgb, offset_px = self.matched.rgb[i], self.clip.disparity_offset_px
             found = self.finder(rgb, lambda coarse: nearness(coarse, right, self.plan, offset_px))
@@ -135,12 +158,23 @@ class FrameWork:
         """Transfer a frame's depth to the right eye, drop it beside instruments, and count pixels."""
         left, right, registration = self.matched, self.right, self.registration
         focal_baseline, offset_px = self.clip.intrinsics.fx * self.clip.baseline_mm, self.clip.disparity_offset_px
+        if self._supported is not None:
+            unseen = seen_nowhere(left.depth_mm[i], focal_baseline, offset_px, self._supported)
+            left.depth_mm[i][unseen], left.depth_confidence[i][unseen] = 0, 0
         moved_mm, moved_trust = moved_depth(left.depth_mm[i], left.depth_confidence[i], focal_baseline, offset_px)
         right.depth_mm[i] = registration.recorded_depth(moved_mm)
         right.depth_confidence[i] = registration.recorded(moved_trust)
         if self.clip.tissue_right is None:
-            shown = moved_tissue(left.tissue[i] | self.label, left.depth_mm[i], focal_baseline, offset_px)
+            no_tool = self.label if self.fields.left is None else self.label | ~self.fields.left
+            shown = moved_tissue(left.tissue[i] | no_tool, left.depth_mm[i], focal_baseline, offset_px)
             right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
+        for eye in (left, right):
+            if eye.field_of_view is not None:
+                eye.depth_mm[i][~eye.field_of_view], eye.depth_confidence[i][~eye.field_of_view] = 0, 0
+        if self.fields.right is not None:
+            right.tissue[i] &= self.fields.right
+        if self.fields.left is not None:  # what the right eye alone sees lies outside the left one's field
+            right.tissue[i] &= filled(right.depth_mm[i] > 0, GAP_SHARE * self.clip.intrinsics.width)
         for eye in (left, right):
             drop_beside_instruments(eye.tissue[i], eye.depth_mm[i], eye.depth_confidence[i])
         trust = left.depth_confidence[i][left.tissue[i]]

@@ -12,13 +12,14 @@ from typing import Literal
 
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip, training_frames
 from intrasplat.clip.calibration import rectify
-from intrasplat.clip.sampling import most_frames, sampled
+from intrasplat.clip.sampling import most_frames
+from intrasplat.clip.shown import with_shown_parts
 from intrasplat.decode import DecoderKilledError, decode_clip
 from intrasplat.instruments import Finder, load_segmenter, with_instruments_found
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.machine.hooks import Hooks, ignore
 from intrasplat.machine.timing import Timings
-from intrasplat.names import MaskSource
+from intrasplat.names import Fov, MaskSource
 from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM, ReconstructionOptions
 from intrasplat.report import Masks
 from intrasplat.stereo.depth import estimate_depth
@@ -79,9 +80,9 @@ def open_with_depth(
                 hooks=hooks,
             )
         if isinstance(decoded, DepthClip):
-            measured = training_frames(decoded.frame_count, options.holdout)
-            hooks.on_first_moment(decoded.moment(measured[0]))
-            clip = sampled(decoded, options)
+            clip = with_shown_parts(decoded, options)
+            measured = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
+            hooks.on_first_moment(clip.moment(measured[0]))
             without = clip.masks is not None and clip.masks.source == "none"
             if not without or not _finds(options.mask_source, segmenter):
                 return clip
@@ -100,6 +101,7 @@ def open_with_depth(
                 device=device,
                 before_matching=before_matching,
                 depth_range_mm=(options.min_depth_mm, options.max_depth_mm),
+                fov=options.fov,
                 mask_source=options.mask_source,
                 segmenter=segmenter,
             )
@@ -124,6 +126,7 @@ def match_eyes(
     device: Literal["cpu", "cuda"] = "cpu",
     before_matching: Callable[[], None] = ignore,
     depth_range_mm: tuple[float, float] = (MIN_DEPTH_MM, MAX_DEPTH_MM),
+    fov: Fov = "all",
     mask_source: MaskSource = "given",
     segmenter: Path | None = None,
 ) -> DepthClip:
@@ -142,6 +145,7 @@ def match_eyes(
             most_frames=most_frames,
             device=device,
             depth_range_mm=depth_range_mm,
+            fov=fov,
             finder_of=partial(Finder.of, segmenter=network) if finds else None,
         )
     return replace(matched, masks=Masks(source="none")) if clip.tissue is None and not finds else matched

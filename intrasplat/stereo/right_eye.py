@@ -79,6 +79,18 @@ def moved_tissue(tissue: Mask, depth_mm: Image, focal_baseline: float, offset_px
     return grown
 
 
+def seen_nowhere(depth_mm: Image, focal_baseline: float, offset_px: float, supported: NDArray[np.uint8]) -> Mask:
+    """The pixels [H, W] of the left eye with a depth whose match lies where the right eye sees nothing.
+
+    supported: [H, W] 1 where the right eye sees something.
+    """
+    height, width = depth_mm.shape
+    valid = depth_mm > 0
+    there = np.arange(width, dtype=np.float32) - _ratio(focal_baseline, depth_mm, valid, offset_px)
+    seen = cv2.remap(supported, there, _row_numbers(height, width), cv2.INTER_NEAREST, borderValue=0)
+    return np.asarray(valid & (seen == 0))
+
+
 def _runs(chosen: Mask) -> list[slice]:
     """The runs of chosen pixels in a column [H]."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]))).tolist()

@@ -241,3 +241,9 @@ def test_a_folder_without_a_scene_is_a_bad_input(tmp_path: Path, capsys: pytest.
     for folder in (tmp_path, tmp_path / "nosuch"):
         assert main(["render", str(folder), "--t", "0", "--out", str(tmp_path / "a.png")]) == ExitCode.BAD_INPUT
         assert "that reconstruct wrote" in capsys.readouterr().err
+
+
+def test_a_checkout_draws_synthetic_clips_by_the_same_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["phantom", "--help"])
+    assert "synthetic stereo clip" in capsys.readouterr().out

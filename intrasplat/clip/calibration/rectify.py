@@ -18,6 +18,7 @@ from intrasplat.clip.recorded_masks import Rectification
 from intrasplat.clip.types import PairSource, RgbFrame, StereoClip
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.check import FIELD, check_calibration
+from intrasplat.intake.calibration.fit import MAX_PIXEL_SKEW
 from intrasplat.intake.calibration.types import RawCalibration, RawEye, RectifiedCalibration, StereoCalibration
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.notices import Notice, NoticeCode
@@ -40,7 +41,7 @@ class RectifiedClip:
     pairs yields rectified (left, right) RGB uint8 frames, remapped on demand. tissue is [T, H, W] bool in the pixels of
     the rectified left eye (a read-only view if no masks were given), False where the rectified image extends beyond the
     recorded one. tissue_right is the same for the right eye, None if no masks show it. intrinsics are the left eye's.
-    rectification has the left eye's mapping; None: the frames are unchanged.
+    rectification has the left eye's mapping; None: the frames are unchanged. damaged: as in the recorded clip.
 
     equal_rows_px is y_right - y_left, in these frames, of points on equal rows of the recorded frames. If frames that
     were rectified already are rectified again, about this row shift is measured.
@@ -58,6 +59,7 @@ class RectifiedClip:
     equal_rows_px: float = 0.0
     tissue_right: NDArray[np.bool_] | None = None
     rectification: Rectification | None = None
+    damaged: tuple[int, ...] = ()
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -113,18 +115,14 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         assumptions=_assumptions(clip, c, "frames: rectified already, as the calibration says"),
         warnings=clip.warnings + _scale_warning(c) + _view_warning(c.fx_px, c.width),
         tissue_right=clip.tissue_right,
+        damaged=clip.damaged,
     )
 
 
 def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
     size = (clip.width, clip.height)
     cameras = [(_matrix(eye), np.array(eye.distortion)) for eye in (calibration.left, calibration.right)]
-    rotation = np.array(calibration.right_from_left_rotation)
-    translation = np.array(calibration.right_from_left_translation_mm)
-    rotations_and_projections = cv2.stereoRectify(
-        *cameras[0], *cameras[1], size, rotation, translation, flags=0, alpha=0.0
-    )
-    left_r, right_r, left_p, right_p = rotations_and_projections[:4]
+    left_r, right_r, left_p, right_p = _rectification(calibration)
     left_maps: Maps = cv2.initUndistortRectifyMap(*cameras[0], left_r, left_p, size, cv2.CV_16SC2)
     right_maps: Maps = cv2.initUndistortRectifyMap(*cameras[1], right_r, right_p, size, cv2.CV_16SC2)
     return RectifiedClip(
@@ -157,7 +155,32 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
             rotation=_rows_of(left_r),
             projection=_rows_of(left_p),
         ),
+        damaged=clip.damaged,
     )
+
+
+def _rectification(
+    calibration: RawCalibration,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Rotations [3, 3] and projections [3, 4] of left and right.
+
+    stereoRectify gives square pixels. Those of a squeezed eye are rectified as a whole eye's and squeezed again.
+    """
+    squeeze = calibration.left.fx_px / calibration.left.fy_px
+    squeeze = squeeze if abs(squeeze - 1) > MAX_PIXEL_SKEW else 1.0
+    width, height = max(1, round(calibration.width / squeeze)), calibration.height
+    whole = calibration if squeeze == 1 else calibration.resized(width, height)
+    cameras = [(_matrix(eye), np.array(eye.distortion)) for eye in (whole.left, whole.right)]
+    rotation, translation = np.array(whole.right_from_left_rotation), np.array(whole.right_from_left_translation_mm)
+    left_r, right_r, left_p, right_p = cv2.stereoRectify(
+        *cameras[0], *cameras[1], (width, height), rotation, translation, flags=0, alpha=0.0
+    )[:4]
+    if squeeze != 1:
+        sx = calibration.width / width
+        for projection in (left_p, right_p):
+            projection[0] *= sx
+            projection[0, 2] += OPENCV_PIXEL_CENTRE * (sx - 1)
+    return left_r, right_r, left_p, right_p
 
 
 def _rows(

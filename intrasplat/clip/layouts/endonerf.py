@@ -8,14 +8,24 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.clip.bit_depth import at_own_depth
+from intrasplat.clip.depth_kind import (
+    FRAMES_LOOKED_AT,
+    check_not_stretched,
+    check_with_right_eye,
+    instrument_warnings,
+    parallax_warnings,
+    unit_warnings,
+)
 from intrasplat.clip.files import FileTree
-from intrasplat.clip.images import ImageSequence, as_depth_mm, as_rgb, open_images
+from intrasplat.clip.images import ImageSequence, as_depth_mm, open_images
 from intrasplat.clip.layouts.layout import ClipFiles, InputLayout
 from intrasplat.clip.masks import MaskFrames, TissueMasks, no_masks, tissue_from_masks
 from intrasplat.clip.naming import check_aligned
@@ -30,7 +40,6 @@ from intrasplat.report import Masks
 
 TITLE = "EndoNeRF"
 CONFIDENT = 255  # depth_confidence of every valid depth: the layout has no confidence
-_USUAL_DEPTH_MM = (5.0, 500.0)  # working distances of endoscopes with an ample margin; other units fall outside
 _MIN_DEPTH_SHARE = 0.5  # a smaller share of tissue pixels with depth causes a warning
 _MAX_THREADS = 4  # decoding PNG releases the interpreter; more threads than this wait for the disk
 
@@ -60,13 +69,15 @@ def _open(files: ClipFiles) -> DepthClip:
     )
     _check_size(images, poses)
     masks = _masks(tree, images, files)
-    rgb = _decode_all(images, np.uint8, (3,), lambda name: as_rgb(images.decode(name), tree.field, name))
+    (images,) = at_own_depth(images)
+    rgb = _decode_all(images, np.uint8, (3,), images.picture)
     depth_mm = _read_depth(tree, images)
     if not ((depth_mm > 0) & masks.tissue).any():
         where = "on tissue" if (depth_mm > 0).any() else "anywhere"
         raise InputError(
             tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
         )
+    doubts = _kind_of_depth(rgb, depth_mm, masks.tissue, poses, images)
     return DepthClip(
         rgb=rgb,
         tissue=masks.tissue,
@@ -83,8 +94,8 @@ def _open(files: ClipFiles) -> DepthClip:
         world_from_camera=poses.world_from_camera,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
         masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
-        assumptions=_assumptions(masks, poses, convention),
-        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue)),
+        assumptions=(*_assumptions(masks, poses, convention), *images.notices),
+        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue), *doubts),
     )
 
 
@@ -93,6 +104,7 @@ def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -
     return (
         Notice.info(NoticeCode.LAYOUT, f"layout: {TITLE}"),
         masks.assumption,
+        *masks.remarks,
         Notice.info(NoticeCode.POSES, f"poses: {convention} camera-to-world, {camera} camera"),
         Notice.info(NoticeCode.INTRINSICS, "intrinsics: principal point at the image centre"),
         Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),
@@ -160,19 +172,30 @@ def _decode_all(
     return result
 
 
+def _kind_of_depth(
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32], tissue: NDArray[np.bool_], poses: Poses, images: ImageSequence
+) -> tuple[Notice, ...]:
+    """Warnings about depth that may be none. InputError if it was stretched for display or is inverted."""
+    tree = images.tree
+    check_not_stretched(depth, tree.field)
+    names = tree.images("images_right")
+    if len(names) == images.frame_count:
+        right = replace(open_images(tree, names), white=images.white)
+        frames = range(0, images.frame_count, -(-images.frame_count // FRAMES_LOOKED_AT))
+        if (right.height, right.width) == (images.height, images.width):
+            check_with_right_eye(((rgb[i], right.picture(names[i])) for i in frames), depth[frames], tree.field)
+    camera = poses.focal_px, images.width / 2, images.height / 2
+    by_path = parallax_warnings(rgb, depth, tissue, poses.world_from_camera, camera, tree.field)
+    return (*instrument_warnings(depth, tissue), *by_path)
+
+
 def _depth_warnings(depth_mm: NDArray[np.float32], tissue: NDArray[np.bool_]) -> tuple[Notice, ...]:
     """Warnings about depth that has some valid pixel on tissue; it is checked on every 4th row and column."""
     depth_mm, tissue = depth_mm[:, ::4, ::4], tissue[:, ::4, ::4]
     valid = (depth_mm > 0) & tissue
-    warnings = []
-    low, high = _USUAL_DEPTH_MM
-    if valid.any() and not low <= (median := float(np.median(depth_mm[valid]))) <= high:
-        warnings.append(
-            Notice.warning(
-                NoticeCode.DEPTH_UNUSUAL,
-                f"depth: its median is {median:.1f} mm, unusual for an endoscope; is it in millimetres?",
-            )
-        )
+    warnings: list[Notice] = []
+    if valid.any():
+        warnings += unit_warnings(float(np.median(depth_mm[valid])))
     share = np.count_nonzero(valid) / max(1, int(np.count_nonzero(tissue)))
     if share < _MIN_DEPTH_SHARE:
         text = f"depth: only {100 * share:.0f} % of the tissue pixels have one"

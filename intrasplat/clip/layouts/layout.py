@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames
-from intrasplat.clip.naming import eye_of
+from intrasplat.clip.naming import eye_folders, eye_of
 from intrasplat.clip.packing import FrameSequence
 from intrasplat.clip.types import DepthClip, StereoClip
 from intrasplat.clip.video import open_video, open_video_in
@@ -64,9 +65,10 @@ class ClipFiles:
             return open_video(self.path, "clip", self.limits)
         if len(self.videos) == 1:
             return open_video_in(self.tree, self.videos[0])
-        if self.videos or not self.images or any(eye_of(name) for name in self.images):
+        folders = eye_folders(self.images)
+        if self.videos or not self.images or any(eye_of(name, folders) for name in self.images):
             return None
-        return open_images(self.tree, self.images)
+        return at_own_depth(open_images(self.tree, self.images))[0]
 
 
 @dataclass(frozen=True)

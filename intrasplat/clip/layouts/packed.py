@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.images import open_images
 from intrasplat.clip.layouts.layout import ClipFiles, InputLayout
 from intrasplat.clip.packing import Packing, detect_packing
@@ -18,7 +19,7 @@ def _open(files: ClipFiles, packing: Packing) -> StereoClip:
     if sequence is None and files.tree is not None:
         if files.videos:
             return two_video_clip(files.tree, files.videos)
-        sequence = open_images(files.tree, files.images)
+        sequence = at_own_depth(open_images(files.tree, files.images))[0]
     assert sequence is not None
     return packed_clip(sequence, packing, files.limits, detected=files.detected)
 

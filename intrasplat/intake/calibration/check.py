@@ -11,7 +11,10 @@ from intrasplat.errors import InputError
 from intrasplat.intake.calibration.types import RectifiedCalibration, Row, StereoCalibration
 
 FIELD = "calibration"
-MIN_BASELINE_MM, MAX_BASELINE_MM = 0.5, 50.0  # da Vinci 4 to 5 mm, rigid 3D laparoscopes up to about 15 mm
+MIN_BASELINE_MM, MAX_BASELINE_MM = 1.5, 50.0
+"""da Vinci 4 to 5.5 mm, rigid 3D laparoscopes up to about 15 mm, which are 1.5 cm: less is centimetres or metres."""
+USUAL_BASELINE_MM = 2.0, 15.0
+_UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "micrometres": 0.001}
 RIGID_TOLERANCE = 1e-3  # largest entry of |R R^T - 1|: files store rotations with four digits
 
 
@@ -60,10 +63,15 @@ def _check_baseline(baseline_mm: float) -> None:
         return
     if baseline_mm == 0:
         raise InputError(FIELD, "the baseline is 0: both eyes stand at one point.", "Give T in mm.")
-    cause = "metres" if baseline_mm < MIN_BASELINE_MM else "micrometres, or for another instrument"
+    low, high = USUAL_BASELINE_MM
+    causes = (
+        f"it is probably in {unit}, which would be {baseline_mm * unit_mm:.4g} mm"
+        for unit, unit_mm in _UNITS_MM.items()
+        if low <= baseline_mm * unit_mm <= high
+    )
     raise InputError(
         FIELD,
         f"a baseline of {baseline_mm:.4g} mm is outside {MIN_BASELINE_MM} to {MAX_BASELINE_MM:.0f} mm; "
-        f"it is probably in {cause}.",
+        f"{next(causes, 'no unit makes it that of a stereo endoscope')}.",
         "Give T and the baseline in mm.",
     )

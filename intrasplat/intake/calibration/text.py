@@ -1,4 +1,7 @@
-"""Parses calibrations: our JSON, and the ini of StereoMIS and SCARED. The content determines the format."""
+"""Parses calibrations: our JSON, files that name M1 D1 M2 D2 R T, the ini of StereoMIS and SCARED.
+
+The content determines the format. XML alone needs OpenCV's parser, which runs in the decoding process.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +14,34 @@ from pydantic import ValidationError
 
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.check import FIELD, check_calibration
+from intrasplat.intake.calibration.fisheye import check_no_fisheye
+from intrasplat.intake.calibration.keyed import keyed_json, keyed_yaml
+from intrasplat.intake.calibration.named import raw_value
+from intrasplat.intake.calibration.names import FORMATS_REMEDY, MATRICES
 from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
 
-FORMATS_REMEDY = (
-    "Give our JSON (model rectified or raw), an OpenCV YAML or XML with M1 D1 M2 D2 R T, "
-    "or an ini with [StereoLeft] and [StereoRight]."
-)
-
+_LAST_COMMA = re.compile(r",(?=\s*[}\]])")
 _BLANKS = re.compile(r"[^\S\n]+")
+_JSON_COMMENT = re.compile(r'("(?:[^"\\\n]|\\.)*"?)|(?:#|//)[^\n]*')
 
 
 def read_calibration(text: str) -> StereoCalibration | None:
-    """The calibration in a text; None if its format is not one of these.
+    """The calibration in a text; None if its format is XML, or if it is good but names no image size.
 
     Raises:
         InputError: it lacks a number, or is implausible for a stereo endoscope.
     """
     value = parse_text(text)
-    return None if value is None else checked_calibration(value)
+    if value is None:
+        return None
+    sized = "width" in value or value.get("model") != "raw"
+    calibration = checked_calibration(value if sized else with_size(value, 1, 1))
+    return calibration if sized else None
+
+
+def with_size(value: dict[str, Any], width: int, height: int) -> dict[str, Any]:
+    """A value of parse_text(), with this size if it has none."""
+    return {"width": width, "height": height} | value
 
 
 def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
@@ -49,22 +62,38 @@ def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
 
 
 def parse_text(text: str) -> dict[str, Any] | None:
-    """The text as a JSON-like value; None if its format is not one of these."""
+    """The text as a value of our JSON, without width and height if the file names none; None if it is XML.
+
+    Raises:
+        InputError: its format is unknown, or it lacks a number.
+    """
     start = text.lstrip()
-    if start.startswith("{") and "opencv-matrix" not in text:
+    if start.startswith("{"):
         return _parse_json(text)
     if start.lower().startswith("[stereo") or "\n[stereo" in text.lower():
+        check_no_fisheye(text)
         return _parse_ini(text)
-    return None
+    if start.startswith("<"):
+        return None
+    found = keyed_yaml(text)
+    check_no_fisheye(text, found.keys)
+    if not found.entries.keys() & MATRICES and "%YAML" not in text:
+        raise InputError(FIELD, "it is neither JSON, nor a stereo ini, nor an OpenCV YAML or XML file.", FORMATS_REMEDY)
+    return raw_value(found.entries)
 
 
 def _parse_json(text: str) -> dict[str, Any]:
+    plain = _LAST_COMMA.sub("", _JSON_COMMENT.sub(lambda found: found.group(1) or "", text))
     try:
-        value = json.loads(text)
+        value = json.loads(plain)
+        found = keyed_json(value)
     except (ValueError, RecursionError) as error:
         raise InputError(FIELD, f"it is not valid JSON: {error}.", FORMATS_REMEDY) from None
     assert isinstance(value, dict)  # it starts with a brace
-    return value
+    if value.get("model") in ("rectified", "raw") or not found.entries.keys() & MATRICES:
+        return value
+    check_no_fisheye(plain, found.keys)
+    return raw_value(found.entries)
 
 
 def _parse_ini(text: str) -> dict[str, Any]:

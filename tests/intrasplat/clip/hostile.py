@@ -194,7 +194,8 @@ CORPUS: dict[str, Hostile] = {
     "out of the folder": Hostile("clip.zip", fixed(zipped(("../../etc/x.png", png(64, 64)))), r'"\.\."'),
     "absolute": Hostile("clip.zip", fixed(zipped(("/etc/x.png", png(64, 64)))), "absolute path"),
     "a drive": Hostile("clip.zip", fixed(zipped(("C:/x.png", png(64, 64)))), "absolute path"),
-    "a backslash": Hostile("clip.zip", fixed(zipped(("left\\x.png", png(64, 64)))), "backslash"),
+    "out of the folder by backslashes": Hostile("clip.zip", fixed(zipped(("..\\..\\x.png", png(64, 64)))), r'"\.\."'),
+    "a drive by backslashes": Hostile("clip.zip", fixed(zipped(("C:\\x.png", png(64, 64)))), "absolute path"),
     "a link": Hostile("clip.zip", fixed(zipped((FRAME, b"/etc/passwd"), kind=stat.S_IFLNK)), "symbolic link"),
     "a device": Hostile("clip.zip", fixed(zipped((FRAME, b""), kind=stat.S_IFCHR)), "not a plain file"),
     "a zip in a zip": Hostile("clip.zip", fixed(zipped(("more.zip", zipped((FRAME, b""))))), "archive inside"),
@@ -240,7 +241,7 @@ CORPUS: dict[str, Hostile] = {
     "deep behind comments": Hostile(
         "calibration.xml",
         fixed(_CUT_XML + b"<a><!--</-->" * 9_000 + b"</a><!--<-->" * 9_000 + b"</opencv_storage>"),
-        "left_k has 1 numbers",
+        "has 1 number,",
         "decoding",
         "calibration",
     ),

@@ -98,14 +98,6 @@ def test_grey_16_bit_and_transparent_frames_become_rgb(studio) -> None:
     np.testing.assert_array_equal(second_right, left)
 
 
-def test_16_bit_frames_that_hold_8_bit_values_are_refused_rather_than_shown_black(studio) -> None:
-    left, right = studio.eyes(1)
-    studio.images("clip/left/{}.png", left.astype(np.uint16))
-    studio.images("clip/right/{}.png", right.astype(np.uint16))
-    with pytest.raises(InputError, match="8-bit values in 16 bits"):
-        next(open_clip(studio.root / "clip").pairs())
-
-
 def test_jpeg_frames_are_accepted(studio) -> None:
     clip = open_clip(write_pairs(studio, ("clip/left/{}.jpg", "clip/right/{}.jpg"), height=50, width=70))
     assert (clip.height, clip.width) == (50, 70)

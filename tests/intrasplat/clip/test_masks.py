@@ -117,13 +117,6 @@ def test_told_masks_may_mark_no_tool_but_not_everything(studio, frames: Path) ->
         open_with(frames, masks=masks, mask_polarity="tissue")
 
 
-def test_a_frame_that_is_all_tool_is_warned_about(studio, frames: Path) -> None:
-    tool = studio.tool()
-    tool[2] = True
-    clip = open_clip(frames, masks=studio.masks("masks", tool))
-    assert "1 of 6 frames are all tool in their masks and cannot be learnt from" in texts(clip.warnings)
-
-
 def test_grey_edges_are_cut_at_half(studio, frames: Path) -> None:
     tool = studio.tool()
     grey = np.where(tool, np.uint8(128), np.uint8(127))
@@ -137,12 +130,6 @@ def test_coloured_and_16_bit_masks_are_read(studio, frames: Path) -> None:
     np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("red/{}.png", red)), ~tool)
     deep = np.where(tool, np.uint16(65535), np.uint16(0))
     np.testing.assert_array_equal(tissue_of(frames, masks=studio.images("deep/{}.png", deep)), ~tool)
-
-
-def test_masks_of_ones_instead_of_255_are_refused_rather_than_read_as_empty(studio, frames: Path) -> None:
-    masks = studio.images("masks/{}.png", studio.tool().astype(np.uint8))
-    with pytest.raises(InputError, match="largest value in the masks is 1 of 255"):
-        open_clip(frames, masks=masks)
 
 
 def test_masks_of_another_count_or_size_are_refused(studio, frames: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,12 @@ def test_every8_is_the_rule_of_the_papers() -> None:
     assert split.held_out == [1, 9, 17, 25, 33, 41, 49, 57]
     assert len(split.train) == 55
     assert split.repeated == []
+
+
+def test_a_skipped_frame_is_not_held_out() -> None:
+    split = split_frames(replace(distinct(20), skipped=(9, 10)), "every8")
+    assert (split.held_out, split.repeated) == ([1, 17], [9, 10])
+    assert not {9, 10} & set(split.train)
 
 
 def test_blocks8_hides_every_third_block_of_eight_between_the_first_and_the_last() -> None:

@@ -110,14 +110,6 @@ def test_vp9_opens_in_each_container(studio, suffix: str) -> None:
     assert np.abs(shown_right.astype(float) - right[0]).mean() < LOSSY_LEVELS
 
 
-def test_the_options_for_the_decoder_do_not_stay_in_the_environment(monkeypatch) -> None:
-    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "theirs;1")
-    monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
-    stereo(SBS_H264)
-    assert os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] == "theirs;1"
-    assert "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
-
-
 def test_a_told_packing_wins_over_what_the_frames_look_like() -> None:
     clip = stereo(SBS_H264, layout="tb")
     assert (clip.height, clip.width) == (40, 192)
@@ -249,6 +241,20 @@ def test_eyes_of_different_length_are_refused(studio) -> None:
     with pytest.raises(InputError, match="right eye has 5 frames, the left 6") as caught:
         open_clip(studio.video("a.webm", left), studio.video("b.webm", right[:5]))
     assert caught.value.field == "right"
+
+
+@pytest.mark.parametrize(("left_hz", "right_hz"), [(25.0, 50.0), (30.0, 25.0), (60.0, 50.0)])
+def test_eyes_of_different_rates_are_refused(studio, left_hz: float, right_hz: float) -> None:
+    left, right = studio.eyes()
+    with pytest.raises(InputError, match=f"right eye has {right_hz:g} frames a second, the left {left_hz:g}") as caught:
+        open_clip(studio.video("a.mp4", left, rate_hz=left_hz), studio.video("b.mp4", right, rate_hz=right_hz))
+    assert caught.value.field == "right"
+
+
+def test_eyes_in_different_containers_have_one_rate(studio) -> None:
+    left, right = studio.eyes()
+    clip = stereo(studio.video("a.mp4", left, rate_hz=120), right=studio.video("b.webm", right, rate_hz=120))
+    assert clip.frame_count == 6
 
 
 def test_eyes_of_different_size_are_refused(studio) -> None:

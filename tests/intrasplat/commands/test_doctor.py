@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from intrasplat.commands.doctor import (
-    FIXED_FFMPEG,
     OPTIONAL_PACKAGES,
     PACKAGES,
     Diagnosis,
-    bundled_ffmpeg,
     device_finding,
     examine,
     format_findings,
+    video_finding,
 )
 from intrasplat.machine.gpu import Gpu
 from tests.test_repository import project, requirement_name
@@ -70,14 +69,19 @@ def test_a_gpu_whose_triton_is_too_old_lies_idle_with_both_versions_named() -> N
     assert device_finding("cuda", dataclasses.replace(H200, triton="3.5.1")).blocks
 
 
-def test_the_version_of_a_bundled_ffmpeg_is_read_from_its_library(tmp_path: Path) -> None:
-    assert bundled_ffmpeg(tmp_path) is None
-    folder = tmp_path / "opencv_python.libs"
-    folder.mkdir()
-    (folder / "libavutil-0.so").write_bytes(b"\0ELF..FFmpeg version 8.1.1\0")
-    version = bundled_ffmpeg(tmp_path)
-    assert version == (8, 1, 1)
-    assert version < FIXED_FFMPEG
+@pytest.mark.parametrize(
+    ("release", "found", "remedy"),
+    [
+        ("8.1.2", "FFmpeg 8.1.2", None),
+        ("n8.2", "FFmpeg 8.2", None),
+        ("8.1.1", "FFmpeg 8.1.1", "CVE-2026-8461"),
+        ("N-12345-gabcdef", "FFmpeg N-12345-gabcdef", "8.1.2 or newer"),
+    ],
+)
+def test_an_ffmpeg_with_a_known_hole_has_a_remedy(release: str, found: str, remedy: str | None) -> None:
+    finding = video_finding(release)
+    assert finding.found == found
+    assert (finding.remedy is None) if remedy is None else (remedy in str(finding.remedy))
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,10 @@ from intrasplat.decode.contained import DecoderKilledError, Patience, keep_decod
 from intrasplat.decode.guard import PROTECTIONS, Allowance
 from intrasplat.errors import Cancelled, InputError, LimitError
 from intrasplat.machine.hooks import Hooks, Progress
+from intrasplat.notices import NoticeCode
 from intrasplat.stereo import estimate_depth
 from tests.intrasplat.clip.conftest import Studio
+from tests.intrasplat.clip.recorder import damaged, record
 from tests.intrasplat.decode.stand_in import run_stand_in
 
 CALIBRATION = (
@@ -79,6 +81,17 @@ def test_a_stereo_clip_comes_out_of_the_process_bit_for_bit(studio: Studio, scra
     assert decoded.calibration == load_calibration(calibration, eye_width=96, eye_height=80)
     assert list(scratch.iterdir()) == []
     assert len(list(decoded.clip.pairs())) == 6  # what is mapped outlives its files, and can be read again
+
+
+def test_damage_is_told_by_the_process(studio: Studio, scratch: Path) -> None:
+    left, right = studio.eyes()
+    path = scratch.parent / "clip.mp4"
+    whole = record(path, np.concatenate([left, right], axis=2), keyframes=3, options={"bf": "0"})
+    decoded = decode_clip(damaged(whole, 4), calibration=calibrated(studio))
+    assert isinstance(decoded, StereoRecording)
+    assert decoded.clip.damaged == (4, 5)
+    assert decoded.clip.warnings[0].code is NoticeCode.DAMAGED_FRAMES
+    assert len(list(decoded.clip.pairs())) == 6
 
 
 def test_a_clip_is_there_before_its_frames_and_their_error_when_they_are_read(studio: Studio, scratch: Path) -> None:

@@ -81,7 +81,8 @@ def test_a_number_that_is_none_is_told_with_its_line_whatever_ends_the_lines() -
     ("again", "is_cut"), [(":!", False), (":[", True), (": !!a", False), ("::{", True), (":[}", True)]
 )
 def test_no_text_keeps_who_looks_at_it(again: str, is_cut: bool) -> None:
-    head, end = "%YAML:1.0\nM1: 1\nM2: 1\nR: 1\nT: 1\n", "" if is_cut else "]}"
+    k = "[90, 0, 48, 0, 90, 40, 0, 0, 1]"
+    head, end = f"%YAML:1.0\nM1: {k}\nM2: {k}\nR: [0, 0, 0]\nT: [-4, 0, 0]\n", "" if is_cut else "]}"
     text = head + again * ((MAX_CALIBRATION_BYTES - 100) // len(again)) + end
     looked = subprocess.run(  # of a process of its own: a pattern that does not come to an end hears no signal
         [sys.executable, "-c", LOOK], input=text, capture_output=True, text=True, timeout=HANGS_AFTER_S

@@ -229,7 +229,7 @@ def _growing_dark(clip: DepthClip) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (_masked_to_a_corner, "of the picture counts as tissue"),
+        (_masked_to_a_corner, "of the field of view counts as tissue"),
         (_without_masks, "No instrument is masked"),
         (_without_depth, "Stereo depth is missing or unsure on 50%"),
         (_without_texture, "has no texture"),

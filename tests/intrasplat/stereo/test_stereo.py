@@ -389,3 +389,12 @@ def test_a_raw_recording_lands_on_equal_rows() -> None:
     assert depth.measurements["vertical_residual_px"] < 0.5
     assert abs(depth.measurements["vertical_misalignment_px"]) < 1.0
     assert depth.measurements["depth_valid_share"] > 0.8
+
+
+def test_damaged_frames_are_neither_measured_nor_matched_and_change_no_bit_of_the_others() -> None:
+    sound = [draw_pair(slanted(), seed) for seed in range(4)]
+    noise = np.random.default_rng(9).integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    pairs = [sound[0], (noise[0], noise[1]), *sound[1:]]
+    depth = estimate_depth(replace(clip_of(pairs), damaged=(1,)))
+    assert depth.skipped == (1,)
+    np.testing.assert_array_equal(depth.depth_mm[[0, 2, 3, 4]], estimate_depth(clip_of(sound)).depth_mm)
