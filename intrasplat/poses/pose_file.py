@@ -19,12 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from intrasplat.clip import DepthClip
 from intrasplat.errors import InputError
+from intrasplat.intake.calibration.encoding import decoded_text
+from intrasplat.intake.limits import MAX_POSE_FILE_BYTES
 from intrasplat.notices import NoticeCode
 from intrasplat.poses.agreement import Convention
 from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import MM_PER_M, at_times
 
-MAX_BYTES = 64 * 2**20
 RIGID_TOLERANCE = 1e-3
 TUM_COLUMNS, MATRIX_COLUMNS = 8, (12, 16)
 REMEDY = "Give a TUM file (t x y z qx qy qz qw), or a 3x4 or 4x4 matrix a frame as JSON or text."
@@ -53,9 +54,11 @@ def read_poses(path: Path, field: str = "poses_file") -> StoredPoses:
         InputError: it cannot be read, has no poses, or poses that are not rigid.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(field, f"{path} is larger than {MAX_BYTES // 2**20} MiB.", REMEDY)
-        text = path.read_text()
+        if path.stat().st_size > MAX_POSE_FILE_BYTES:
+            raise InputError(field, f"{path} is larger than {MAX_POSE_FILE_BYTES // 2**20} MiB.", REMEDY)
+        text = decoded_text(path.read_bytes())
+        if text is None:
+            raise InputError(field, f"{path} is not a text file.", REMEDY)
         if text.lstrip()[:1] in ("[", "{"):
             return StoredPoses(rigid(_of_json(json.loads(text)), field), None, field)
     except (OSError, ValueError, RecursionError) as error:

@@ -26,7 +26,7 @@ def lines(rows: Reals) -> str:
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("list.json", json.dumps(PATH.tolist())),
+        ("list.json", "\ufeff" + json.dumps(PATH.tolist())),
         ("3x4.json", json.dumps({"poses": PATH[:, :3].tolist()})),
         ("frames.json", json.dumps({"frames": [{"transform_matrix": each.tolist()} for each in PATH]})),
         ("kitti.txt", lines(PATH[:, :3].reshape(-1, 12))),
