@@ -90,8 +90,9 @@ def run_cli(options: argparse.Namespace) -> int:
     if out is not None:
         write_tum(out, clip.frame_times_s, clip.world_from_camera)
     if true is not None:
-        unit = likely_unit(true)
-        if unit == "mm":
+        is_tum = known is not None and known.stamps is not None
+        unit = likely_unit(true) if is_tum else "mm"
+        if is_tum and unit == "mm":
             print(f"{options.against}: its positions are in mm, not in metres: a factor of 1000")
         error = trajectory_error(clip.world_from_camera, Convention(unit).world_from_camera(true))
         print(f"absolute trajectory error: {error.mm:.2f} mm, {error.deg:.2f} degrees")
