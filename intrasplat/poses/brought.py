@@ -10,7 +10,7 @@ import numpy as np
 from intrasplat.clip import DepthClip
 from intrasplat.names import PoseConvention
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.poses.agreement import OPENCV_AXES, Agreement, Convention, agreement, likely_unit
+from intrasplat.poses.agreement import OPENCV_AXES, Agreement, Convention, Unit, agreement, likely_unit
 from intrasplat.poses.placing import placed
 from intrasplat.poses.pose_file import StoredPoses, poses_of_frames
 
@@ -24,7 +24,8 @@ def with_stored_poses(clip: DepthClip, train: Sequence[int], stored: StoredPoses
         InputError: the poses do not belong to this clip.
     """
     poses = poses_of_frames(clip, stored)
-    told = stored.told or Convention("mm" if stored.stamps is None else likely_unit(poses))
+    usual: Unit = "mm" if stored.stamps is None else "m"
+    told = stored.told or Convention(usual if usual == "mm" else likely_unit(poses))
     found = agreement(clip, train, poses, told) if len(train) >= MIN_FRAMES else Agreement(told)
     if found.contradicts:
         why = "the pictures contradict them in every unit, direction and axes"
@@ -34,8 +35,7 @@ def with_stored_poses(clip: DepthClip, train: Sequence[int], stored: StoredPoses
         why = "which fits the pictures"
     else:
         why = "which the pictures cannot check: the camera hardly moves"
-    factor = ", a factor of 1000" if found.convention.unit != told.unit else ""
-    text = f"poses: as given, read as {found.convention}{factor}; {why}"
+    text = f"poses: as given, read as {found.convention}{_factor(found.convention.unit, usual)}; {why}"
     clip = _told(placed(clip, found.convention.world_from_camera(poses)), Notice.info(NoticeCode.POSES, text))
     return clip, found.contradicts
 
@@ -55,7 +55,7 @@ def with_checked_poses(clip: DepthClip, train: Sequence[int], axes: PoseConventi
     found = agreement(clip, train, poses, told)
     if found.convention == told:
         return clip, found.contradicts
-    factor = ", a factor of 1000" if found.convention.unit != told.unit else ""
+    factor = _factor(found.convention.unit, told.unit)
     text = f"poses: read as {found.convention}{factor}, not as {told}: only so do they fit the pictures"
     corrected = placed(clip, found.convention.world_from_camera(poses))
     return _told(corrected, Notice.info(NoticeCode.POSES, text)), found.contradicts
@@ -66,6 +66,10 @@ def contradicted(clip: DepthClip, *, used: bool) -> DepthClip:
     text = "The given camera poses contradict the pictures in every unit, direction and axes: "
     text += "they are used nevertheless; check them, or estimate them." if used else "the path was estimated instead."
     return replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSES_CONTRADICT, text)))
+
+
+def _factor(unit: Unit, usual: Unit) -> str:
+    return f" (not in {usual}: a factor of 1000)" if unit != usual else ""
 
 
 def _told(clip: DepthClip, notice: Notice) -> DepthClip:

@@ -87,6 +87,8 @@ def test_poses_in_any_convention_are_read_as_the_pictures_show(
 def test_a_factor_of_1000_is_told() -> None:
     clip, true = drawn("still", "swing")
     assert "a factor of 1000" in told(posed(clip, StoredPoses(written(true, unit_mm=1000.0))))
+    assert "a factor of 1000" in told(posed(clip, StoredPoses(true, STAMPS)))
+    assert "a factor" not in told(posed(clip, StoredPoses(true)))
 
 
 def test_poses_of_another_clip_are_not_used_unless_they_must_be() -> None:
