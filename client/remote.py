@@ -66,6 +66,7 @@ def _add_submit(commands: Commands) -> None:
     parser.add_argument(
         "--masks", type=Path, metavar="F", help="zip of PNGs or a video: the instruments, of the left eye or of both"
     )
+    parser.add_argument("--poses-file", type=Path, metavar="F", help="the camera's poses: TUM, or a matrix a frame")
     source.add_argument(
         "--clip-of",
         metavar="JOB",
@@ -164,6 +165,7 @@ def _submit(options: argparse.Namespace) -> int:
                 clip_of=options.clip_of,
                 calibration=options.calibration,
                 masks=options.masks,
+                poses_file=options.poses_file,
                 label=options.label,
                 metadata=dict(options.metadata or ()),
                 callback_url=options.callback_url,

@@ -84,6 +84,7 @@ class NoticeCode(StrEnum):
     NO_TIME = "no_time"
     NOTHING_NEW = "nothing_new"
     OUT_OF_FOCUS = "out_of_focus"
+    POSES_CONTRADICT = "poses_contradict"
     POSES_UNSURE = "poses_unsure"
     POSE_JITTER = "pose_jitter"
     REPEATED_FRAMES = "repeated_frames"

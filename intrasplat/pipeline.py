@@ -27,7 +27,7 @@ from intrasplat.machine.timing import Timings
 from intrasplat.names import CURVE, MASKS, RECORDED, REPORT
 from intrasplat.notices import Notice
 from intrasplat.outcome import scene_of, snapshot_of, training_of
-from intrasplat.poses import placed, with_poses
+from intrasplat.poses import placed, read_poses, with_poses
 from intrasplat.quality.checks import clip_warnings
 from intrasplat.quality.report import first_report
 from intrasplat.quality.score import score_model
@@ -181,9 +181,10 @@ def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timin
 
     On a GPU the splatting kernels are checked before stereo matching.
     """
+    stored = read_poses(request.poses) if isinstance(request.poses, Path) else request.poses
     if isinstance(request.clip, DepthClip):
         clip = request.clip if request.clip.fov is not None else with_shown_parts(request.clip, request.options)
-        return with_poses(clip, request.options, hooks, timings)
+        return with_poses(clip, request.options, hooks, timings, stored)
 
     def examined() -> None:
         if device != CPU:
@@ -201,7 +202,7 @@ def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timin
         before_matching=examined,
         segmenter=request.segmenter,
     )
-    return with_poses(clip, request.options, hooks, timings)
+    return with_poses(clip, request.options, hooks, timings, stored)
 
 
 def optimise(run: Run, keeper: Keeper) -> None:

@@ -279,13 +279,14 @@ def reconstruct(
     request = ReconstructionRequest(clip=Path(), options=chosen, device=device)
     source = clip.source if isinstance(clip, Clip) else clip
     segmenter = clip.segmenter if isinstance(clip, Clip) else None
+    poses = clip.poses if isinstance(clip, Clip) else None
     if isinstance(source, ClipPaths):
         request = dataclasses.replace(
             request, clip=source.clip, right=source.right, calibration=source.calibration, masks=source.masks,
-            segmenter=segmenter,
+            segmenter=segmenter, poses=poses,
         )  # fmt: skip
     elif isinstance(source, DepthClip):
-        request = dataclasses.replace(request, clip=source, segmenter=segmenter)
+        request = dataclasses.replace(request, clip=source, segmenter=segmenter, poses=poses)
     else:
         assert isinstance(clip, Clip)
         matched = clip.with_depth(device=device, on_progress=on_progress, options=chosen)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,9 @@ from intrasplat.names import Layout, MaskPolarity, MaskSource, PoseConvention
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ClipOptions, ReconstructionOptions, parse_options
 from intrasplat.pipeline import open_with_poses
+from intrasplat.poses import StoredPoses
+from intrasplat.poses.agreement import Convention
+from intrasplat.poses.pose_file import rigid
 from intrasplat.report import CameraPoses, Masks
 from intrasplat.splat.backend import choose_device
 from intrasplat.stereo import ClipPaths, match_eyes
@@ -53,11 +56,13 @@ class Clip:
     source     its files, its frames of both eyes, or its frames with depth
     options    layout of its files
     segmenter  an ONNX file that finds instruments where there are no masks; None: they are found by colour and depth
+    poses      of the camera, a file or as stored; None: as source has them
     """
 
     source: ClipPaths | StereoFrames | DepthClip
     options: ClipOptions = field(default_factory=ClipOptions)
     segmenter: Path | None = None
+    poses: Path | StoredPoses | None = None
 
     def with_depth(
         self,
@@ -114,6 +119,7 @@ class Clip:
             masks=paths.masks,
             options=chosen,
             segmenter=self.segmenter,
+            poses=self.poses,
         )
         return open_with_poses(request, hooks, timings, where)
 
@@ -125,7 +131,7 @@ def read_clip(
     calibration: FilePath | Mapping[str, Any] | None = None,
     masks: FilePath | NDArray[np.bool_] | None = None,
     depth_mm: NDArray[np.floating[Any]] | None = None,
-    poses: NDArray[np.floating[Any]] | None = None,
+    poses: FilePath | NDArray[np.floating[Any]] | None = None,
     intrinsics: Intrinsics | None = None,
     frame_times_s: NDArray[np.floating[Any]] | None = None,
     segmenter: FilePath | None = None,
@@ -144,7 +150,8 @@ def read_clip(
         calibration: of both eyes, a file or the values of our JSON (docs/input.md). Needed for stereo frames.
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
         depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
-        poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; None: the camera is fixed. Only with depth_mm.
+        poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; or a file of them (docs/conventions.md). None: with
+            depth_mm the camera is fixed, else its path is found. Poses are checked against the pictures.
         intrinsics: the camera; required with depth_mm.
         frame_times_s: [T] seconds from the first frame; None: 30 frames a second. Only with frames in memory.
         segmenter: an ONNX file that finds instruments where there are no masks.
@@ -174,13 +181,16 @@ def read_clip(
         if depth_mm is not None:
             _refuse("right", right, "frames with depth_mm are of one eye", "Leave it out, or leave out depth_mm.")
             _refuse("calibration", calibration, "frames with depth_mm have intrinsics", "Give intrinsics instead.")
-            return Clip(_depth_clip(source, depth_mm, masks, poses, intrinsics, times_s), chosen, network)
-        _refuse("poses", poses, "the camera's path of a stereo clip is found", "Leave them out, or give depth_mm.")
+            array = poses if isinstance(poses, np.ndarray) else None
+            clip = _depth_clip(source, depth_mm, masks, array, intrinsics, times_s)
+            if poses is None or array is not None:
+                return Clip(clip, chosen, network)
+            return Clip(replace(clip, poses=None), chosen, network, _stored(poses))
         _refuse("intrinsics", intrinsics, "the cameras of a stereo clip are in its calibration", "Leave them out.")
-        return Clip(_stereo_frames(source, right, calibration, masks, times_s), chosen, network)
-    in_memory = {"depth_mm": depth_mm, "poses": poses, "intrinsics": intrinsics, "frame_times_s": frame_times_s}
-    for name, given in in_memory.items():
-        _refuse(name, given, "it goes with frames in memory alone", "Leave it out; files bring their own.")
+        return Clip(_stereo_frames(source, right, calibration, masks, times_s), chosen, network, _stored(poses))
+    in_memory = {"depth_mm": depth_mm, "intrinsics": intrinsics, "frame_times_s": frame_times_s}
+    for name, value in in_memory.items():
+        _refuse(name, value, "it goes with frames in memory alone", "Leave it out; files bring their own.")
     for name, file in (("right", right), ("masks", masks)):
         if isinstance(file, np.ndarray):
             raise InputError(name, "it is an array, but the clip is a file.", "Give a file, or the clip's frames too.")
@@ -190,7 +200,13 @@ def read_clip(
         _path(source, "source"), _existing(right, "right"), _existing(calibration, "calibration"),
         _existing(masks, "masks"),
     )  # fmt: skip
-    return Clip(paths, chosen, network)
+    return Clip(paths, chosen, network, _stored(poses))
+
+
+def _stored(poses: FilePath | NDArray[Any] | None) -> Path | StoredPoses | None:
+    if not isinstance(poses, np.ndarray):
+        return _existing(poses, "poses")
+    return StoredPoses(rigid(poses, "poses"), None, "poses", Convention())
 
 
 def _path(path: FilePath, field: str) -> Path:

@@ -23,11 +23,12 @@ ABOUT = {
     "right": "the right eye, with left",
     "calibration": "of the cameras",
     "masks": "where instruments are",
+    "poses_file": "the camera's poses: TUM, or a matrix a frame",
 }
 CLIP_OF_ID = {
     "type": "string",
     "pattern": JOB_ID_PATTERN,
-    "description": "a job whose clip is used again, with its calibration and masks unless others are sent",
+    "description": "a job whose clip is used again, with its calibration, masks and poses unless others are sent",
 }
 CALLBACK_URL = {
     "type": "string",

@@ -92,7 +92,7 @@ def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
         return
     yield from _found(FindingCode.TOO_LARGE, lambda: check_part_size(part, file.size_bytes))
     head = bytes.fromhex(file.head)
-    if part == "calibration" or not head:
+    if part in ("calibration", "poses_file") or not head:
         return
     if file.suffix.lower() != ZIP_SUFFIX:
         yield from _found(FindingCode.KIND, lambda: check_head(head, file.suffix, part, "the file"))

@@ -73,6 +73,7 @@ class Submission(BaseModel):
     right: str | None = None
     calibration: str | None = None
     masks: str | None = None
+    poses_file: str | None = None
     clip_of: str | None = None
     label: str | None = None
     metadata: dict[str, object] | None = None

@@ -34,7 +34,9 @@ MAX_OPEN_UPLOADS = 100
 """Maximum uploads of one tenant that are unfinished or not used yet."""
 
 REST_REMEDY = "Ask for the offset (HEAD) and send the bytes that follow."
-METADATA_REMEDY = "Send `part` (clip, left, right, calibration or masks) and `suffix` (.mp4), each value in base64."
+METADATA_REMEDY = (
+    "Send `part` (clip, left, right, calibration, masks or poses_file) and `suffix` (.mp4), each value in base64."
+)
 
 
 class TusRoute(APIRoute):

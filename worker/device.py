@@ -281,6 +281,7 @@ def request_of(
         right=spool / files.right if files.right else None,
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
+        poses=spool / files.poses_file if files.poses_file else None,
         segmenter=segmenter,
         options=record.options,
         device=device,

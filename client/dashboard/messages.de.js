@@ -59,6 +59,7 @@ export const DE = {
     "no_time": "Einige Bilder wurden weggelassen, um Zeit zu sparen.",
     "nothing_new": "Bilder, die nichts Neues zeigen, wurden weggelassen.",
     "out_of_focus": "Das Bild ist unscharf.",
+    "poses_contradict": "Die mitgegebenen Orte des Endoskops passen nicht zu den Bildern.",
     "poses_unsure": "Wo das Endoskop war, ist in einigen Bildern unsicher.",
     "pose_jitter": "Die mitgelieferten Positionen des Endoskops springen.",
     "repeated_frames": "Viele Bilder wiederholen das vorige.",

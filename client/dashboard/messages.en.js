@@ -59,6 +59,7 @@ export const EN = {
     "no_time": "Some frames were left out to save time.",
     "nothing_new": "Frames that show nothing new were left out.",
     "out_of_focus": "The picture is out of focus.",
+    "poses_contradict": "The positions of the endoscope that were given do not fit the pictures.",
     "poses_unsure": "Where the endoscope was is unsure in some frames.",
     "pose_jitter": "The positions of the endoscope that came with the clip jump.",
     "repeated_frames": "Many frames repeat the one before.",

@@ -47,6 +47,7 @@ class Core:
         clip_of: str | None = None,
         calibration: Path | None = None,
         masks: Path | None = None,
+        poses_file: Path | None = None,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
         callback_url: str | None = None,
@@ -57,8 +58,9 @@ class Core:
     ) -> JobView:
         """Upload a clip and get its queued job; `right` is the right eye's file, if there are two.
 
-        `clip_of`, instead of a clip, is the id of a job or scene whose clip is used again, with its calibration and
-        masks unless others are given here: so better masks need no second upload of the clip.
+        `clip_of`, instead of a clip, is the id of a job or scene whose clip is used again, with its calibration, masks
+        and poses unless others are given here: so better masks need no second upload of the clip.
+        `poses_file` holds the camera's poses: TUM, or a matrix a frame as JSON or text.
         A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
@@ -70,7 +72,7 @@ class Core:
             InputError: a file cannot be read, there is no clip or both clip and clip_of, or an option cannot be used;
                 nothing was sent.
         """
-        others = {"calibration": calibration, "masks": masks}
+        others = {"calibration": calibration, "masks": masks, "poses_file": poses_file}
         prepared = submission.prepare(
             clip,
             right,

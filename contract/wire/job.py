@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_serializer,
+)
 
 from contract.wire.labels import Labels
 from intrasplat.codes import known_code
@@ -20,6 +27,10 @@ LOCAL_TENANT = "local"
 """Whose jobs they are where no key is asked for."""
 
 TENANT_PATTERN = r"^[a-z0-9-]{1,40}$"
+
+
+LATER_OPTIONS = ("fov",)
+"""Options that workers of the last version do not know: a record leaves them out where they have their default."""
 
 
 class JobState(StrEnum):
@@ -58,6 +69,7 @@ class JobFiles(BaseModel):
     """File names inside the job's spool folder, made by the service (`clip.mp4`), never the caller's.
 
     clip: of an imported scene, its archive.
+    poses_file: left out of JSON if there is none, because workers of older versions do not know it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -66,6 +78,7 @@ class JobFiles(BaseModel):
     right: str | None = None
     calibration: str | None = None
     masks: str | None = None
+    poses_file: str | None = Field(default=None, exclude_if=lambda name: name is None)
 
 
 class JobProgress(BaseModel):
@@ -143,6 +156,12 @@ class JobRecord(BaseModel):
     error: JobError | None = None
     trace: str | None = Field(default=None, exclude=True)
     """The W3C traceparent of the request that submitted it. It stands in no JSON, so that older versions read that."""
+
+    @field_serializer("options", mode="wrap")
+    def _known_to_older_workers(self, options: JobOptions, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        default = JobOptions()
+        unset = {name for name in LATER_OPTIONS if getattr(options, name) == getattr(default, name)}
+        return {name: value for name, value in handler(options).items() if name not in unset}
 
 
 class Forecast(BaseModel):

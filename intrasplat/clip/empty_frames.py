@@ -57,7 +57,7 @@ class EmptyFrames:
         for reason in dict.fromkeys(self.reasons.values()):
             frames = sorted(index for index, why in self.reasons.items() if why == reason)
             named = ", ".join(str(index) for index in frames[:MAX_NAMED]) + (", ..." if len(frames) > MAX_NAMED else "")
-            text = f"{len(frames)} of {frame_count:,} frames {reason} ({named}) and were left out"
+            text = f"frames that {reason} were left out: {named} ({len(frames)} of {frame_count:,})"
             if reason == COVERED:
                 found.append(Notice.warning(NoticeCode.FRAMES_WITHOUT_TISSUE, text))
             else:

@@ -28,9 +28,13 @@ _OPENCV_COLUMNS: dict[str, tuple[list[int], list[float]]] = {
 
 @dataclass(frozen=True)
 class Poses:
-    """world_from_camera [T, 4, 4] float64 mm, OpenCV axes, world = camera of frame 0; size and focal in pixels."""
+    """world_from_camera [T, 4, 4] float64 mm, OpenCV axes, world = camera of frame 0; size and focal in pixels.
+
+    first_pose [4, 4]: frame 0 in the file's world.
+    """
 
     world_from_camera: NDArray[np.float64]
+    first_pose: NDArray[np.float64]
     height: int
     width: int
     focal_px: float
@@ -50,7 +54,7 @@ def parse_poses(data: bytes, frame_count: int, convention: PoseConvention) -> Po
     world_from_camera = np.tile(np.eye(4), (frame_count, 1, 1))
     world_from_camera[:, :3, :3] = _nearest_rotations(matrices[:, :, columns] * signs)
     world_from_camera[:, :3, 3] = matrices[:, :, 3]
-    return Poses(_relative_to_first(world_from_camera), height, width, focal_px)
+    return Poses(_relative_to_first(world_from_camera), world_from_camera[0], height, width, focal_px)
 
 
 def _load(data: bytes) -> NDArray[np.float64]:

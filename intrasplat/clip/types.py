@@ -110,6 +110,7 @@ class DepthClip(Eye):
     fov              entry of the field of view for the report; None: it was not looked for
     rectification    rectification of the recorded left eye; None: it is as recorded
     poses            source of world_from_camera; None: poses are not set yet
+    first_pose       [4, 4] of frame 0 in the layout's own world, mm, OpenCV axes; None: not known
     skipped         skipped frames (sampling.py): no stage reads them, and stereo gives them no depth
     """
 
@@ -120,6 +121,7 @@ class DepthClip(Eye):
     fov: FieldOfView | None = None
     rectification: Rectification | None = None
     poses: CameraPoses | None = None
+    first_pose: NDArray[np.float64] | None = None
     skipped: tuple[int, ...] = ()
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()

@@ -16,8 +16,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 
 if TYPE_CHECKING:
-    from intrasplat.clip import DepthClip
-    from intrasplat.poses.rigid import Reals
+    pass
 
 OPTIONS = (
     "layout",
@@ -41,6 +40,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--masks", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument("--poses-file", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--segmenter", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument(
         "--against",
@@ -63,22 +63,25 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.decode import keep_decoder_ready
     from intrasplat.machine.hooks import Hooks
     from intrasplat.machine.timing import Timings
-    from intrasplat.poses import with_poses
-    from intrasplat.poses.trajectory import from_first, read_tum, trajectory_error, write_tum
+    from intrasplat.poses import read_poses, with_poses
+    from intrasplat.poses.agreement import Convention, likely_unit
+    from intrasplat.poses.pose_file import poses_of_frames
+    from intrasplat.poses.trajectory import trajectory_error, write_tum
     from intrasplat.stereo import ClipPaths, open_with_depth
 
     out: Path | None = options.out
     if out is not None and (out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK)):
         raise InputError("--out", f"{out} cannot be written.", "Name a file in a folder that is there.")
-    known = read_tum(options.against) if options.against else None
+    known = read_poses(options.against, "--against") if options.against else None
+    stored = read_poses(options.poses_file) if options.poses_file else None
     given, timings = given_options(options, ReconstructionOptions), Timings()
     keep_decoder_ready()
     with ProgressBar(sys.stderr) as bar:
         hooks = Hooks(on_progress=bar.show)
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
-        true = None if known is None else from_first(_of_frames(clip, *known))
-        clip = with_poses(clip, given, hooks, timings)
+        true = None if known is None else poses_of_frames(clip, known)
+        clip = with_poses(clip, given, hooks, timings, stored)
     for notice in clip.assumptions:
         if notice.code is NoticeCode.POSES:
             print(notice.text)
@@ -87,22 +90,10 @@ def run_cli(options: argparse.Namespace) -> int:
     if out is not None:
         write_tum(out, clip.frame_times_s, clip.world_from_camera)
     if true is not None:
-        error = trajectory_error(clip.world_from_camera, true)
+        is_tum = known is not None and known.stamps is not None
+        unit = likely_unit(true) if is_tum else "mm"
+        if is_tum and unit == "mm":
+            print(f"{options.against}: its positions are in mm, not in metres: a factor of 1000")
+        error = trajectory_error(clip.world_from_camera, Convention(unit).world_from_camera(true))
         print(f"absolute trajectory error: {error.mm:.2f} mm, {error.deg:.2f} degrees")
     return ExitCode.OK
-
-
-def _of_frames(clip: DepthClip, times_s: Reals, poses: Reals) -> Reals:
-    """The known poses [T, 4, 4] of the clip's frames: one line per frame, or interpolated at its time.
-
-    Raises:
-        InputError: the path does not belong to this clip.
-    """
-    from intrasplat.poses.trajectory import at_times
-
-    if len(poses) == clip.frame_count:
-        return poses
-    if any(notice.code is NoticeCode.FRAME_TIMES for notice in clip.assumptions):
-        problem = f"the path has {len(poses)} poses, the clip {clip.frame_count} frames whose times nobody knows."
-        raise InputError("--against", problem, "Give a pose for each frame.")
-    return at_times(times_s - times_s[0], poses, clip.frame_times_s - clip.frame_times_s[0])

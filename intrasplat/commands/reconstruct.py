@@ -54,6 +54,9 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         help="zip or folder of PNGs, or a video: the instruments, of the left eye or of both",
     )
     parser.add_argument(
+        "--poses-file", type=Path, metavar="F", help="the camera's poses: TUM, or a matrix a frame as JSON or text"
+    )
+    parser.add_argument(
         "--segmenter", type=Path, metavar="F", help="a network of your own (ONNX) that finds instruments without masks"
     )
     add_options(parser, ReconstructionOptions)
@@ -113,6 +116,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     keep_decoder_ready()  # the decoder loads its libraries while this process loads its own
     from intrasplat.machine.gpu import may_have_gpu
     from intrasplat.machine.timing import Timings
+    from intrasplat.poses import read_poses
     from intrasplat.stereo import ClipPaths, open_with_depth
 
     clip: Path | DepthClip = options.clip
@@ -123,6 +127,8 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     background.submit(_compile, on_cpu)  # not awaited here: the pipeline waits for it, and shows that as a stage
     if on_cpu:
         paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+        if options.poses_file is not None:
+            read_poses(options.poses_file)  # fails before the clip is opened
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
     pipeline.result()
     background.shutdown(wait=False)
@@ -135,6 +141,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
         right=options.right,
         calibration=options.calibration,
         masks=options.masks,
+        poses=options.poses_file,
         segmenter=options.segmenter,
         options=given,
         device=options.device,

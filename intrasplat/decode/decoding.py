@@ -175,6 +175,7 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
             world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
             frame_times_s=frame_times_s,
             masks=described["masks"] and Masks.model_validate(described["masks"]),
+            first_pose=described["first_pose"] and _finite(np.array(described["first_pose"], np.float64).reshape(4, 4)),
             assumptions=assumptions,
             warnings=warnings,
         )

@@ -69,7 +69,8 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
     if isinstance(clip, DepthClip):
         write_arrays(folder, _depth_arrays(clip, reports))
         masks = clip.masks and clip.masks.model_dump()
-        return description | {"intrinsics": clip.intrinsics.numbers(), "masks": masks}
+        first_pose = None if clip.first_pose is None else clip.first_pose.tolist()
+        return description | {"intrinsics": clip.intrinsics.numbers(), "masks": masks, "first_pose": first_pose}
     reports.reading("calibration")
     path = given_calibration or find_calibration(paths["path"], folder, limits)
     calibration = _calibration(path, clip)

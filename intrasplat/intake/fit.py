@@ -44,9 +44,13 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
     has_poses = clip is not None and is_zip and _holds(clip, POSES_FILE)
     if layout == "endonerf" and not has_poses:
         raise InputError("clip", f"the zip has no {POSES_FILE}.", "Put it beside images/, or leave the layout out.")
-    if options.poses == "given" and not (has_poses and layout in ("auto", "endonerf")):
+    of_layout = has_poses and layout in ("auto", "endonerf")
+    if options.poses == "given" and not of_layout and "poses_file" not in files:
         problem = "it asks for poses that come with the clip, and only the EndoNeRF layout brings poses."
-        raise InputError("options.poses", problem, f'Say "auto" or "estimate", or send a zip with {POSES_FILE}.')
+        raise InputError("options.poses", problem, 'Send poses_file too, or say "auto" or "estimate".')
+    if options.poses in ("fixed", "estimate") and "poses_file" in sent:
+        problem = f'"{options.poses}" uses no given poses, and poses_file came with it.'
+        raise InputError("options.poses", problem, "Leave out either of them.")
     if options.mask_source == "none" and "masks" in sent:
         problem = '"none" uses no masks, and masks came with it.'
         raise InputError("options.mask_source", problem, "Leave out either of them.")

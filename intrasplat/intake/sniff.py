@@ -49,6 +49,9 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
         check_calibration_file(text, part, path.name)
         with named_errors(path.name):
             look_at_calibration(text)
+    elif part == "poses_file":
+        if b"\0" in path.read_bytes():
+            raise InputError(part, f"{path.name} is not a text file.", "Send poses as TUM, JSON or text.")
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, training_frames
 from intrasplat.errors import InputError
@@ -15,7 +14,10 @@ from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import ReconstructionOptions
+from intrasplat.poses.brought import MIN_FRAMES, contradicted, with_checked_poses, with_stored_poses
 from intrasplat.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
+from intrasplat.poses.placing import placed
+from intrasplat.poses.pose_file import StoredPoses
 from intrasplat.poses.still import camera_rests
 from intrasplat.report import CameraPoses
 
@@ -23,34 +25,35 @@ if TYPE_CHECKING:  # imported when needed: a fixed camera needs none of it
     from intrasplat.poses.estimate import FoundPath
 
 STAGE = "poses"
-MIN_FRAMES = 2
 WORTH = 0.7
 """Smoothed poses replace the given ones only if less than this share of the jitter remains."""
 MAX_UNSURE = 0.5
 """With a larger share of unsure frames, the path is rejected."""
 
 
-def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings) -> DepthClip:
+def with_poses(
+    clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, timings: Timings, stored: StoredPoses | None = None
+) -> DepthClip:
     """The clip with its poses and their entry for the report. A clip whose poses are set is returned unchanged.
 
-    A fixed camera leaves all arrays unchanged. timings get poses_s.
+    A fixed camera leaves all arrays unchanged. timings get poses_s. stored: poses that replace the clip's own.
 
     Raises:
-        InputError: options.poses asks for given poses, and the clip has none.
+        InputError: options.poses asks for given poses, and there are none; or the stored ones do not fit the clip.
         Cancelled: hooks.should_stop said so.
     """
-    brought = clip.right is None  # only layouts with depth bring poses
+    brought = clip.right is None or stored is not None  # only layouts with depth bring poses
     if clip.poses is not None:
         return clip
     if options.poses == "given" and not brought:
         problem = '"given" asks for poses that come with the clip, and stereo clips bring none.'
-        raise InputError("options.poses", problem, 'Say "auto" or "estimate", or give the EndoNeRF layout.')
+        raise InputError("options.poses", problem, 'Give a file of poses, or say "auto" or "estimate".')
     train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
     with timings.measure("poses_s"):
-        if options.poses == "given":
-            return _as_given(clip, *jitter_mm(clip, train))
-        if options.poses == "auto" and brought:
-            return _steadied(clip, train, hooks)
+        if brought and options.poses in ("auto", "given"):
+            clip = _brought(clip, train, options, hooks, stored)
+            if clip.poses is not None:
+                return clip
         hooks.report_stage(STAGE, 0.0)
         if len(train) < MIN_FRAMES:
             return _fixed(clip, "was taken as fixed")
@@ -64,10 +67,36 @@ def with_poses(clip: DepthClip, options: ReconstructionOptions, hooks: Hooks, ti
         return _posed_or_fixed(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
 
 
+def _brought(
+    clip: DepthClip, train: Sequence[int], options: ReconstructionOptions, hooks: Hooks, stored: StoredPoses | None
+) -> DepthClip:
+    """The clip with its given poses; unplaced and with a warning if the pictures contradict those of a file.
+
+    Poses that jitter are not judged: the jitter hides what is right in them.
+    """
+    if stored is not None:
+        read, contradicts = with_stored_poses(clip, train, stored)
+    else:
+        read, contradicts = with_checked_poses(clip, train, options.pose_convention)
+    jumps_mm, depth_mm = jitter_mm(read, train)
+    if contradicts and not _harms(read, jumps_mm, depth_mm, MIN_JITTER):
+        if stored is not None and options.poses == "auto":
+            return contradicted(clip, used=False)
+        read = contradicted(read, used=True)
+    if options.poses == "given":
+        return _as_given(read, jumps_mm, depth_mm)
+    return _steadied(read, train, jumps_mm, depth_mm, hooks)
+
+
+def _harms(clip: DepthClip, jumps_mm: float, depth_mm: float, most: float) -> bool:
+    """Whether jitter at the tissue exceeds this share of the picture's width."""
+    return clip.intrinsics.fx * jumps_mm > most * clip.intrinsics.width * depth_mm
+
+
 def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
     """The clip with its given poses, and a warning if their jitter harms the model."""
     clip = replace(clip, poses=CameraPoses(source="given"))
-    if clip.intrinsics.fx * jumps_mm <= MAX_JITTER * clip.intrinsics.width * depth_mm:
+    if not _harms(clip, jumps_mm, depth_mm, MAX_JITTER):
         return clip
     text = (
         f"The camera's poses jump to and fro by about {jumps_mm:.1f} mm at the tissue from frame to frame: they seem "
@@ -76,10 +105,9 @@ def _as_given(clip: DepthClip, jumps_mm: float, depth_mm: float) -> DepthClip:
     return replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
 
 
-def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
+def _steadied(clip: DepthClip, train: Sequence[int], jumps_mm: float, depth_mm: float, hooks: Hooks) -> DepthClip:
     """The clip with its given poses; jitter is removed if the pictures show that the camera did not move so."""
-    jumps_mm, depth_mm = jitter_mm(clip, train)
-    if clip.intrinsics.fx * jumps_mm <= MIN_JITTER * clip.intrinsics.width * depth_mm:
+    if not _harms(clip, jumps_mm, depth_mm, MIN_JITTER):
         return _as_given(clip, 0.0, depth_mm)
     from intrasplat.poses.estimate import find_path
 
@@ -95,7 +123,7 @@ def _steadied(clip: DepthClip, train: Sequence[int], hooks: Hooks) -> DepthClip:
     notice = Notice.info(NoticeCode.POSES, f"{text}{steady.left_mm:.2f} mm")
     clip = replace(placed(clip, steady.world_from_camera), assumptions=(*clip.assumptions, notice))
     clip = replace(clip, poses=CameraPoses(source="given", steadied_mm=jumps_mm))
-    if clip.intrinsics.fx * steady.left_mm > MAX_JITTER * clip.intrinsics.width * depth_mm:
+    if _harms(clip, steady.left_mm, depth_mm, MAX_JITTER):
         text = f"The camera's poses, once steadied, may still be off by {steady.left_mm:.1f} mm at the tissue."
         clip = replace(clip, warnings=(*clip.warnings, Notice.warning(NoticeCode.POSE_JITTER, text)))
     return clip
@@ -147,15 +175,6 @@ def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings:
         clip = placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
     return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
-
-
-def placed(clip: DepthClip, world_from_camera: NDArray[np.float64]) -> DepthClip:
-    """The clip with these poses [T, 4, 4] of the left eye, mm; the right eye moves along."""
-    right = clip.right
-    if right is not None:
-        left_from_right = np.linalg.inv(clip.world_from_camera[0]) @ right.world_from_camera[0]
-        right = replace(right, world_from_camera=world_from_camera @ left_from_right)
-    return replace(clip, world_from_camera=world_from_camera, right=right)
 
 
 def _report_entry(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:

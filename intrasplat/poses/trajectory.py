@@ -63,43 +63,7 @@ def tum_lines(times_s: Reals, world_from_camera: Reals) -> str:
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows)
 
 
-def read_tum(path: Path) -> tuple[Reals, Reals]:
-    """Times [T] in seconds and poses [T, 4, 4] in mm of a TUM file.
-
-    Raises:
-        InputError: it cannot be read, or is no TUM file.
-    """
-    remedy = "Give lines `timestamp tx ty tz qx qy qz qw`, in seconds and metres."
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("--against", f"{path} cannot be read as a TUM file ({error}).", remedy) from error
-    numbered = [
-        (number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
-    ]
-    if not numbered:
-        raise InputError("--against", f"{path} holds no pose.", remedy)
-    for number, words in numbered:
-        if len(words) != 8 or not all(_is_number(word) for word in words):
-            raise InputError("--against", f"line {number} of {path} does not hold 8 finite numbers.", remedy)
-    rows = np.array([words for _, words in numbered], np.float64)
-    lengths = np.linalg.norm(rows[:, 4:], axis=1)
-    if not np.allclose(lengths, 1, atol=0.01):
-        raise InputError("--against", f"{path} holds quaternions that are not of length 1.", remedy)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    poses[:, :3, 3] = MM_PER_M * rows[:, 1:4]
-    return rows[:, 0], poses
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False
-
-
-def at_times(times_s: Reals, poses: Reals, wanted_s: Reals) -> Reals:
+def at_times(times_s: Reals, poses: Reals, wanted_s: Reals, field: str = "--against") -> Reals:
     """The poses [T, 4, 4] of a path at the times wanted, interpolated. Both times count from the same moment.
 
     Raises:
@@ -107,12 +71,12 @@ def at_times(times_s: Reals, poses: Reals, wanted_s: Reals) -> Reals:
     """
     remedy = "Give a pose for each frame, or a path that begins with the clip and lasts as long, with 5 poses a second."
     if not (np.diff(times_s) > 0).all():
-        raise InputError("--against", "the times of the path do not rise from line to line.", remedy)
+        raise InputError(field, "the times of the path do not rise from line to line.", remedy)
     gap_s = np.diff(times_s, prepend=-math.inf, append=math.inf)[np.searchsorted(times_s, wanted_s)]
     nearest_s = np.abs(np.asarray(wanted_s)[:, None] - times_s).min(1)
     if (unknown := (gap_s > MAX_GAP_S) & (nearest_s > LATE_S)).any():
         about = f"{len(times_s)} poses from {times_s[0]:.2f} to {times_s[-1]:.2f} s"
-        raise InputError("--against", f"the path has {about}, and none about {wanted_s[unknown][0]:.2f} s.", remedy)
+        raise InputError(field, f"the path has {about}, and none about {wanted_s[unknown][0]:.2f} s.", remedy)
     return np.stack([between(times_s, poses, wanted) for wanted in wanted_s])
 
 

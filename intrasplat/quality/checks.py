@@ -215,14 +215,16 @@ def _colour_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
 
 
 def _depth_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
-    """Warn if the depth of much tissue jumps by a tenth within a frame: no tissue moves so fast, so depth is wrong."""
+    """Warn if the depth of much tissue jumps by a tenth within a frame: no tissue moves so fast, so depth is wrong.
+
+    Depths are compared at the pixels to which the camera's motion takes the tissue.
+    """
     still = set(clip.skipped)
     following = {one: two for one, two in itertools.pairwise(train) if still.issuperset(range(one + 1, two))}
     jumps, total = 0, 0
     for index in clip.one_by_one(list(following)[:: -(-len(following) // MAX_PAIRS) or 1]):
         pair = (index, following[index])
-        sure = np.logical_and(*(clip.tissue[i] & (clip.depth_confidence[i] >= SURE) for i in pair))
-        before, after = (clip.depth_mm[i][sure] for i in pair)
+        before, after = _depths_of_both(clip, *pair)
         jumps += int((np.abs(after - before) > DEPTH_JUMP * before).sum())
         total += before.size
         clip.let_go(pair[1])
@@ -235,6 +237,25 @@ def _depth_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
             "tissue: much of it is wrong, and so are distances in this scene.",
         )
     ]
+
+
+def _depths_of_both(clip: DepthClip, one: int, two: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depths [M] in the second frame: of the first frame's tissue if it stayed in place, and as measured there."""
+    k, pose = clip.intrinsics, clip.world_from_camera
+    sure, there = (clip.tissue[i] & (clip.depth_confidence[i] >= SURE) for i in (one, two))
+    if (pose[one] == pose[two]).all():
+        return clip.depth_mm[one][sure & there], clip.depth_mm[two][sure & there]
+    rows, columns = np.nonzero(sure)
+    z = clip.depth_mm[one][sure].astype(np.float64)
+    points = np.stack([(columns + 0.5 - k.cx) * z / k.fx, (rows + 0.5 - k.cy) * z / k.fy, z], axis=1)
+    motion = np.linalg.inv(pose[two]) @ pose[one]
+    x, y, depth = (points @ motion[:3, :3].T + motion[:3, 3]).T
+    ahead = np.maximum(depth, 1e-3)
+    column, row = np.floor(k.fx * x / ahead + k.cx), np.floor(k.fy * y / ahead + k.cy)
+    inside = (depth > 0) & (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
+    row, column, depth = row[inside].astype(np.intp), column[inside].astype(np.intp), depth[inside].astype(np.float32)
+    seen = there[row, column]
+    return depth[seen], clip.depth_mm[two][row[seen], column[seen]]
 
 
 def _pixels(clip: DepthClip, index: int) -> NDArray[np.uint8]:

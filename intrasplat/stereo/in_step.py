@@ -104,7 +104,8 @@ def _alike(left: NDArray[np.float32], right: NDArray[np.float32]) -> NDArray[np.
     """Correlation [T - 1, 2 MAX_LAG + 1] of the changes of left frame t and of right frame t + k; 0 beyond the clip."""
     left, right = (each / (np.linalg.norm(each, axis=1, keepdims=True) + 1e-6) for each in (left, right))
     every = left @ right.T
-    return np.stack([np.pad(np.diagonal(every, k), (max(0, -k), max(0, k))) for k in range(-MAX_LAG, MAX_LAG + 1)], 1)
+    before = {k: min(max(0, -k), len(every)) for k in range(-MAX_LAG, MAX_LAG + 1)}
+    return np.stack([np.pad(np.diagonal(every, k), (before[k], before[-k])) for k in before], 1)
 
 
 def move_frames(frames: NDArray[np.uint8], sources: Sequence[int | None]) -> None:

@@ -24,6 +24,7 @@ from intrasplat.clip.layouts import registered_files
 from intrasplat.clip.stored import load_clip, save_clip
 from intrasplat.errors import Cancelled
 from intrasplat.names import PREPARED, RESUME_STATE
+from intrasplat.poses import StoredPoses
 from intrasplat.scene.resume_file import RESUME_FILE
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.resume import begin_save
@@ -158,8 +159,10 @@ def _lower_priority() -> None:
 
 def _identity(request: ReconstructionRequest) -> str:
     """A hash that identifies the prepared clip: name, size and mtime of every file, the options, our version."""
-    given = (request.clip, request.right, request.calibration, request.masks, request.segmenter)
+    given = (request.clip, request.right, request.calibration, request.masks, request.segmenter, request.poses)
     found = hashlib.sha256(f"{version('intrasplat')} {request.options.model_dump_json()}".encode())
+    if isinstance(request.poses, StoredPoses):
+        found.update(request.poses.matrices.tobytes())
     for place, path in enumerate((*given, *registered_files())):
         if isinstance(path, Path):
             for file in _files_of(path):

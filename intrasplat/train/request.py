@@ -10,6 +10,7 @@ from intrasplat.clip import ClipLimits, DepthClip
 from intrasplat.methods.method import Preset
 from intrasplat.methods.registry import preset_named
 from intrasplat.options import ReconstructionOptions
+from intrasplat.poses import StoredPoses
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class ReconstructionRequest:
 
     clip           a path, or a clip with depth in memory, which is neither decoded nor matched
     seconds        seconds by stage already spent on such a clip, for the report
+    poses          of the camera, a file or as stored (intrasplat/poses/pose_file.py)
     own_preset     used instead of the preset that options name
     accepted_at_s  Unix time at which the clip was accepted, for t_post_s; None means now
     segmenter      an ONNX file that finds the instruments of clips without masks (intrasplat/instruments/segmenter.py)
@@ -29,6 +31,7 @@ class ReconstructionRequest:
     right: Path | None = None
     calibration: Path | None = None
     masks: Path | None = None
+    poses: Path | StoredPoses | None = None
     segmenter: Path | None = None
     own_preset: Preset | None = None
     device: str = "auto"

@@ -175,3 +175,20 @@ def test_a_pose_may_be_a_matrix_or_the_text_of_the_api(scene: isp.Scene) -> None
     assert np.array_equal(scene.render(0.0, np.eye(4)).rgb, scene.render(0.0).rgb)
     with pytest.raises(isp.InputError, match="pose"):
         scene.render(0.0, np.eye(3))
+
+
+def test_poses_of_frames_of_both_eyes_are_given_as_array_or_file(tmp_path: Path) -> None:
+    phantom = make_phantom(PhantomSettings(width=96, height=80, frames=14, tools=(), camera=("pan",)))
+    frames = [phantom.frame(index) for index in range(14)]
+    left, right = (np.stack([getattr(frame, name) for frame in frames]) for name in ("left", "right"))
+    poses = np.stack([phantom.world_from_camera(index) for index in range(14)])
+    calibration = phantom.settings.calibration.model_dump()
+    (tmp_path / "poses.json").write_text(str(poses.tolist()))
+    for given in (poses, tmp_path / "poses.json"):
+        clip = isp.read_clip(left, right, calibration=calibration, poses=given).with_depth()
+        assert np.allclose(clip.world_from_camera, poses, atol=1e-6)
+        assert clip.poses is not None
+        assert clip.poses.source == "given"
+    with pytest.raises(isp.InputError) as refused:
+        isp.read_clip(left, right, calibration=calibration, poses=2 * poses)
+    assert refused.value.field == "poses"

@@ -48,6 +48,16 @@ def test_an_accepted_clip_is_on_disk_and_queued_before_the_answer(service: Servi
     assert list((service.store.data_dir / "incoming").iterdir()) == []
 
 
+def test_a_file_of_poses_is_kept_and_one_that_is_no_text_is_refused(service: ServiceUnderTest) -> None:
+    parts = {"clip": ("c.mp4", CLIP), "poses_file": ("Smith.TUM", b"0 0 0 0 0 0 0 1\n")}
+    record = service.queue.get(service.upload(parts=parts).json()["id"])
+    assert record is not None
+    assert record.files.poses_file == "poses_file.tum"
+    assert '"poses_file"' in record.model_dump_json()
+    parts["poses_file"] = ("poses.tum", b"\0\0")
+    assert_problem(service.upload(parts=parts), 422, "poses_file")
+
+
 def test_two_eyes_calibration_and_masks_are_kept_under_our_names(service: ServiceUnderTest) -> None:
     eyes = {"left": ("Smith_L.MOV", CLIP), "right": ("Smith_R.mov", CLIP)}
     response = service.upload(

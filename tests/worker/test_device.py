@@ -66,7 +66,9 @@ def test_files_lie_where_the_store_keeps_them() -> None:
     assert (asked.clip, asked.right) == (SPOOL / "clip.mp4", SPOOL / "right.mp4")
     assert (asked.calibration, asked.masks) == (SPOOL / "calibration.json", SPOOL / "masks.zip")
     alone = request(JobFiles(clip="clip.zip"), {})
-    assert (alone.right, alone.calibration, alone.masks) == (None, None, None)
+    assert (alone.right, alone.calibration, alone.masks, alone.poses) == (None, None, None, None)
+    posed = request(JobFiles(clip="clip.zip", poses_file="poses_file.tum"), {})
+    assert posed.poses == SPOOL / "poses_file.tum"
 
 
 @pytest.fixture(scope="module")

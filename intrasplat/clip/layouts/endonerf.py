@@ -92,6 +92,7 @@ def _open(files: ClipFiles) -> DepthClip:
             cy=images.height / 2,
         ),
         world_from_camera=poses.world_from_camera,
+        first_pose=poses.first_pose,
         frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
         masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
         assumptions=(*_assumptions(masks, poses, convention), *images.notices),

@@ -116,6 +116,6 @@ def test_the_report_counts_and_names_them() -> None:
     empty = EmptyFrames({3: EMPTY_FRAME, 4: EMPTY_FRAME, 9: COVERED})
     shows_nothing, covered = empty.notices(24)
     assert (shows_nothing.code, covered.code) == (NoticeCode.FRAMES_SHOW_NOTHING, NoticeCode.FRAMES_WITHOUT_TISSUE)
-    assert shows_nothing.text == "2 of 24 frames show nothing (3, 4) and were left out"
+    assert shows_nothing.text == "frames that show nothing were left out: 3, 4 (2 of 24)"
     assert empty.frames == (3, 4, 9)
     assert EmptyFrames().notices(24) == ()

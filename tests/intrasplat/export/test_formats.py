@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from intrasplat.errors import InputError, LimitError
 from intrasplat.export import EXPORTS, PART_BYTES, export_parts, target
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
-from intrasplat.poses.trajectory import read_tum
+from intrasplat.poses.pose_file import read_tum
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.constants import SH_C0
 from intrasplat.view.render import render_frame

@@ -19,10 +19,10 @@ def files_in(folder: Path, *names: str) -> dict[str, Path]:
     """Empty files by part; `poses.zip` is a clip with poses, `clip.zip` one without."""
     paths = {}
     for name in names:
-        path = folder / name.replace("poses", "clip")
+        path = folder / name.replace("poses.", "clip.")
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("clip/images/000000.png", b"")
-            if name.startswith("poses"):
+            if name.startswith("poses."):
                 archive.writestr("clip/poses_bounds.npy", b"")
         paths[path.stem] = path
     return paths
@@ -40,6 +40,7 @@ def files_in(folder: Path, *names: str) -> dict[str, Path]:
         ({"poses": "given"}, ("clip.mp4",), ("clip",), "options.poses"),
         ({"poses": "given"}, ("clip.zip",), ("clip",), "options.poses"),
         ({"poses": "given", "layout": "frames"}, ("poses.zip",), ("clip",), "options.poses"),
+        ({"poses": "estimate"}, (*PAIR, "poses_file.tum"), ("poses_file",), "options.poses"),
         ({"mask_source": "none"}, ("clip.mp4", "masks.zip"), ("masks",), "options.mask_source"),
         ({}, ("left.mp4", "right.mp4"), ("left", "right"), "calibration"),
         ({"layout": "sbs"}, ("clip.mp4",), ("clip",), "calibration"),
@@ -66,6 +67,8 @@ def test_what_cannot_go_together_names_the_field_and_a_remedy(
         ({"layout": "frames"}, ("clip.zip",), ("clip",)),
         ({"poses": "given"}, ("poses.zip",), ("clip",)),
         ({"poses": "given", "layout": "endonerf"}, ("poses.zip",), ("clip",)),
+        ({"poses": "given"}, (*PAIR, "poses_file.tum"), PAIR),
+        ({"poses": "estimate"}, (*PAIR, "poses_file.tum"), PAIR),
         ({"mask_source": "none"}, ("clip.mp4", "masks.zip"), ()),
         ({"mask_source": "auto"}, ("clip.mp4", "masks.zip"), ("masks",)),
     ],

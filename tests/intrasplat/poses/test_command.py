@@ -10,8 +10,9 @@ import pytest
 
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
+from intrasplat.poses.pose_file import read_tum
 from intrasplat.poses.rigid import between
-from intrasplat.poses.trajectory import read_tum, trajectory_error, write_tum
+from intrasplat.poses.trajectory import trajectory_error, write_tum
 from lab.phantom import PhantomSettings, make_phantom, write_stereo_video, write_stereomis
 
 SETTINGS = PhantomSettings(
@@ -84,3 +85,27 @@ def test_what_is_no_path_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     arguments = ["poses", str(tmp_path), "--against", str(tmp_path / "bad.tum")]
     assert main(arguments) == ExitCode.BAD_INPUT
     assert "--against" in capsys.readouterr().err
+
+
+def test_a_true_path_in_mm_is_told_and_compared_as_such(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times_s, poses = read_tum(clip / "groundtruth.txt")
+    poses[:, :3, 3] *= 1000
+    poses[-1, 0, 3] += 3e3  # 3 mm in a file in mm
+    write_tum(tmp_path / "mm.tum", times_s, poses)
+    assert of(clip, "--poses", "fixed", "--against", tmp_path / "mm.tum") == ExitCode.OK
+    told = capsys.readouterr().out
+    assert "in mm, not in metres: a factor of 1000" in told
+    assert float(told.rsplit("error: ", 1)[1].split(" mm")[0]) < 50
+
+
+def test_poses_of_a_file_are_read_and_used(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = clip / "groundtruth.txt"
+    assert of(clip, "--poses-file", truth, "--poses", "given", "--against", truth) == ExitCode.OK
+    told = capsys.readouterr().out
+    assert "poses: as given, read as camera-to-world in m, OpenCV axes" in told
+    assert "absolute trajectory error: 0.00 mm, 0.00 degrees" in told
+    (tmp_path / "short.txt").write_text("".join(truth.read_text().splitlines(keepends=True)[:9]))
+    assert of(clip, "--poses-file", tmp_path / "short.txt") == ExitCode.BAD_INPUT
+    assert "poses_file" in capsys.readouterr().err

@@ -9,8 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from intrasplat.errors import InputError
+from intrasplat.poses.pose_file import read_tum
 from intrasplat.poses.rigid import Reals, exp
-from intrasplat.poses.trajectory import at_times, from_first, read_tum, trajectory_error, write_tum
+from intrasplat.poses.trajectory import at_times, from_first, trajectory_error, write_tum
 
 
 def a_path(count: int = 20) -> Reals:

@@ -14,7 +14,7 @@ from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.checks import picture_warnings, sequence_warnings
 from intrasplat.train.scoring import sample_frames
 from lab.conditions import CONDITIONS, CleanClip, clean_clip
-from lab.phantom import MOTIONS, Motion, PhantomSettings
+from lab.phantom import MOTIONS, Motion, PhantomSettings, make_phantom
 from tests.intrasplat.phantoms import phantom_clip
 
 DATA = Path(os.environ.get("INTRASPLAT_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -108,3 +108,11 @@ def test_a_picture_of_one_colour_and_one_of_no_tissue_are_survived() -> None:
     nothing = dataclasses.replace(clip, tissue=np.zeros_like(clip.tissue))
     assert picture_warnings(nothing, train) == []
     assert sequence_warnings(nothing, train) == []
+
+
+def test_depth_of_a_camera_that_moves_does_not_jump() -> None:
+    settings = PhantomSettings(width=160, height=128, frames=8, camera=("pan", "roll"))
+    clip = make_phantom(settings).depth_clip()
+    assert NoticeCode.DEPTH_JUMPS not in {each.code for each in doubts(clip)}
+    resting = dataclasses.replace(clip, world_from_camera=np.tile(np.eye(4), (8, 1, 1)))
+    assert NoticeCode.DEPTH_JUMPS in {each.code for each in doubts(resting)}

@@ -71,6 +71,7 @@ def test_a_lost_frame_is_found_in_either_eye(lost: int) -> None:
 def test_short_clips_and_unlike_eyes_tell_nothing() -> None:
     left, right = profiles(SHAKING_PX)
     assert find_lag(left[:7], right[1:8]) is None
+    assert find_lag(left[:8], right[:8]) is None
     assert find_lag(left, profiles(SHAKING_PX, noise=300.0)[1]) is None
 
 
