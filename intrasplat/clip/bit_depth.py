@@ -35,12 +35,12 @@ def at_own_depth(*sequences: Pictures) -> tuple[Pictures, ...]:
     text = (
         f"pictures: the largest value in 16 bits is {largest}, so they are read as {bits}-bit pictures (white {white})"
     )
-    told = [Notice.info(NoticeCode.BIT_DEPTH, text)]
+    notices = [Notice.info(NoticeCode.BIT_DEPTH, text)]
     scaled: list[Pictures] = []
     for sequence in sequences:
         if isinstance(sequence, ImageSequence):
-            sequence = cast(Pictures, replace(sequence, white=white, notices=(*sequence.notices, *told)))
-            told = []
+            sequence = cast(Pictures, replace(sequence, white=white, notices=(*sequence.notices, *notices)))
+            notices = []
         scaled.append(sequence)
     return tuple(scaled)
 

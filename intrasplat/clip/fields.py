@@ -83,8 +83,8 @@ class CombMeter:
     def interlacing(self) -> Interlacing | None:
         """What to deinterlace; None: the frames are progressive."""
         order: FieldOrder = max(self._orders, key=self._orders.__getitem__)
-        agreeing, told = self._orders[order], sum(self._orders.values())
-        if len(self.combed) < max(MIN_FRAMES, MIN_SHARE * self.count) or agreeing < max(1, AGREEING * told):
+        agreeing, clear = self._orders[order], sum(self._orders.values())
+        if len(self.combed) < max(MIN_FRAMES, MIN_SHARE * self.count) or agreeing < max(1, AGREEING * clear):
             return None
         whole = len(self.combed) >= WHOLE_SHARE * self.count
         return Interlacing(order, frozenset(range(self.count) if whole else self.combed))

@@ -40,9 +40,9 @@ FAR_PX = 20.0
 MAX_OFF_PX = 40.0
 """Limit of a match's residual."""
 MIN_APART_PX = 0.5
-"""Readings that put matches less far apart cannot be told apart."""
+"""Readings that put matches less far apart cannot be declared apart."""
 MIN_SUPPORT = 0.7
-"""A reading replaces the one told if the matches lie this share of the way from the one's prediction to its own."""
+"""A reading replaces the one declared if the matches lie this share of the way from the one's prediction to its own."""
 CONTRADICTED, LARGE = 0.4, 0.5
 """Poses contradict the pictures if less than this share of their motion is found, and if that motion is at least this
 share of the pictures' motion."""
@@ -75,13 +75,13 @@ class Convention:
 class Agreement:
     """What the pictures say about poses.
 
-    convention   the reading that they support; the one told where they support no other
-    told_apart   whether they tell readings apart; not if the camera hardly moves
+    convention   the reading that they support; the declared one where they support no other
+    determined   whether they tell readings apart; not if the camera hardly moves
     contradicts  whether they contradict the poses in every reading
     """
 
     convention: Convention
-    told_apart: bool = False
+    determined: bool = False
     contradicts: bool = False
 
 
@@ -91,7 +91,7 @@ def likely_unit(stored: Reals) -> Unit:
     return "m" if float(np.linalg.norm(places - places[0], axis=1).max()) <= MAX_EXTENT_M else "mm"
 
 
-def agreement(clip: DepthClip, train: Sequence[int], stored: Reals, told: Convention) -> Agreement:
+def agreement(clip: DepthClip, train: Sequence[int], stored: Reals, declared: Convention) -> Agreement:
     """The reading of stored poses [T, 4, 4] that the training frames support.
 
     The matches are regressed on the difference of two readings' predictions: the slope is 1 if the second is true, and
@@ -101,14 +101,14 @@ def agreement(clip: DepthClip, train: Sequence[int], stored: Reals, told: Conven
         frames = Frames(clip)
         links = _links(frames, train)
     if not links:
-        return Agreement(told)
+        return Agreement(declared)
     camera, still = frames.camera, [np.eye(4)] * len(links)
     readings = (Convention(*each) for each in product(MM, (True, False), OPENCV_AXES))
-    motions = {each: _motions(each, stored, links) for each in dict.fromkeys((told, *readings))}
+    motions = {each: _motions(each, stored, links) for each in dict.fromkeys((declared, *readings))}
     best = min(motions, key=lambda each: _off_px(camera, links, motions[each]))
-    support, apart_px = _support(camera, links, motions[told], motions[best])
+    support, apart_px = _support(camera, links, motions[declared], motions[best])
     if apart_px < MIN_APART_PX or support < MIN_SUPPORT:
-        best = told
+        best = declared
     found, moved_px = _support(camera, links, still, motions[best])
     large = moved_px > max(MIN_APART_PX, LARGE * _off_px(camera, links, still))
     return Agreement(best, moved_px > MIN_APART_PX, large and found < CONTRADICTED)

@@ -25,18 +25,18 @@ def with_stored_poses(clip: DepthClip, train: Sequence[int], stored: StoredPoses
     """
     poses = poses_of_frames(clip, stored)
     usual: Unit = "mm" if stored.stamps is None else "m"
-    told = stored.told or Convention(usual if usual == "mm" else likely_unit(poses))
-    found = agreement(clip, train, poses, told) if len(train) >= MIN_FRAMES else Agreement(told)
+    declared = stored.declared or Convention(usual if usual == "mm" else likely_unit(poses))
+    found = agreement(clip, train, poses, declared) if len(train) >= MIN_FRAMES else Agreement(declared)
     if found.contradicts:
         why = "the pictures contradict them in every unit, direction and axes"
-    elif found.convention != told:
-        why = f"not as {told}: only so do they fit the pictures"
-    elif found.told_apart:
+    elif found.convention != declared:
+        why = f"not as {declared}: only so do they fit the pictures"
+    elif found.determined:
         why = "which fits the pictures"
     else:
         why = "which the pictures cannot check: the camera hardly moves"
     text = f"poses: as given, read as {found.convention}{_factor(found.convention.unit, usual)}; {why}"
-    clip = _told(placed(clip, found.convention.world_from_camera(poses)), Notice.info(NoticeCode.POSES, text))
+    clip = _with_notice(placed(clip, found.convention.world_from_camera(poses)), Notice.info(NoticeCode.POSES, text))
     return clip, found.contradicts
 
 
@@ -48,17 +48,17 @@ def with_checked_poses(clip: DepthClip, train: Sequence[int], axes: PoseConventi
     poses = clip.world_from_camera
     if len(train) < MIN_FRAMES or (poses == poses[:1]).all():
         return clip, False
-    told = Convention()
+    declared = Convention()
     if clip.first_pose is not None:
-        told = Convention(axes=axes)
+        declared = Convention(axes=axes)
         poses = clip.first_pose @ poses @ np.linalg.inv(OPENCV_AXES[axes])
-    found = agreement(clip, train, poses, told)
-    if found.convention == told:
+    found = agreement(clip, train, poses, declared)
+    if found.convention == declared:
         return clip, found.contradicts
-    factor = _factor(found.convention.unit, told.unit)
-    text = f"poses: read as {found.convention}{factor}, not as {told}: only so do they fit the pictures"
+    factor = _factor(found.convention.unit, declared.unit)
+    text = f"poses: read as {found.convention}{factor}, not as {declared}: only so do they fit the pictures"
     corrected = placed(clip, found.convention.world_from_camera(poses))
-    return _told(corrected, Notice.info(NoticeCode.POSES, text)), found.contradicts
+    return _with_notice(corrected, Notice.info(NoticeCode.POSES, text)), found.contradicts
 
 
 def contradicted(clip: DepthClip, *, used: bool) -> DepthClip:
@@ -72,7 +72,7 @@ def _factor(unit: Unit, usual: Unit) -> str:
     return f" (not in {usual}: a factor of 1000)" if unit != usual else ""
 
 
-def _told(clip: DepthClip, notice: Notice) -> DepthClip:
+def _with_notice(clip: DepthClip, notice: Notice) -> DepthClip:
     """The clip with this notice on its poses instead of an earlier one."""
     others = (each for each in clip.assumptions if each.code is not NoticeCode.POSES)
     return replace(clip, assumptions=(*others, notice))

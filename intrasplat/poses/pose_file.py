@@ -38,13 +38,13 @@ class StoredPoses:
     matrices [P, 4, 4]
     stamps   [P] first column of a TUM file: seconds or frame numbers; None: one pose a frame
     field    name for errors
-    told     unit, direction and axes by the caller; None: those of the format
+    declared unit, direction and axes by the caller; None: those of the format
     """
 
     matrices: Reals
     stamps: Reals | None = None
     field: str = "poses_file"
-    told: Convention | None = None
+    declared: Convention | None = None
 
 
 def read_poses(path: Path, field: str = "poses_file") -> StoredPoses:
