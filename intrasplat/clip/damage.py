@@ -49,7 +49,7 @@ class Shown:
     damaged: tuple[int, ...] = ()
 
 
-def shown_frames(
+def frames_to_show(
     times: Sequence[int | None], corrupt: Sequence[int], log: PacketLog, *, one_to_one: bool = True
 ) -> Shown:
     """What to show of D decoded frames.

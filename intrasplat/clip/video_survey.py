@@ -12,7 +12,7 @@ from pathlib import Path
 
 import av
 
-from intrasplat.clip.damage import PacketLog, Shown, shown_frames
+from intrasplat.clip.damage import PacketLog, Shown, frames_to_show
 from intrasplat.clip.fields import ALL_STRIPS, STRIPS, CombMeter, Interlacing, deinterlaced
 from intrasplat.clip.frame_times import frame_times
 from intrasplat.clip.types import RgbFrame
@@ -61,7 +61,7 @@ def survey(path: Path, field: str, limits: ClipLimits, label: str) -> VideoFile:
         aspect = float(stream.sample_aspect_ratio or 1)
         aspect = aspect if 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT else 1.0
     _check_whole(path, field, limits, label, found, declared)
-    shown = shown_frames(found.times, found.corrupt, found.log, one_to_one=codec != "vp9")  # VP9 has hidden frames
+    shown = frames_to_show(found.times, found.corrupt, found.log, one_to_one=codec != "vp9")  # VP9 has hidden frames
     _check_damage(shown, field, label)
     stamps_s = [None if time is None else float(time * unit_s) for time in shown.times]
     times_s, notices = frame_times(stamps_s, None if rate_hz is None else float(rate_hz), field)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import ClipLimits, StereoClip
-from intrasplat.clip.damage import PacketLog, Sample, shown_frames
+from intrasplat.clip.damage import PacketLog, Sample, frames_to_show
 from intrasplat.clip.frame_times import frame_times
 from intrasplat.clip.video import VideoFile, open_video
 from intrasplat.errors import InputError
@@ -133,22 +133,22 @@ def test_a_video_that_is_mostly_damaged_is_refused(tmp_path: Path, frames: Frame
 def test_frames_that_refer_to_damage_across_a_keyframe_are_left_out() -> None:
     """Decoded 0 3 1 2, then keyframe 6 with 4 and 5 before it: frame 3 is lost."""
     log = PacketLog([Sample(time, time in (0, 6), False) for time in (0, 3, 1, 2, 6, 4, 5, 7)], failures=1)
-    shown = shown_frames([0, 1, 2, 4, 5, 6, 7], [], log)
+    shown = frames_to_show([0, 1, 2, 4, 5, 6, 7], [], log)
     assert shown.damaged == (1, 2, 3, 4, 5)
     assert shown.sources == (0, 0, 0, 0, 0, 0, 5, 6)
 
 
 def test_packets_that_are_fields_or_lie_before_the_first_keyframe_are_not_missing() -> None:
     fields = PacketLog([Sample(time, time == 0, False) for time in range(8)])
-    assert shown_frames([0, 2, 4, 6], [], fields).damaged == ()
+    assert frames_to_show([0, 2, 4, 6], [], fields).damaged == ()
     cut = PacketLog([Sample(time, time == 3, False) for time in range(8)])
-    assert shown_frames([3, 4, 5, 6, 7], [], cut).damaged == ()
-    assert shown_frames([3, 4, 6, 7], [], cut).damaged == (2, 3, 4)
+    assert frames_to_show([3, 4, 5, 6, 7], [], cut).damaged == ()
+    assert frames_to_show([3, 4, 6, 7], [], cut).damaged == (2, 3, 4)
 
 
 def test_the_first_frames_may_be_damaged() -> None:
     log = PacketLog([Sample(time, time in (0, 2), False) for time in range(4)], failures=1)
-    shown = shown_frames([1, 2, 3], [], log)
+    shown = frames_to_show([1, 2, 3], [], log)
     assert (shown.damaged, shown.sources) == ((0, 1), (1, 1, 1, 2))
 
 
