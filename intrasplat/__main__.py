@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.util import find_spec
+from pathlib import Path
 from typing import NoReturn
 
 from intrasplat.commands.arguments import add_command
@@ -23,6 +23,7 @@ from intrasplat.machine.cores import keep_libraries_to_one_thread
 from intrasplat.server_parts import server_part
 
 LABORATORY_COMMAND = "phantom"
+LABORATORY = Path(__file__).resolve().parents[1] / "lab" / LABORATORY_COMMAND
 """Draws a synthetic clip. It is the laboratory's, which a checkout has and no installation."""
 NO_SERVER = UnavailableError(
     "This command needs the server, which is not installed here.", "Install intrasplat-server."
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments and arguments[0] in LOCAL_COMMANDS:
         return run_local(arguments)
-    if arguments[:1] == [LABORATORY_COMMAND] and find_spec("lab") is not None:
+    if arguments[:1] == [LABORATORY_COMMAND] and LABORATORY.is_dir():
         return int(import_module("lab.__main__").main(arguments))
     commands: Callable[[Sequence[str]], int] | None = server_part("commands")
     if commands is not None:
