@@ -8,14 +8,14 @@ Symbols: H W pixels of one eye.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.sampling import Mapping
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import RgbFrame
 from intrasplat.machine.mapped import let_go
@@ -25,7 +25,6 @@ from intrasplat.report import FieldOfView, FieldShape
 
 Mask = NDArray[np.bool_]
 Levels = NDArray[np.uint8]  # [H, W]
-Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 SAMPLED, OUTLIERS, COMPARED = 24, 2, 3
 """Pictures that are read, spread over the clip; how many of them may be flashes; pairs in which labels are searched."""
@@ -137,7 +136,8 @@ def find_field(pictures: Iterable[RgbFrame]) -> Mask:
     inside |= _shadows(inside, SLIVER_SHARE * width)
     if 1 - float(inside.mean()) < MIN_OUTSIDE:
         return np.ones(outside.shape, np.bool_)
-    return _without_rim(inside, brightest)
+    field = _without_rim(inside, brightest)
+    return field if field.any() else inside
 
 
 def _without_rim(inside: Mask, brightest: Levels) -> Mask:
@@ -146,7 +146,10 @@ def _without_rim(inside: Mask, brightest: Levels) -> Mask:
     frame = cv2.copyMakeBorder(inside.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     away_px = cv2.distanceTransform(frame, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
     most_px = MAX_RIM_SHARE * float(np.sqrt(np.count_nonzero(inside)))
-    usual = float(np.median(brightest[inside & (away_px > most_px) & (away_px <= 2 * most_px)]))
+    within = inside & (away_px > most_px) & (away_px <= 2 * most_px)
+    if not within.any():
+        return inside
+    usual = float(np.median(brightest[within]))
     rim_px = max(RIM_SHARE * width, BLUR_PX / 2 + 1)
     while rim_px < most_px:
         ring = inside & (away_px > rim_px) & (away_px <= rim_px + 1)

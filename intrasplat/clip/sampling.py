@@ -41,7 +41,8 @@ NOISE_MARGIN = 2.0
 
 Thumbnail = NDArray[np.float32]
 """Grey [h, w], levels of 255."""
-Mapping = Callable[[Callable[[int], Thumbnail], Iterable[int]], Iterable[Thumbnail]]
+Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""The signature of `map` for one argument."""
 
 
 def thumbnail(rgb: RgbFrame) -> Thumbnail:

@@ -5,22 +5,19 @@ Symbols: H W pixels of one eye; d disparity, x_left - x_right in px; dy = y_righ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.sampling import Mapping
 from intrasplat.errors import InputError
 from intrasplat.stereo.matching import Grey, Image, evidence, semi_global
 
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
 """The signature of agreed_disparities, which another device may implement."""
-
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""The signature of `map` for one argument."""
 
 FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as accurate, in a third of the time
 FEATURES = 1500
@@ -198,7 +195,7 @@ def _check_eyes(beyond_infinity_px: NDArray[np.float64]) -> None:
 
 
 def agreed_disparities(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int, each: Map = map
+    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, count: int, each: Mapping = map
 ) -> tuple[Image, NDArray[np.bool_]]:
     """Disparities [F, h, w] of pairs, with low <= d < low + count, and where both matching directions agree.
 

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.clip.sampling import Mapping
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import RightEye
-from intrasplat.stereo.alignment import FEATURE_WIDTH, Map, RowShift
+from intrasplat.stereo.alignment import FEATURE_WIDTH, RowShift
 from intrasplat.stereo.matching import SATURATED_LEVEL, Image, MatchPlan, match
 from intrasplat.stereo.turn import AnyImage, EyeRotation, Rgb
 
@@ -103,7 +104,7 @@ class Registration:
             turn = turn_of_matches(matches, shift.shift_px, calibrated)
         return cls(calibrated, baseline_mm, turn, Colours(), shift.matches, _residual_px(matches, turn, calibrated))
 
-    def refined(self, pairs: Sequence[MatchedPair], matches: NDArray[np.float64], each: Map = map) -> Registration:
+    def refined(self, pairs: Sequence[MatchedPair], matches: NDArray[np.float64], each: Mapping = map) -> Registration:
         """The refined rotation, and the colours, from pairs that this registration rectified.
 
         each: a thread pool's map processes pairs in parallel.
@@ -263,7 +264,7 @@ class MatchedPair:
 
 
 def turn_of_pictures(
-    pairs: Sequence[MatchedPair], turn: EyeRotation, camera: Intrinsics, each: Map = map
+    pairs: Sequence[MatchedPair], turn: EyeRotation, camera: Intrinsics, each: Mapping = map
 ) -> EyeRotation:
     """A refined rotation, from pairs that `turn` rectified: they are matched along rows, so the row error remains.
 
@@ -282,7 +283,7 @@ def turn_of_pictures(
     return EyeRotation(*(np.array(astuple(turn)) + numbers).tolist())
 
 
-def colours_of(pairs: Sequence[MatchedPair], each: Map = map) -> Colours:
+def colours_of(pairs: Sequence[MatchedPair], each: Mapping = map) -> Colours:
     """Gain and offset between the eyes over matching pixels, without highlights; identity if too few match."""
     found = each(_colour_samples, pairs)
     left, right = (np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True))

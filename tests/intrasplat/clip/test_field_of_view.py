@@ -161,3 +161,10 @@ def test_held_out_frames_decide_nothing() -> None:
     other[[1, 9]] = 255
     one, two = (find_fields([each], train, "auto").left for each in (pictures, other))
     np.testing.assert_array_equal(one, two)
+
+
+def test_a_field_that_is_hardly_wider_than_its_rim_stays() -> None:
+    inside = box(58, 63, 0, W)
+    found = find_field(outside_as(tissue(), inside, 0.0))
+    assert found.any()
+    assert not found[:50].any()
