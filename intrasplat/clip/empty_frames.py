@@ -17,6 +17,7 @@ from intrasplat.clip.sampling import Thumbnail
 from intrasplat.notices import Notice, NoticeCode
 
 PATCH_PX = 4
+PATCH_CENTRES = slice(PATCH_PX // 2, None, PATCH_PX)
 EMPTY, FADED = 0.2, 0.8
 """Contrast of an empty frame, and of a frame beside one that is still fading, as shares of the clip's median."""
 KNOWN_PERCENTILE, UNKNOWN_PERCENTILE = 50.0, 95.0
@@ -83,8 +84,9 @@ def find_empty(
     faded, torn = np.zeros((2, count), np.bool_)
     empty = np.zeros((len(eyes), count), np.bool_)
     for eye, (thumbnails, inside) in enumerate(zip(eyes, fields or [None] * len(eyes), strict=True)):
+        patches = _patches_inside(inside, thumbnails[0].shape)
         for percentile in (KNOWN_PERCENTILE, UNKNOWN_PERCENTILE) if fields else (UNKNOWN_PERCENTILE,):
-            contrast = np.array([_contrast(each, inside, percentile) for each in thumbnails])
+            contrast = np.array([_contrast(each, patches, percentile) for each in thumbnails])
             usual = float(np.median(contrast[train]))
             if usual < MIN_CONTRAST_LEVELS:  # most frames may be empty
                 usual = float(np.percentile(contrast[train], FEW_PERCENTILE))
@@ -108,17 +110,22 @@ def find_empty(
     return EmptyFrames(reasons)
 
 
-def _contrast(thumbnail: Thumbnail, inside: NDArray[np.bool_] | None, percentile: float) -> float:
-    """A percentile of the standard deviations of a thumbnail's patches inside the field [H, W], levels."""
+def _patches_inside(field: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """The patches of a thumbnail [h, w] that lie wholly in the field [H, W]; None: all of them."""
+    if field is None or field.all():
+        return None
+    small = cv2.resize(field.astype(np.uint8) * 255, shape[::-1], interpolation=cv2.INTER_AREA)
+    wholly = cv2.erode((small == 255).astype(np.uint8), np.ones((PATCH_PX + 1, PATCH_PX + 1), np.uint8))
+    chosen = wholly[PATCH_CENTRES, PATCH_CENTRES] > 0
+    return chosen if chosen.any() else None
+
+
+def _contrast(thumbnail: Thumbnail, patches: NDArray[np.bool_] | None, percentile: float) -> float:
+    """A percentile of the standard deviations of a thumbnail's patches, levels; None: of all patches."""
     size = (PATCH_PX, PATCH_PX)
     mean, square = cv2.blur(thumbnail, size), cv2.blur(np.square(thumbnail), size)
-    deviation = np.sqrt(np.maximum(square - np.square(mean), 0))[PATCH_PX // 2 :: PATCH_PX, PATCH_PX // 2 :: PATCH_PX]
-    if inside is not None and not inside.all():
-        small = cv2.resize(inside.astype(np.uint8) * 255, thumbnail.shape[::-1], interpolation=cv2.INTER_AREA)
-        wholly = cv2.erode((small == 255).astype(np.uint8), np.ones((PATCH_PX + 1, PATCH_PX + 1), np.uint8))
-        chosen = wholly[PATCH_PX // 2 :: PATCH_PX, PATCH_PX // 2 :: PATCH_PX] > 0
-        deviation = deviation[chosen] if chosen.any() else deviation
-    return float(np.percentile(deviation, percentile))
+    deviation = np.sqrt(np.maximum(square - np.square(mean), 0))[PATCH_CENTRES, PATCH_CENTRES]
+    return float(np.percentile(deviation if patches is None else deviation[patches], percentile))
 
 
 def _fading(empty: NDArray[np.bool_], faint: NDArray[np.bool_]) -> NDArray[np.bool_]:

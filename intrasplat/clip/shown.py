@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from intrasplat.clip.empty_frames import find_empty
-from intrasplat.clip.field_of_view import find_fields
-from intrasplat.clip.sampling import sampled, thumbnail
+from intrasplat.clip.empty_frames import EmptyFrames, find_empty
+from intrasplat.clip.field_of_view import Fields, find_fields
+from intrasplat.clip.sampling import Mapping, Thumbnail, sampled, thumbnail
 from intrasplat.clip.split import training_frames
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import InputError
 from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.names import Fov
 from intrasplat.options import ReconstructionOptions
 
 
@@ -25,16 +28,13 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
     thumbnails = [[thumbnail(rgb) for rgb in clip.rgb]]
     shares = [float(tissue.mean()) for tissue in clip.tissue]
     train = training_frames(clip.frame_count, options.holdout)
-    empty = find_empty(thumbnails, train, tissue_shares=shares)
-    fields = find_fields([clip.rgb], shown_frames(train, empty.frames), options.fov)
+    fields, empty = find_shown([clip.rgb], thumbnails, train, options.fov, shares)
     if fields.left is not None:
         inside = mapped_zeros(clip.tissue.shape, np.bool_)
         for index, tissue in enumerate(clip.tissue):
             np.logical_and(tissue, fields.left, out=inside[index])
             let_go(inside[index])
         clip = replace(clip, tissue=inside, field_of_view=fields.left)
-    empty = find_empty(thumbnails, train, [fields.left], shares)
-    shown_frames(train, empty.frames)
     clip = replace(
         clip,
         fov=fields.entry,
@@ -44,13 +44,39 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
     return sampled(clip, options, empty.frames)
 
 
-def shown_frames(train: list[int], empty: tuple[int, ...]) -> list[int]:
-    """The training frames that are not empty.
+def find_shown(
+    eyes: Sequence[NDArray[np.uint8]],
+    thumbnails: Sequence[Sequence[Thumbnail]],
+    train: Sequence[int],
+    fov: Fov,
+    tissue_shares: Sequence[float],
+    mapping: Mapping = map,
+) -> tuple[Fields, EmptyFrames]:
+    """The fields of view of a clip's eyes, and the frames that show no whole scene within them.
+
+    The field is found in frames that are not empty, and whether a frame is empty is judged within the field.
+
+    Args:
+        eyes: [T, H, W, 3] of each eye.
+        thumbnails: T thumbnails of each eye.
+        train: the frames that are not held out, rising.
+        tissue_shares: T shares of each frame that the masks leave; none: no masks.
+        mapping: a replacement of map(), such as a thread pool's.
 
     Raises:
-        InputError: there are none.
+        InputError: no training frame shows anything.
     """
-    shown = sorted(set(train) - set(empty))
+    empty = find_empty(thumbnails, train, tissue_shares=tissue_shares)
+    fields = find_fields(eyes, _some(train, empty), fov, mapping)
+    found = [fields.left, fields.right][: len(eyes)]
+    empty = find_empty(thumbnails, train, found, tissue_shares)
+    _some(train, empty)
+    return fields, empty
+
+
+def _some(train: Sequence[int], empty: EmptyFrames) -> list[int]:
+    """The training frames that are not empty. Raises InputError if there are none."""
+    shown = sorted(set(train) - set(empty.frames))
     if not shown:
         raise InputError(
             "clip",

@@ -79,6 +79,11 @@ class Eye:
         return int(self.rgb.shape[0])
 
     @property
+    def field_pixels(self) -> int:
+        """The pixels in the field of view."""
+        return self.tissue[0].size if self.field_of_view is None else int(np.count_nonzero(self.field_of_view))
+
+    @property
     def t(self) -> NDArray[np.float64]:
         """Model time of each frame, t_i = i / T, in [0, 1)."""
         return np.arange(self.frame_count) / self.frame_count

@@ -42,7 +42,6 @@ def with_instruments_found(
     tissue = mapped_zeros(clip.tissue.shape, np.bool_)
     wanted = clip.used
     evidence = np.zeros((clip.frame_count, 3))
-    field_pixels = tissue[0].size if clip.field_of_view is None else np.count_nonzero(clip.field_of_view)
 
     def find(i: int) -> float:
         if hooks.should_stop():
@@ -50,7 +49,7 @@ def with_instruments_found(
         found: FoundMask = finder(clip.rgb[i], lambda coarse: nearness_of(coarse, clip.depth_mm[i]))
         tissue[i] = clip.tissue[i] & ~found.tool
         evidence[i] = found.seen, found.clear, found.missed
-        masked = 1 - np.count_nonzero(tissue[i]) / field_pixels
+        masked = 1 - np.count_nonzero(tissue[i]) / clip.field_pixels
         let_go(tissue[i])
         clip.let_go(i)
         return masked

@@ -70,7 +70,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 NoticeCode.FEW_FRAMES, f"Only {len(train)} frames were trained on; motion between them is guessed."
             )
         )
-    field_share = 1.0 if clip.field_of_view is None else float(clip.field_of_view.mean())
+    field_share = clip.field_pixels / clip.tissue[0].size
     tissue_share = float(np.mean([clip.tissue[index].mean() for index in clip.one_by_one(train)])) / field_share
     if tissue_share < MIN_TISSUE_SHARE:
         found.append(

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.clip.empty_frames import find_empty
-from intrasplat.clip.field_of_view import Fields, find_fields
+from intrasplat.clip.field_of_view import Fields
 from intrasplat.clip.sampling import SkippedFrames, Thumbnail, skippable_frames, thumbnail
-from intrasplat.clip.shown import shown_frames
+from intrasplat.clip.shown import find_shown
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import Cancelled, InputError
@@ -115,10 +114,8 @@ def estimate_depth(
             measured = sorted(set(measured) - set(unpaired))
         rgb, right_rgb = received.rgb, received.right_rgb
         shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
-        empty = find_empty(received.thumbnails, measured, tissue_shares=shares)
-        fields = find_fields([rgb, right_rgb], shown_frames(measured, empty.frames), fov, pool.map)
-        empty = find_empty(received.thumbnails, measured, [fields.left, fields.right], shares)
-        measured = shown_frames(measured, empty.frames)
+        fields, empty = find_shown([rgb, right_rgb], received.thumbnails, measured, fov, shares, pool.map)
+        measured = sorted(set(measured) - set(empty.frames))
         matches = received.matches(spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()
         if device == "cuda":
@@ -142,7 +139,7 @@ def estimate_depth(
     pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
     valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
     _check_depth(sure_share)
-    share = 1 - pixels / (len(wanted) * work.field_pixels)
+    share = 1 - pixels / (len(wanted) * work.matched.field_pixels)
     masks, assumptions = Masks(source="given", share=share), clip.assumptions
     mask_warnings: tuple[Notice, ...] = ()
     if finder is not None:

@@ -113,11 +113,6 @@ class FrameWork:
         )
         return cls(clip, plan, registration, matched, right, label, fields, finder)
 
-    @property
-    def field_pixels(self) -> int:
-        """The pixels in the left eye's field of view."""
-        return self.clip.tissue[0].size if self.fields.left is None else int(np.count_nonzero(self.fields.left))
-
     @cached_property
     def _supported(self) -> NDArray[np.uint8] | None:
         """[H, W] 1 in the right eye's field of view, in the calibrated eye's pixels; None: the whole picture."""
