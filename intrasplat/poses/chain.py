@@ -3,35 +3,42 @@
 A keyframe is followed while most of it stays in view. The next keyframe starts where less than KEY_OVERLAP of it is
 visible. Each frame is linked to the keyframe before it and to the one after it. Loop closure: keyframes that show the
 same tissue at other times are linked, too, so that a camera that returns gets the same pose again.
+
+Where optical flow loses the tissue, between stills or after a jump, features place the frame (wide.py). Frames that
+nothing ties to the largest set of linked frames are left out of the chain.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from intrasplat.clip import spread
 from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, exp, inverse, log
+from intrasplat.poses.wide import FarMotion
 
 KEY_OVERLAP = 0.6
 KEY_FRAMES = 16
 """Most frames between keyframes, so that the depth noise of one frame does not enter all poses."""
 LOOP_OVERLAP, MIN_OVERLAP = 0.5, 0.25
 """Minimum predicted overlap of two keyframes for a loop link; minimum measured overlap of any link."""
-
+MIN_AGREEING = 0.15
+"""Minimum share of a frame's tissue that is found where the poses expect it: below it, a link ties nothing."""
 MAX_LOOKS, MAX_LOOPS = 32, 64
 """Most keyframes among which loop pairs are searched, and most links between them."""
+PART_LOOKS = 8
+"""Most frames of a part that are matched with those of other parts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """Linked frames, and their camera poses under the assumption that all tissue is rigid.
 
-    frames             [K]       indices in the clip, rising
+    frames             [K]       indices in the clip, rising: the largest set that links tie together
     world_from_camera  [K, 4, 4] mm; the world is the first one's camera
     links                        a and b are indices in the clip
     """
@@ -44,6 +51,7 @@ class Chain:
 def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
     """Follow the training frames, link by link."""
     poses, links, keys = {train[0]: np.eye(4)}, list[FrameLink](), [train[0]]
+    parts = [[train[0]]]
     flow = None
 
     def linked(i: int, last: int) -> tuple[FrameLink, float]:
@@ -64,15 +72,61 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
         if share < MIN_OVERLAP and keys[-1] != last:  # most was lost: the last frame shows more of it
             turn_to(last)
             flow = None
-            link, _ = linked(i, last)
+            link, share = linked(i, last)
+        if share < MIN_OVERLAP and (far := frames.far_motion(keys[-1], i)) is not None:
+            far_link, motion, far_share = _far_link(frames, keys[-1], i, far)
+            if far_share > share:
+                link, share, poses[i] = far_link, far_share, poses[keys[-1]] @ inverse(motion)
+        on_progress(train.index(i) / (len(train) - 1))
+        if share < MIN_AGREEING:
+            keys.append(i)
+            parts.append([i])
+            flow = None
+            continue
+        parts[-1].append(i)
         links.append(link)
         flow = link.flow
         if link.overlap < KEY_OVERLAP or train.index(i) - train.index(keys[-1]) == KEY_FRAMES:
             turn_to(i)
             flow = None
-        on_progress(train.index(i) / (len(train) - 1))
+    if len(parts) > 1:
+        links += _joined(frames, parts, poses)
+        main: list[int] = max(parts, key=len)
+        train = sorted(main)
+        keys = [key for key in keys if key in train]
+        links = [link for link in links if link.a in train and link.b in train]
+        poses = {i: inverse(poses[train[0]]) @ poses[i] for i in train}
     links += _loops(frames, keys, poses)
     return Chain(train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP])
+
+
+def _far_link(frames: Frames, a: int, b: int, far: FarMotion) -> tuple[FrameLink, Reals, float]:
+    """A link of far frames, the motion [4, 4] from a's camera axes to b's, and the share of a that agrees with it."""
+    link = frames.far_link(a, b, far)
+    aligned = align(frames.camera, link.before, link.after, link.trust, far.motion)
+    return link, aligned.motion, link.agreeing(aligned.residual_px)
+
+
+def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> list[FrameLink]:
+    """Links between parts that show common tissue. The parts become one in parts, and in poses."""
+    looks, links = dict[int, list[int]](), list[FrameLink]()
+    for number in sorted(range(len(parts)), key=lambda each: -len(parts[each])):
+        room = MAX_LOOKS - sum(map(len, looks.values()))
+        looks[number] = list(spread(parts[number], min(PART_LOOKS, room))) if room else []
+    pairs = [(a, b) for one, other in combinations(looks.values(), 2) for a in one for b in other]
+    found = {pair: far for pair in pairs if (far := frames.far_motion(*pair)) is not None}
+    for a, b in sorted(found, key=lambda pair: -len(found[pair].before))[:MAX_LOOPS]:
+        link, motion, share = _far_link(frames, a, b, found[a, b])
+        if share < MIN_AGREEING:
+            continue
+        links.append(link)
+        one, other = (next(part for part in parts if each in part) for each in (a, b))
+        if one is not other:
+            moved = poses[a] @ inverse(motion) @ inverse(poses[b])
+            poses.update({i: moved @ poses[i] for i in other})
+            one += other
+            parts.remove(other)
+    return links
 
 
 def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:

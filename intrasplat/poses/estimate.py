@@ -17,20 +17,18 @@ from scipy.sparse.csgraph import connected_components
 
 from intrasplat.clip import DepthClip, spread
 from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.poses.beside import place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
-from intrasplat.poses.chain import chained
+from intrasplat.poses.chain import MIN_AGREEING, chained
 from intrasplat.poses.common_motion import RIGID_PER_BENT, Gauged, gauged
 from intrasplat.poses.fitting import Fit, fitted
 from intrasplat.poses.links import FrameLink, Frames
-from intrasplat.poses.rigid import Reals, align, between, inverse, log
+from intrasplat.poses.rigid import Reals, between, inverse, log
 
 MAX_FITTED = 128
 """Most frames that are fitted together; in a longer clip the others are aligned with them one by one."""
 CHAINING, FITTING = 0.45, 0.45
 """Shares of the progress."""
-MIN_AGREEING, GOOD = 0.15, 0.4
-"""A frame's pose is reliable from the first share of a keyframe's tissue that is found where the fit expects it.
-From the second share on, a frame is aligned with one fitted frame only."""
 MOVED_MM, MOVED_DEG = 1.2, 0.6
 """A camera whose root mean square about its mean is smaller counts as fixed."""
 UNSURE_MM, UNSURE_DEG = 1.25, 1.0
@@ -43,7 +41,7 @@ LARGE_MM, LARGE_DEG = 12.0, 6.0
 class FoundPath:
     """The camera's path.
 
-    world_from_camera  [T, 4, 4] mm; the world is the first training frame's camera
+    world_from_camera  [T, 4, 4] mm; the world is the camera of the first frame that is fitted
     sigma_mm, sigma_deg  expected error (standard deviation) after one rigid motion aligns the path with the true one
     alone_mm, alone_deg  root mean square of the path without the part that follows the tissue's time courses
     extent_mm, extent_deg  largest distance and angle between two cameras; path_mm: length of the path
@@ -102,11 +100,12 @@ def find_path(
 
 def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None]) -> FoundPath:
     frames = Frames(clip)
-    used = spread(train, MAX_FITTED)
-    chain = chained(frames, used, lambda share: on_progress(CHAINING * share))
+    chain = chained(frames, spread(train, MAX_FITTED), lambda share: on_progress(CHAINING * share))
     if not chain.links:
         return _unknown(clip.frame_count)
-    fit = fitted(frames.camera, chain, lambda share: on_progress(CHAINING + FITTING * share))
+    used = chain.frames
+    frame_s = float(np.median(np.diff(clip.frame_times_s)))
+    fit = fitted(frames.camera, chain, frame_s, lambda share: on_progress(CHAINING + FITTING * share))
     on_progress(CHAINING + FITTING)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics
@@ -117,7 +116,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     unsure = _apart(used, fit, chain.links)
     others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
     for done, i in enumerate(others):
-        pose, share = _placed(frames, used, fit, gauge, i)
+        pose, share = place_beside(frames, used, fit, gauge, i)
         path[i] = pose
         frames.forget(i)
         unsure += [i] if share < MIN_AGREEING else []
@@ -148,26 +147,6 @@ def _apart(used: Sequence[int], fit: Fit, links: Sequence[FrameLink]) -> list[in
     _, piece = connected_components(graph, directed=False)
     most = np.bincount(piece).argmax()
     return [index for index, each in zip(used, piece, strict=True) if each != most]
-
-
-def _placed(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index: int) -> tuple[Reals, float]:
-    """A frame's camera pose, aligned with the nearest fitted frames, and the share of tissue that agrees."""
-    course, guess = fit.field.course_at(index, used), between(used, fit.poses, index)
-    found = []
-    for number in np.argsort(np.abs(np.asarray(used) - index), kind="stable")[:2]:
-        pose = fit.poses[number]
-        link = frames.link(used[number], index, frames.predicted(used[number], inverse(guess) @ pose)[0])
-        points = frames.camera.points_mm(link.before)
-        world = points @ pose[:3, :3].T + pose[:3, 3]
-        moved = world + fit.field.displacement(world, course - fit.field.courses[number])
-        seen = frames.camera.seen((moved - pose[:3, 3]) @ pose[:3, :3])  # measurements if the camera stayed at `pose`
-        aligned = align(frames.camera, seen, link.after, link.trust, np.eye(4))
-        share = link.agreeing(aligned.residual_px)
-        found.append((share, gauge.tissue_at(course) @ pose @ inverse(aligned.motion)))
-        if share > GOOD:
-            break
-    share, pose = max(found, key=lambda each: each[0])
-    return pose, share
 
 
 def _found_path(

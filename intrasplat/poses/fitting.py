@@ -30,8 +30,9 @@ TUNED, FOLLOWED = (2, 4), (1, 2, 3)
 """Indices of the fine rounds that tune the period, and of those that fit free courses."""
 DEGREE, WIDE_DEGREE, WIDE = 3, 5, 1.5
 """Degree of the polynomials. The second applies where the tissue is more than WIDE times as wide or high as a view."""
-PERIODS, MIN_PERIOD_FRAMES, MIN_PERIODS = 48, 8.0, 1.25
-"""Number of periods that are tried; the shortest; how often the longest fits into the clip."""
+PERIODS, MIN_PERIOD_S, MIN_PERIOD_FRAMES, MIN_PERIODS = 48, 0.32, 2.2, 1.25
+"""Number of periods that are tried; the shortest, in seconds and in frames; how often the longest fits into the
+clip."""
 NEAR = np.linspace(0.94, 1.06, 25)
 """Factors on the current period that are tried to tune it."""
 MIN_EXPLAINED = 0.08
@@ -59,9 +60,18 @@ class Fit:
     grams: Grams
 
 
-def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], None] = lambda share: None) -> Fit:
-    """Cameras and the tissue's motion. on_progress gets the share of rounds done; its exceptions pass through."""
-    fitting, rounds = _Fitting(camera, chain), len(ROUGH_PX) + len(FINE_PX) + SETTLING
+def fitted(
+    camera: StereoCamera,
+    chain: Chain,
+    frame_s: float,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> Fit:
+    """Cameras and the tissue's motion.
+
+    frame_s: seconds from frame to frame of the clip. on_progress gets the share of rounds done; its exceptions pass
+    through.
+    """
+    fitting, rounds = _Fitting(camera, chain, frame_s), len(ROUGH_PX) + len(FINE_PX) + SETTLING
     for done, scale_px in enumerate(ROUGH_PX):
         on_progress(done / rounds)
         fitting.improve(scale_px)
@@ -83,7 +93,8 @@ def fitted(camera: StereoCamera, chain: Chain, on_progress: Callable[[float], No
 class _Fitting:
     """A fit in progress."""
 
-    def __init__(self, camera: StereoCamera, chain: Chain) -> None:
+    def __init__(self, camera: StereoCamera, chain: Chain, frame_s: float) -> None:
+        self.shortest = max(MIN_PERIOD_S / frame_s, MIN_PERIOD_FRAMES)
         self.camera, self.links, self.poses = camera, chain.links, chain.world_from_camera
         place = {index: k for k, index in enumerate(chain.frames)}
         self.ends = [(place[each.a], place[each.b]) for each in chain.links]
@@ -128,9 +139,9 @@ class _Fitting:
         """Whether some period explains enough; if so, one step of cameras and field with it."""
         grams = self._measured(scale_px)
         span = self.frames[-1] - self.frames[0]
-        if span < MIN_PERIODS * MIN_PERIOD_FRAMES:
+        if span < MIN_PERIODS * self.shortest:
             return False
-        periods = np.geomspace(MIN_PERIOD_FRAMES, span / MIN_PERIODS, PERIODS)
+        periods = np.geomspace(self.shortest, span / MIN_PERIODS, PERIODS)
         gains = grams.explained(self.field, periods.tolist())
         best = int(np.argmax(gains))
         if gains[best] < MIN_EXPLAINED * grams.unexplained():

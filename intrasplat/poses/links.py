@@ -10,15 +10,18 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from intrasplat.clip import DepthClip
 from intrasplat.motion.lifted import cell_means
-from intrasplat.poses.rigid import Reals, StereoCamera
+from intrasplat.poses.rigid import Reals, StereoCamera, align
+from intrasplat.poses.wide import FarMotion, Landmarks, far_motion, landmarks
 
 Floats = NDArray[np.float32]
 
 FLOW_WIDTH = 320
-"""Maximum width in px at which flow is computed: the clip is reduced by the smallest whole factor that fits."""
+"""Maximum width in px of the field of view at which flow is computed: the clip is reduced by the smallest whole factor
+that fits."""
 MATCH_STEP = 5
 """Cells of the grid between neighbouring matches."""
 PATCH_PX = 11
@@ -37,6 +40,10 @@ MIN_TRUST, MIN_MATCH_TRUST = 0.5, 0.1
 """Minimum confidence of depth at both ends of a match; minimum trust of a match that counts."""
 AGREES_PX = 1.5
 """Residual below which a match agrees with the fit."""
+FEATURE_TRUST = 8.0
+"""Trust in a match of features: those of flow lie so near to one another that they count much less each."""
+FLOW_SUFFICES = 0.35
+"""From this agreeing share on of what both frames show, flow is used rather than features."""
 PSEUDO_BASELINE_MM = 4.3
 """Given depth is converted to the disparity of a stereo camera with this baseline."""
 
@@ -63,7 +70,7 @@ class FrameLink:
     cells  [M]     indices among a's cells with depth, which are the same in all links of a
     before [M, 3]  (column, row, disparity) in a, px of the coarse grid
     after  [M, 3]  in b
-    trust  [M]     in [0, 1]
+    trust  [M]     in [0, 1]; of features FEATURE_TRUST
     overlap        share of a's cells with depth that were found in b
     flow [h, w, 2] an initial flow for another link
     """
@@ -87,7 +94,7 @@ class Frames:
 
     def __init__(self, clip: DepthClip) -> None:
         k = clip.intrinsics
-        step = -(-k.width // FLOW_WIDTH)
+        step = -(-_field_width(clip) // FLOW_WIDTH)
         self._clip, self._step = clip, step
         right = clip.right
         baseline_mm = PSEUDO_BASELINE_MM
@@ -95,6 +102,7 @@ class Frames:
             baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
         self._cache: dict[int, TrackedFrame] = {}
+        self._landmarks: dict[int, Landmarks] = {}
         self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def frame(self, index: int) -> TrackedFrame:
@@ -118,6 +126,27 @@ class Frames:
     def forget(self, index: int) -> None:
         """Free a frame's memory."""
         self._cache.pop(index, None)
+        self._landmarks.pop(index, None)
+
+    def far_motion(self, a: int, b: int) -> FarMotion | None:
+        """The motion from frame a to frame b, however far apart; None: they show no common tissue that matches."""
+        for index in (a, b):
+            if index not in self._landmarks:
+                self._landmarks[index] = landmarks(self._clip, index, self.camera, self._step)
+        return far_motion(self.camera, self._landmarks[a], self._landmarks[b])
+
+    def far_link(self, a: int, b: int, far: FarMotion) -> FrameLink:
+        """Matches from frame a to frame b: of flow that starts from the motion, or of features if they find more."""
+        flow, in_view = self.predicted(a, far.motion)
+        link = self.link(a, b, flow)
+        aligned = align(self.camera, link.before, link.after, link.trust, far.motion)
+        overlap = in_view * far.share
+        if link.agreeing(aligned.residual_px) > min(overlap, FLOW_SUFFICES * in_view):
+            return link
+        columns, rows = self._matched(self.frame(a))
+        cells = cKDTree(np.stack([columns, rows], axis=1)).query(far.before[:, :2])[1]
+        trust = np.full(len(cells), FEATURE_TRUST)
+        return FrameLink(a, b, np.asarray(cells, np.intp), far.before, far.after, trust, overlap, flow)
 
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""
@@ -177,6 +206,14 @@ class Frames:
         rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
         known = frame.trust[rows, columns] > MIN_TRUST
         return columns[known], rows[known]
+
+
+def _field_width(clip: DepthClip) -> int:
+    """Width of the field of view in px."""
+    if clip.field_of_view is None or not clip.field_of_view.any():
+        return clip.intrinsics.width
+    columns = np.flatnonzero(clip.field_of_view.any(0))
+    return int(columns[-1] - columns[0] + 1)
 
 
 def _patches(one: NDArray[np.uint8], two: NDArray[np.uint8], places: Floats, guess: Floats) -> Floats:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # imported when needed: a fixed camera needs none of it
 STAGE = "poses"
 WORTH = 0.7
 """Smoothed poses replace the given ones only if less than this share of the jitter remains."""
+MAX_NAMED = 8
 MAX_UNSURE = 0.5
 """With a larger share of unsure frames, the path is rejected."""
 
@@ -132,8 +133,8 @@ def _steadied(clip: DepthClip, train: Sequence[int], jumps_mm: float, depth_mm: 
 def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOptions) -> DepthClip:
     """The clip with the found path, or with a fixed camera if that explains the clip as well."""
     if len(found.unsure) > MAX_UNSURE * clip.frame_count:
-        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames: too little "
-        text += "tissue with texture and depth is common to them. The camera was taken as fixed."
+        text = f"The camera's pose could not be found in {_named(clip, found)}: too little tissue with texture and "
+        text += "depth is common to them. The camera was taken as fixed."
         return _fixed(clip, "was taken as fixed", None, Notice.warning(NoticeCode.POSES_UNSURE, text))
     if not found.seems_to_move and not found.confused:
         how = f"is fixed: placed frame by frame, it stays within about {found.spread_mm:.1f} mm of one place"
@@ -152,7 +153,8 @@ def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOp
         )
         warnings.append(Notice.warning(NoticeCode.CAMERA_OR_TISSUE, text))
     if found.unsure:
-        text = f"The camera's pose could not be found in {len(found.unsure)} of {clip.frame_count} frames."
+        text = f"The camera's pose could not be found in {_named(clip, found)}: no other frame shows enough of their "
+        text += "tissue. They were left out, and are not scored."
         warnings.append(Notice.warning(NoticeCode.POSES_UNSURE, text))
     text = (
         f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; its path fits the "
@@ -161,8 +163,15 @@ def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOp
     )
     entry = _report_entry(clip, "estimated", found)
     clip = placed(clip, found.world_from_camera)
+    clip = replace(clip, skipped=tuple(sorted({*clip.skipped, *found.unsure})))
     notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
     return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
+
+
+def _named(clip: DepthClip, found: FoundPath) -> str:
+    """How many frames' pose is unreliable, and which."""
+    named = ", ".join(str(index) for index in found.unsure[:MAX_NAMED]) + ", ..." * (len(found.unsure) > MAX_NAMED)
+    return f"{len(found.unsure)} of {clip.frame_count} frames ({named})"
 
 
 def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings: Notice) -> DepthClip:

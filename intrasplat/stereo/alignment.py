@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.features import Features, matched
 from intrasplat.clip.sampling import Mapping
 from intrasplat.errors import InputError
 from intrasplat.stereo.matching import Grey, Image, evidence, semi_global
@@ -19,9 +20,6 @@ from intrasplat.stereo.matching import Grey, Image, evidence, semi_global
 Agreed = Callable[[NDArray[np.uint8], NDArray[np.uint8], int, int], tuple[Image, NDArray[np.bool_]]]
 """The signature of agreed_disparities, which another device may implement."""
 
-FEATURE_WIDTH = 400  # px; images are reduced to it: the median over pairs is as accurate, in a third of the time
-FEATURES = 1500
-RATIO = 0.8  # Lowe's ratio test
 MAX_MATCH_DY_PX = 48.0  # matches farther apart in y are wrong
 MIN_MATCHES = 20
 MAX_CORRECTION_PX = 8.0  # a larger row shift means that the calibration belongs to other frames
@@ -43,34 +41,9 @@ class RowShift:
     matches: int
 
 
-@dataclass(frozen=True, eq=False)
-class Features:
-    """SIFT features of an image: points [N, 2] x, y in its pixels, descriptors [N, 128] float32."""
-
-    points: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
-
-
-def find_features(image: Grey, max_width_px: int = FEATURE_WIDTH) -> Features:
-    """Features of the image, which is reduced to max_width_px if it is wider."""
-    scale = min(1.0, max_width_px / image.shape[1])
-    small = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    points, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(small, None)
-    if descriptors is None:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    return Features(np.array([point.pt for point in points], np.float64) / scale, descriptors)
-
-
 def match_features(left: Features, right: Features) -> NDArray[np.float64]:
     """Matches [M, 4] (x_left, y_left, x_right, y_right) that pass the ratio test and lie on similar rows."""
-    if not len(left.points) or len(right.points) < 2:
-        return np.zeros((0, 4))
-    pairs = [
-        (best.queryIdx, best.trainIdx)
-        for best, second in cv2.BFMatcher(cv2.NORM_L2).knnMatch(left.descriptors, right.descriptors, k=2)
-        if best.distance < RATIO * second.distance
-    ]
-    one, other = np.array(pairs, np.intp).reshape(-1, 2).T
+    one, other = matched(left, right).T
     matches = np.concatenate([left.points[one], right.points[other]], axis=1)
     near: NDArray[np.float64] = matches[np.abs(matches[:, 3] - matches[:, 1]) <= MAX_MATCH_DY_PX]
     return near

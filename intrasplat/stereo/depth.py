@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.features import Features, find_features
 from intrasplat.clip.field_of_view import Fields
 from intrasplat.clip.sampling import SkippedFrames, Thumbnail, skippable_frames, thumbnail
 from intrasplat.clip.shown import find_shown
@@ -32,10 +33,8 @@ from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from intrasplat.report import Masks
 from intrasplat.stereo.alignment import (
     Agreed,
-    Features,
     agreed_disparities,
     choose_range,
-    find_features,
     match_features,
     measure_row_shift,
     outside_share,

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.clip.features import FEATURE_WIDTH
 from intrasplat.clip.sampling import Mapping
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import RightEye
-from intrasplat.stereo.alignment import FEATURE_WIDTH, RowShift
+from intrasplat.stereo.alignment import RowShift
 from intrasplat.stereo.matching import SATURATED_LEVEL, Image, MatchPlan, match
 from intrasplat.stereo.turn import AnyImage, EyeRotation, Rgb
 

@@ -37,13 +37,13 @@ from lab.evaluate.rows import commit
 from lab.evaluate.sources import open_source, source_of
 
 PATHS = ("still", "pan", "advance", "roll", "turn", "shake", "swing")
-"""still: no path, a fixed camera."""
+"""still: no path, a fixed camera. With INTRASPLAT_DATA set, its recorded paths may be named, too, such as p1_00240."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motions", nargs="+", default=["breathing", "pull"])
-    parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS)
+    parser.add_argument("--paths", nargs="+", default=PATHS)
     parser.add_argument("--frames", type=int, default=64)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--holdout", default="every8")

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, StereoClip, open_clip
 from intrasplat.clip.calibration import RectifiedClip, load_calibration, rectify
+from intrasplat.clip.features import find_features
 from intrasplat.options import ClipOptions
 from intrasplat.stereo import estimate_depth
-from intrasplat.stereo.alignment import find_features, match_features, measure_row_shift
+from intrasplat.stereo.alignment import match_features, measure_row_shift
 from lab.evaluate.rows import commit
 from lab.phantom import PhantomSettings, make_phantom
 

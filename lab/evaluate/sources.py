@@ -2,8 +2,10 @@
 
 PATH                                        anything `reconstruct` reads
 phantom:MOTION[:WxH][:FRAMESframes][:seedN] synthetic tissue with true depth, 320x256, 64 frames, seed 0
-phantom:MOTION[+PATH...][:...]              the same under an endoscope that follows paths: swing, pan, advance, roll,
-                                            turn, shake (lab/phantom/camera.py); the clip has the true poses
+phantom:MOTION[+PATH...][:...]              the same under an endoscope that follows paths: swing, pan, advance,
+                                            retreat, roll, turn, shake (lab/phantom/camera.py), or the path
+                                            paths/PATH.tum in the folder INTRASPLAT_DATA names; the clip has the true
+                                            poses
 phantom:MOTION[:...]:TOOL[+TOOL...]         with other instruments than the grasper: steel, yellow, dark; or none
 phantom:MOTION[:...]:nomasks                without masks of the instruments
 phantom:MOTION[:...]:stereo                 the same tissue as a stereo clip: both eyes without loss, their calibration
@@ -35,7 +37,7 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.stereo import match_eyes
 from intrasplat.train.request import ReconstructionRequest
 from lab.evaluate.thinned import shrunk
-from lab.phantom import MOTIONS, TOOLS, Phantom, PhantomSettings, make_phantom
+from lab.phantom import CAMERA_PATHS, MOTIONS, TOOLS, Phantom, PhantomSettings, make_phantom
 
 DATA_VARIABLE = "INTRASPLAT_DATA"
 PHANTOM_WIDTH, PHANTOM_HEIGHT = 320, 256
@@ -177,6 +179,11 @@ def _drawn(argument: str) -> Source:
     flags = {"stereo": False, "nomasks": False}
     _, moves, *parts = argument.split(":")
     motion, *paths = moves.split("+")
+    for path in set(paths) - set(CAMERA_PATHS):
+        recorded = Path(os.environ.get(DATA_VARIABLE, ""), "paths", f"{path}.tum")
+        if recorded.is_file():
+            paths.remove(path)
+            values["recorded_path"] = recorded
     for part in parts:
         if match := re.fullmatch(r"(\d+)x(\d+)", part):
             values |= {"width": int(match[1]), "height": int(match[2])}
@@ -203,7 +210,7 @@ def _drawn(argument: str) -> Source:
 def _phantom_name(settings: PhantomSettings) -> str:
     """phantom-MOTION and what differs from the usual clip."""
     usual = PhantomSettings()
-    parts = ["phantom", settings.motion, *settings.camera]
+    parts = ["phantom", *settings.moves.split("+")]
     if (settings.width, settings.height) != (PHANTOM_WIDTH, PHANTOM_HEIGHT):
         parts.append(f"{settings.width}x{settings.height}")
     if settings.frames != usual.frames:

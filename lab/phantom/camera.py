@@ -5,6 +5,7 @@ The endoscope follows no path, one, or several at once; each path starts at the 
 swing    slowly about the tissue, by SWING_DEG and DOLLY_MM
 pan      to the right by PAN_VIEWS widths of the view at mean depth, once in the clip
 advance  by ADVANCE_MM towards the tissue and back, once in the clip
+retreat  by RETREAT_MM away from the tissue and back, once in the clip
 roll     by ROLL_DEG about the optical axis, once in the clip
 turn     by TURN_DEG within TURN_S about the port that the endoscope goes through, from TURN_START_S on
 shake    as held by hand: sway of a mm or two and half a degree at 1.1 to 2.1 Hz, and tremor of 5 to 8 Hz
@@ -14,11 +15,14 @@ A turn and a shake take seconds, so settings.frame_rate_hz says how many frames 
 
 from __future__ import annotations
 
-from functools import reduce
+from dataclasses import replace
+from functools import cache, reduce
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lab.phantom.settings import CAMERA_PATHS, FOCAL_PER_WIDTH, MEAN_DEPTH_MM, CameraPath, PhantomSettings
 
@@ -29,6 +33,7 @@ DOLLY_MM = 5.0
 PAN_VIEWS = 1.5
 PAN_BOW_MM, PAN_BOW_DEG = 8.0, 6.0  # deviation down and to the right, half-way: no hand moves along a line
 ADVANCE_MM = 30.0
+RETREAT_MM, RETREAT_SIDE_MM, RETREAT_DEG = 100.0, 8.0, 4.0  # back, to the side and turned, half-way
 ROLL_DEG = 20.0
 TURN_DEG, TURN_S, TURN_START_S = 5.0, 1.5, 0.4  # as fast as the kinematics of real recordings show
 PORT_BEHIND_MM = 120.0  # the endoscope turns about its port in the abdominal wall
@@ -57,6 +62,9 @@ def orbit_pose(yaw_deg: float, pitch_deg: float, nearer_mm: float = 0.0) -> Pose
 def endoscope_pose(frame: float, settings: PhantomSettings) -> Pose:
     """The left eye's pose at a frame: the identity at frame 0, and in every frame of a fixed endoscope."""
     followed = [_POSES[path](frame, settings) for path in CAMERA_PATHS if path in settings.camera]
+    if settings.recorded_path is not None:
+        recorded = _recorded(settings.recorded_path)
+        followed.append(recorded[min(round(frame), len(recorded) - 1)])
     return reduce(np.matmul, followed) if followed else np.eye(4)
 
 
@@ -75,8 +83,9 @@ def farther_mm(settings: PhantomSettings, depth_mm: float) -> tuple[float, float
     corners = np.array([[x * edges[0], y * edges[1], 1.0] for x in (-1, 1) for y in (-1, 1)])
     paths: tuple[CameraPath, ...] = tuple(path for path in CAMERA_PATHS if path in settings.camera and path != "swing")
     reach_mm = depth_mm * edges
-    for frame in np.linspace(0, settings.frames - 1, min(settings.frames, _MAX_LOOKS)) if paths else ():
-        pose = reduce(np.matmul, [_POSES[path](float(frame), settings) for path in paths])
+    looked_at = replace(settings, camera=paths)
+    for frame in np.linspace(0, settings.frames - 1, min(settings.frames, _MAX_LOOKS)):
+        pose = endoscope_pose(float(frame), looked_at)
         rays = corners @ pose[:3, :3].T
         places_mm = pose[:2, 3] + rays[:, :2] / rays[:, 2:] * (depth_mm - pose[2, 3])
         reach_mm = np.maximum(reach_mm, np.abs(places_mm).max(axis=0))
@@ -107,6 +116,12 @@ def _advance(frame: float, settings: PhantomSettings) -> Pose:
     return _moved((0, 0, ADVANCE_MM * np.sin(np.pi * _eased(_done(frame, settings))) ** 2), (0, 0, 0))
 
 
+def _retreat(frame: float, settings: PhantomSettings) -> Pose:
+    share = float(np.sin(np.pi * _eased(_done(frame, settings))) ** 2)
+    away = share * np.array([RETREAT_SIDE_MM, -RETREAT_SIDE_MM / 2, -RETREAT_MM])
+    return _moved(away, share * RETREAT_DEG * np.array([0.5, 1.0, -2.0]))
+
+
 def _roll(frame: float, settings: PhantomSettings) -> Pose:
     return _moved((0, 0, 0), (0, 0, ROLL_DEG * _eased(_done(frame, settings))))
 
@@ -123,6 +138,16 @@ def _shake(frame: float, settings: PhantomSettings) -> Pose:
     return _moved(
         SWAY_MM * (np.sin(angle * SWAY_MM_HZ) + tremor), SWAY_DEG * (np.sin(angle * SWAY_DEG_HZ) + tremor[::-1])
     )
+
+
+@cache
+def _recorded(path: Path) -> Pose:
+    """The poses [lines, 4, 4] of a TUM file, from the first one."""
+    rows = np.loadtxt(path)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
+    poses[:, :3, 3] = 1000 * rows[:, 1:4]
+    return np.asarray(np.linalg.inv(poses[0]) @ poses)
 
 
 def _done(frame: float, settings: PhantomSettings) -> float:
@@ -148,4 +173,12 @@ def _moved(by_mm: NDArray[np.float64] | tuple[float, ...], by_deg: NDArray[np.fl
 
 
 _MAX_LOOKS = 500  # frames of a long clip at which its extent is looked at
-_POSES = {"swing": _swing, "pan": _pan, "advance": _advance, "roll": _roll, "turn": _turn, "shake": _shake}
+_POSES = {
+    "swing": _swing,
+    "pan": _pan,
+    "advance": _advance,
+    "retreat": _retreat,
+    "roll": _roll,
+    "turn": _turn,
+    "shake": _shake,
+}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, get_args
 
 from intrasplat.camera import Intrinsics
@@ -12,7 +13,7 @@ from intrasplat.intake.calibration.types import RectifiedCalibration
 
 Motion = Literal["still", "breathing", "pull", "cut"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
-CameraPath = Literal["swing", "pan", "advance", "roll", "turn", "shake"]
+CameraPath = Literal["swing", "pan", "advance", "retreat", "roll", "turn", "shake"]
 CAMERA_PATHS: tuple[CameraPath, ...] = get_args(CameraPath)
 Tool = Literal["grasper", "steel", "yellow", "dark"]
 TOOLS: tuple[Tool, ...] = get_args(Tool)
@@ -40,6 +41,8 @@ class PhantomSettings:
             those motions; the others come into view and leave it.
         noise: whether frames carry sensor noise; depth, hidden surface and free viewpoints never do.
         camera: the paths that the endoscope follows, all at once (lab/phantom/camera.py); none if it is fixed.
+        recorded_path: a TUM file (metres), which the endoscope follows as well, a line a frame, from the first line's
+            place on; it rests after the last line.
         period_frames: frames of one breath, of one pull, or of half a cut.
 
     Raises InputError (field options.<name>) for a setting out of range.
@@ -53,6 +56,7 @@ class PhantomSettings:
     tools: tuple[Tool, ...] = ("grasper",)
     noise: bool = True
     camera: tuple[CameraPath, ...] = ()
+    recorded_path: Path | None = None
     baseline_mm: float = 4.3
     period_frames: float = 36.0
     frame_rate_hz: float = 25.0
@@ -87,7 +91,8 @@ class PhantomSettings:
     @property
     def moves(self) -> str:
         """How tissue and endoscope move, as the command line spells it: MOTION[+PATH...]."""
-        return "+".join((self.motion, *self.camera))
+        recorded = () if self.recorded_path is None else (self.recorded_path.stem,)
+        return "+".join((self.motion, *self.camera, *recorded))
 
     @property
     def intrinsics(self) -> Intrinsics:
