@@ -36,6 +36,9 @@ MAX_UNEXPLAINED_MOTION = 0.5
 """No number of bases follows the motion if the best leaves more than this share of what the smallest number leaves."""
 MIN_GAIN_DB = 0.25
 """More bases, or more points, must lower the expected error of the picture by more than this."""
+MAX_LOSS_DB = 1.5
+"""If no number of bases follows the motion, one may leave this much more of it than the best does: its training frames
+are sharper."""
 MAX_COARSENING = 4
 """Largest stride over the finest stride: changing illumination may reveal detail later."""
 MAX_POINTS = 80_000
@@ -118,9 +121,10 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
     The expected error is that in validation frames plus the floor, the error of the Gaussians without motion. `frames`
     is the number of training frames.
 
-    If no number follows the motion, the largest number tried is chosen: even the best leaves a motion error above the
-    floor and above MAX_UNEXPLAINED_MOTION of what the smallest number leaves. Changes of illumination do not count,
-    because more bases do not model a flickering lamp. Without trials, one basis for every FRAMES_A_BASIS frames.
+    If no number follows the motion, the largest number within MAX_LOSS_DB of the best is chosen: even the best leaves a
+    motion error above the floor and above MAX_UNEXPLAINED_MOTION of what the smallest number leaves. Between stills,
+    more bases fit each frame and miss those between by more. Changes of illumination do not count, because more bases
+    do not model a flickering lamp. Without trials, one basis for every FRAMES_A_BASIS frames.
     """
     errors = trials.tracked
     if not errors:
@@ -132,9 +136,10 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
     if len(errors) == 1:
         return BasisChoice(smallest, limit.reason)
     if min(each.motion for each in errors.values()) > max(floor, MAX_UNEXPLAINED_MOTION * errors[smallest].motion):
-        return BasisChoice(
-            max(errors), f"{limit.reason}, for none that was tried follows the motion in validation frames"
-        )
+        allowed = min(each.motion for each in errors.values()) * 10 ** (MAX_LOSS_DB / 10)
+        most = max(bases for bases, each in errors.items() if each.motion <= allowed)
+        why = limit.reason if most == max(errors) else f"more lose over {MAX_LOSS_DB} dB"
+        return BasisChoice(most, f"{why}, for none that was tried follows the motion in validation frames")
     total = {bases: each.total for bases, each in trials.decisive.items()}
     best = min(total, key=lambda each: total[each])
     allowed = (total[best] + floor) * 10 ** (MIN_GAIN_DB / 10)

@@ -32,6 +32,8 @@ WITH_TOOL = (9, 10)
 BULGE, SHIFT_PX = 0.06, 7.0
 """The rectified pictures' borders: how far the sides bulge inwards, as a share of the side, and how far the whole
 is moved, in opposite directions for the two eyes."""
+MARGIN_PX = 4
+"""Around the field of view, for the motion of the tissue and of the right eye."""
 FIELDS = (
     "clip", "ate_mm", "ate_deg", "sigma_mm", "lost", "psnr_tissue_db", "psnr_right_db", "blend_db", "train_db",
     "gaussians", "outside_field", "poses_s", "finish_s", "shrink_s", "t_post_s", "machine", "commit",
@@ -111,6 +113,7 @@ def measured(recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | N
     report = scene.report
     poses, seconds = report.poses, report.seconds
     assert poses is not None
+    field = recording.with_depth().field_of_view
     row: dict[str, Any] = {
         "sigma_mm": poses.sigma_mm and round(poses.sigma_mm, 2),
         "lost": len(poses.unsure_frames),
@@ -119,6 +122,7 @@ def measured(recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | N
         "blend_db": round(report.baseline_blend_db or 0.0, 2),
         "train_db": round(report.train_psnr_tissue_db or 0.0, 2),
         "gaussians": report.gaussians,
+        "outside_field": 0.0 if field is None else round(outside(scene, field), 4),
         **{name: round(seconds.get(name, 0.0), 1) for name in ("poses_s", "finish_s", "shrink_s", "t_post_s")},
     }
     if true is not None:
@@ -127,6 +131,22 @@ def measured(recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | N
         error = trajectory_error(found[placed], true[placed])
         row |= {"ate_mm": round(error.mm, 2), "ate_deg": round(error.deg, 2)}
     return row
+
+
+def outside(scene: isp.Scene, field: NDArray[np.bool_]) -> float:
+    """The share of Gaussians that lie outside the field of view [H, W], and MARGIN_PX around it, of all frames."""
+    trained, camera, margin = scene.trained, scene.intrinsics, np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+    near = cv2.dilate(field.astype(np.uint8), margin) > 0
+    points_mm = trained.gaussians.mean.numpy() / trained.units_per_mm
+    seen = np.zeros(len(points_mm), np.bool_)
+    lost = scene.report.poses.unsure_frames if scene.report.poses else ()
+    for pose in np.linalg.inv(np.delete(scene.world_from_camera, lost, axis=0)):
+        x, y, z = (points_mm @ pose[:3, :3].T + pose[:3, 3]).T
+        column = np.floor(camera.fx * x / np.maximum(z, 1e-3) + camera.cx).astype(int)
+        row = np.floor(camera.fy * y / np.maximum(z, 1e-3) + camera.cy).astype(int)
+        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen[inside] |= near[row[inside], column[inside]]
+    return float(1 - seen.mean())
 
 
 if __name__ == "__main__":

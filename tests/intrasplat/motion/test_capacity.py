@@ -138,6 +138,13 @@ def test_motion_too_fast_for_any_number_gets_the_most() -> None:
     assert choose_bases(errors, 1000.0, 40).count == 3  # it does not show beside what the Gaussians leave
 
 
+def test_between_stills_bases_that_miss_the_motion_by_far_more_are_not_taken() -> None:
+    errors = motion_left({1: 2267.0, 3: 2161.0, 5: 2937.0, 9: 3214.0})
+    choice = choose_bases(errors, 12.0, 22)
+    assert choice.count == 5
+    assert "more lose over 1.5 dB" in choice.reason
+
+
 def test_light_that_no_number_follows_gets_no_more_bases() -> None:
     clip, train, _ = followed("still")
     brightness = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (FRAMES, 1, 1, 1))
