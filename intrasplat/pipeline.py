@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -54,6 +55,8 @@ from intrasplat.train.setup import Setup, length_of
 from intrasplat.view.recorded import EYES, zipped_frames
 from intrasplat.view.render import SceneRenderer
 
+SHRINKING = 0.15
+"""Share of the training budget after which no coarser quantisation is tried."""
 FINISHING_STEPS = 7
 """Progress reports of finish() when round_model tries three steps; more trials stay at 100 %."""
 
@@ -237,7 +240,9 @@ def finish(run: Run) -> tuple[TrainedScene, QuantizedScene | None]:
     with timings.measure("finish_s"):
         scene = scene_of(run, report).without_motion()  # no second copy of the weights, which take much memory
     with timings.measure("shrink_s"):
-        rounded = round_model(run.model, scene, run.eyes, device=run.device, on_step=report)
+        _, budget_s = length_of(run.setup.options, run.setup.preset)
+        limit_s = math.inf if budget_s is None else SHRINKING * budget_s
+        rounded = round_model(run.model, scene, run.eyes, device=run.device, on_step=report, limit_s=limit_s)
         keep_free_memory(LITTLE_BYTES)
         if rounded is None:
             return dataclasses.replace(scene, deformation=run.model.export()[1]), None

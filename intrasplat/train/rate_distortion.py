@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -107,6 +108,7 @@ def round_model(
     tolerance_db: float = TOLERANCE_DB,
     device: Device = CPU,
     on_step: Callable[[], None] = lambda: None,
+    limit_s: float = math.inf,
 ) -> RoundedModel | None:
     """The model in whole numbers; None if it is stored as floats, or if no trial stayed within the tolerance.
 
@@ -114,7 +116,9 @@ def round_model(
         scene: of this model; its motion needs no weights.
         eyes: targets of the eyes that were trained on.
         on_step: called between two parts of the work.
+        limit_s: no trial begins later than this if one has stayed within the tolerance.
     """
+    began_s = time.monotonic()
     pictures = [(frames, index) for index in eyes[0].indices for frames in eyes if frames.eye.tissue[index].any()]
     if not isinstance(scene.deformation, SharedBasis) or scene.gaussians.sh_degree > 0 or not pictures:
         return None
@@ -133,7 +137,12 @@ def round_model(
     on_step()
     weight = model.parameters()["motion.weight"].cpu().numpy()
     prepared = prepare(scene.gaussians, scene.deformation, weight, scene.seen, sensitivity, times)
-    found = _coarsest(lambda step: loss_db(rounding(prepared, step)), _first_step(prepared, exact_db), tolerance_db)
+    found = _coarsest(
+        lambda step: loss_db(rounding(prepared, step)),
+        _first_step(prepared, exact_db),
+        tolerance_db,
+        lambda: time.monotonic() - began_s > limit_s,
+    )
     return None if found is None else RoundedModel(rounding(prepared, found[0]), *found, len(scored))
 
 
@@ -144,13 +153,20 @@ def _first_step(prepared: Prepared, exact_db: float) -> float:
     return min(max(FIRST_STEP * error / math.sqrt(numbers), 2 * MIN_STEP), MAX_FIRST_STEP)
 
 
-def _coarsest(loss_of: Callable[[float], float], first: float, tolerance_db: float) -> tuple[float, float] | None:
+def _coarsest(
+    loss_of: Callable[[float], float],
+    first: float,
+    tolerance_db: float,
+    is_late: Callable[[], bool] = lambda: False,
+) -> tuple[float, float] | None:
     """The coarsest step tried that stayed within the tolerance, and its loss in dB; None if none did.
 
-    Each trial predicts the step that just uses the tolerance.
+    Each trial predicts the step that just uses the tolerance. Once is_late(), the first such step ends the trials.
     """
     step, good, bad, best = first, MIN_STEP, math.inf, None
     for _ in range(MAX_TRIALS):
+        if best is not None and is_late():
+            break
         try:
             loss_db = loss_of(step)
         except DoesNotFitError:

@@ -4,7 +4,8 @@
 
 Trains `fast` for a fixed number of iterations on small stereo clips of synthetic tissue, on both eyes, and compares
 views 10 and 15 degrees off the axis and the right eye's views with the truth. Prints the rank correlations of
-lab/evaluate/truth.py. With --csv it also writes the reliability diagram: a row a clip, kind of view and bin of
+lab/evaluate/truth.py. With INTRASPLAT_DATA set, recordings follow, at their held-out frames (recorded_confidence.py).
+With --csv it also writes the reliability diagram: a row a clip, kind of view and bin of
 confidence, and the same as PNG beside it.
 
 --fit finds the constants of intrasplat/quality/trust.py and intrasplat/view/confidence.py anew: a logistic regression
@@ -36,7 +37,8 @@ from intrasplat.train.targets import TrainingFrames
 from intrasplat.view.camera import view_camera
 from intrasplat.view.confidence import LEAST_DISAGREEMENT, evidence, seen_from_endoscope
 from intrasplat.view.render import render_frame
-from lab.evaluate.ranking import rank_scores, reliability
+from lab.benchmarks.recorded_confidence import recorded_errors
+from lab.evaluate.ranking import PixelErrors, rank_scores, reliability
 from lab.evaluate.rows import commit, machine
 from lab.evaluate.sources import open_source, source_of
 from lab.evaluate.style import GREY, PANEL_INCHES, PNG_DPI, SETTINGS
@@ -79,10 +81,16 @@ def measured(motion: str) -> Iterator[dict[str, Any]]:
     candidate = SceneCandidate(run.scene)
     for views, expected in run.truth.expected.items():
         errors = errors_of([candidate.view(each.frame, each.pose) for each in expected], expected)
-        scores = rank_scores(errors, "rank")
-        print(f"{motion:10} {views:9}", *(f"{name} {value:.2f}" for name, value in scores.items()), flush=True)
-        for each in reliability(errors):
-            yield {"clip": f"phantom-{motion}", "views": views, **dataclasses.asdict(each)}
+        yield from rows_of(f"phantom-{motion}", views, errors)
+
+
+def rows_of(clip: str, views: str, errors: PixelErrors) -> list[dict[str, Any]]:
+    """A row a bin of confidence; prints the rank correlations and the expected calibration error."""
+    bins = reliability(errors)
+    off = sum(each.pixels * abs(each.confidence - each.right) for each in bins if each.pixels) / errors.confidence.size
+    scores = {**rank_scores(errors, "rank"), "calibration_error": off}
+    print(f"{clip:17} {views:14}", *(f"{name} {value:.2f}" for name, value in scores.items()), flush=True)
+    return [{"clip": clip, "views": views, **dataclasses.asdict(each)} for each in bins]
 
 
 def evidence_of(run: Trained, rng: np.random.Generator) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
@@ -162,6 +170,8 @@ def main() -> None:
         fit()
         return
     rows = [row for motion in MOTIONS for row in measured(motion)]
+    for clip, views, errors in recorded_errors():
+        rows += rows_of(clip, views, errors)
     if options.csv:
         with options.csv.open("w", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")

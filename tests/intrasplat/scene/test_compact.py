@@ -312,6 +312,19 @@ def quantized(scene: TrainedScene, frames: TrainingFrames, tolerance_db: float =
     return found and found.stored(scene)
 
 
+def test_late_shrinking_takes_the_first_step_within_the_tolerance() -> None:
+    run, _ = prepared(phantom_clip(), iterations=40)
+    trained(run)
+    scene, trials = scene_of(run), []
+    found = round_model(model_of(scene), scene, [run.frames], 0.5, on_step=lambda: trials.append(1), limit_s=0.0)
+    patient = round_model(model_of(scene), scene, [run.frames], 0.5)
+    assert found is not None
+    assert patient is not None
+    assert found.loss_db <= 0.5
+    assert found.step < patient.step
+    assert len(trials) == 3  # before the sensitivity, before the trials, and one trial
+
+
 def test_shrinking_keeps_its_tolerance_and_says_what_it_took() -> None:
     clip = phantom_clip()
     run, _ = prepared(clip, iterations=40)
