@@ -23,6 +23,7 @@ from lab.pages.programs import (
     service_sections,
     survival_sections,
 )
+from lab.pages.recordings import recording_sections
 from lab.pages.right_eye import two_eyes_sections
 from lab.pages.stability import MAP, stability_sections
 from lab.pages.stereo import stereo_sections
@@ -61,6 +62,7 @@ def main() -> None:
         *measure_sections(ROWS),
         *stability_sections(ROWS, PICTURES),
         *moving_sections(ROWS),
+        *recording_sections(ROWS),
         *stereo_sections(ROWS),
         *raster_sections(ROWS),
         *gpu_sections(ROWS),

@@ -18,12 +18,14 @@ an instrument. Columns in mm count pixels with a confidence of 0.5 or more.
 _CONFIDENCE = """
 ## Does confidence tell what is right
 
-Pixels of synthetic clips, by the confidence that the model reports: `right` is the share of them that is right. On the
+Pixels by the confidence that the model reports: `right` is the share of them that is right, in synthetic clips
+(chart) and at held-out frames of recordings (table, against the recorded picture and stereo depth). On the
 diagonal, confidence is a probability ([rank
 correlations](../decisions/views.md#confidence-is-the-probability-that-a-pixel-is-right)).
 
 ![Share of right pixels against confidence](confidence.png)
 """
+_RECORDED = ("confidence", "depth_right", "colour_right", "right")
 _MEASURE = """
 ## Are measured distances true
 
@@ -73,7 +75,16 @@ def confidence_sections(folder: Path, pictures: Path) -> list[str]:
     if not rows or not (pictures / CONFIDENCE_CHART).exists():
         return []
     command = f"python -m lab.benchmarks.bm_confidence --csv lab/rows/{CONFIDENCE}"
-    return [_CONFIDENCE, source(command, CONFIDENCE), origin(rows)]
+    cells = []
+    for clip, views in dict.fromkeys((row["clip"], row["views"]) for row in rows if "held-out" in row["views"]):
+        here = [row for row in rows if (row["clip"], row["views"]) == (clip, views) and int(row["pixels"])]
+        pixels = sum(int(row["pixels"]) for row in here)
+        means = (sum(int(row["pixels"]) * float(row[name]) for row in here) / pixels for name in _RECORDED)
+        cells.append([clip, views, *(f"{mean:.2f}" for mean in means)])
+    tables = (
+        [table(["recording", "views", "confidence", "depth right", "colour right", "both"], cells)] if cells else []
+    )
+    return [_CONFIDENCE, source(command, CONFIDENCE), *tables, origin(rows)]
 
 
 def measure_sections(folder: Path) -> list[str]:
