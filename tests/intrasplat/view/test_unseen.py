@@ -76,7 +76,7 @@ def stepped_clip() -> DepthClip:
 
 def test_a_pose_that_looks_past_a_depth_edge_sees_the_gap_as_unseen() -> None:
     clip, right_mm = stepped_clip(), 10.0
-    scene = scene_from(clip)
+    scene = scene_from(clip, iterations=150)
     pose = np.eye(4)
     pose[0, 3] = right_mm
     frame = render_frame(scene, 0.5, pose)
