@@ -39,21 +39,26 @@ def find_features(
     mask = None
     if where is not None:
         mask = cv2.resize(where.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    points, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=min_contrast).detectAndCompute(
-        grey, mask
-    )
+    sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=min_contrast)
+    points, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     return Features(np.array([point.pt for point in points], np.float64) / scale, descriptors)
 
 
-def matched(one: Features, other: Features) -> NDArray[np.intp]:
-    """Matches [M, 2], indices of the features in one and other, that pass the ratio test."""
+def matched(one: Features, other: Features, *, mutual: bool = False) -> NDArray[np.intp]:
+    """Matches [M, 2], indices of the features in one and other, that pass the ratio test.
+
+    mutual: each feature is also the best match of its best match.
+    """
     if not len(one.points) or len(other.points) < 2:
         return np.zeros((0, 2), np.intp)
-    pairs = [
-        (best.queryIdx, best.trainIdx)
-        for best, second in cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors, other.descriptors, k=2)
-        if best.distance < RATIO * second.distance
-    ]
-    return np.array(pairs, np.intp).reshape(-1, 2)
+    lengths = [np.square(each.descriptors).sum(1) for each in (one, other)]
+    apart = lengths[0][:, None] + lengths[1] - 2 * one.descriptors @ other.descriptors.T  # squared distances
+    rows, best = np.arange(len(apart)), apart.argmin(1)
+    second = np.partition(apart, 1, axis=1)[:, 1]
+    good = apart[rows, best] < RATIO**2 * second
+    if mutual:
+        good &= apart.argmin(0)[best] == rows
+    pairs: NDArray[np.intp] = np.stack([rows, best], axis=1)[good]
+    return pairs

@@ -48,7 +48,7 @@ def place_beside(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, i
         looks = sorted({*nearest[: MAX_LOOKS // 2].tolist(), *spread(range(len(used)), MAX_LOOKS // 2)})
         far = [(number, each) for number in looks if (each := frames.far_motion(used[number], index)) is not None]
         for number, motion in sorted(far, key=lambda each: -len(each[1].before))[:FAR_TRIED]:
-            link = frames.far_link(used[number], index, motion)
+            link, _ = frames.far_link(used[number], index, motion)
             found.append(_aligned(frames.camera, fit, number, link, expected, motion.motion))
     best = max(found, key=lambda each: each.share)
     if not len(expected):

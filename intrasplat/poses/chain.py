@@ -19,7 +19,6 @@ import numpy as np
 from intrasplat.clip import spread
 from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, exp, inverse, log
-from intrasplat.poses.wide import FarMotion
 
 KEY_OVERLAP = 0.6
 KEY_FRAMES = 16
@@ -74,9 +73,9 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
             flow = None
             link, share = linked(i, last)
         if share < MIN_OVERLAP and (far := frames.far_motion(keys[-1], i)) is not None:
-            far_link, motion, far_share = _far_link(frames, keys[-1], i, far)
-            if far_share > share:
-                link, share, poses[i] = far_link, far_share, poses[keys[-1]] @ inverse(motion)
+            far_link, aligned = frames.far_link(keys[-1], i, far)
+            if (far_share := far_link.agreeing(aligned.residual_px)) > share:
+                link, share, poses[i] = far_link, far_share, poses[keys[-1]] @ inverse(aligned.motion)
         on_progress(train.index(i) / (len(train) - 1))
         if share < MIN_AGREEING:
             keys.append(i)
@@ -100,13 +99,6 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
     return Chain(train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP])
 
 
-def _far_link(frames: Frames, a: int, b: int, far: FarMotion) -> tuple[FrameLink, Reals, float]:
-    """A link of far frames, the motion [4, 4] from a's camera axes to b's, and the share of a that agrees with it."""
-    link = frames.far_link(a, b, far)
-    aligned = align(frames.camera, link.before, link.after, link.trust, far.motion)
-    return link, aligned.motion, link.agreeing(aligned.residual_px)
-
-
 def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> list[FrameLink]:
     """Links between parts that show common tissue. The parts become one in parts, and in poses."""
     looks, links = dict[int, list[int]](), list[FrameLink]()
@@ -116,13 +108,13 @@ def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> 
     pairs = [(a, b) for one, other in combinations(looks.values(), 2) for a in one for b in other]
     found = {pair: far for pair in pairs if (far := frames.far_motion(*pair)) is not None}
     for a, b in sorted(found, key=lambda pair: -len(found[pair].before))[:MAX_LOOPS]:
-        link, motion, share = _far_link(frames, a, b, found[a, b])
-        if share < MIN_AGREEING:
+        link, aligned = frames.far_link(a, b, found[a, b])
+        if link.agreeing(aligned.residual_px) < MIN_AGREEING:
             continue
         links.append(link)
         one, other = (next(part for part in parts if each in part) for each in (a, b))
         if one is not other:
-            moved = poses[a] @ inverse(motion) @ inverse(poses[b])
+            moved = poses[a] @ inverse(aligned.motion) @ inverse(poses[b])
             poses.update({i: moved @ poses[i] for i in other})
             one += other
             parts.remove(other)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from intrasplat.clip import DepthClip
 from intrasplat.motion.lifted import cell_means
-from intrasplat.poses.rigid import Reals, StereoCamera, align
+from intrasplat.poses.rigid import Aligned, Reals, StereoCamera, align
 from intrasplat.poses.wide import FarMotion, Landmarks, far_motion, landmarks
 
 Floats = NDArray[np.float32]
@@ -135,18 +135,22 @@ class Frames:
                 self._landmarks[index] = landmarks(self._clip, index, self.camera, self._step)
         return far_motion(self.camera, self._landmarks[a], self._landmarks[b])
 
-    def far_link(self, a: int, b: int, far: FarMotion) -> FrameLink:
-        """Matches from frame a to frame b: of flow that starts from the motion, or of features if they find more."""
+    def far_link(self, a: int, b: int, far: FarMotion) -> tuple[FrameLink, Aligned]:
+        """Matches from frame a to frame b, and the motion that they give from a's camera axes to b's.
+
+        They are those of flow that starts from the features' motion, or the features' own if these agree on more.
+        """
         flow, in_view = self.predicted(a, far.motion)
         link = self.link(a, b, flow)
         aligned = align(self.camera, link.before, link.after, link.trust, far.motion)
         overlap = in_view * far.share
         if link.agreeing(aligned.residual_px) > min(overlap, FLOW_SUFFICES * in_view):
-            return link
+            return link, aligned
         columns, rows = self._matched(self.frame(a))
         cells = cKDTree(np.stack([columns, rows], axis=1)).query(far.before[:, :2])[1]
         trust = np.full(len(cells), FEATURE_TRUST)
-        return FrameLink(a, b, np.asarray(cells, np.intp), far.before, far.after, trust, overlap, flow)
+        link = FrameLink(a, b, np.asarray(cells, np.intp), far.before, far.after, trust, overlap, flow)
+        return link, align(self.camera, far.before, far.after, trust, far.motion)
 
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
-from intrasplat.clip.features import Features, find_features
+from intrasplat.clip.features import Features, find_features, matched
 from intrasplat.poses.rigid import Reals, StereoCamera, align
 
 WIDTH = 960
@@ -24,8 +23,6 @@ MIN_CONTRAST = 0.01
 MIN_CONFIDENCE = 128
 """Minimum confidence of a feature's depth, of 255."""
 HYPOTHESES = 400
-RATIO = 0.8
-"""Of a match's distance to that of the second best."""
 NEAR_PX = 2.0
 """A match agrees with a motion below this residual, px of the coarse grid: tissue deforms between far frames."""
 MIN_MATCHES, MIN_SHARE = 12, 0.4
@@ -76,7 +73,7 @@ def far_motion(camera: StereoCamera, one: Landmarks, other: Landmarks) -> FarMot
 
     None: the frames show no common tissue that could be matched.
     """
-    pairs = _matched(one.features, other.features)
+    pairs = matched(one.features, other.features, mutual=True)
     if len(pairs) < MIN_MATCHES:
         return None
     before, after = one.seen[pairs[:, 0]], other.seen[pairs[:, 1]]
@@ -94,22 +91,6 @@ def far_motion(camera: StereoCamera, one: Landmarks, other: Landmarks) -> FarMot
     if np.count_nonzero(agrees) < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
         return None
     return FarMotion(found.motion, before[agrees], after[agrees], float(agrees.sum() / len(pairs)))
-
-
-def _matched(one: Features, other: Features) -> NDArray[np.intp]:
-    """Matches [M, 2], indices of features that are each other's best and pass the ratio test."""
-    if min(len(one.points), len(other.points)) < 2:
-        return np.zeros((0, 2), np.intp)
-    apart = np.maximum(2 - 2 * one.descriptors @ other.descriptors.T, 0)  # squared distances of unit vectors
-    best = apart.argmin(1)
-    rows = np.arange(len(best))
-    nearest = apart[rows, best]
-    apart[rows, best] = np.inf
-    distinct = nearest < RATIO**2 * apart.min(1)
-    apart[rows, best] = nearest
-    mutual = apart.argmin(0)[best] == rows
-    pairs: NDArray[np.intp] = np.stack([rows, best], axis=1)[distinct & mutual]
-    return pairs
 
 
 def _hypotheses(points: Reals, there: Reals) -> Reals:
