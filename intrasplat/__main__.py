@@ -23,8 +23,8 @@ from intrasplat.machine.cores import keep_libraries_to_one_thread
 from intrasplat.server_parts import server_part
 
 LABORATORY_COMMAND = "phantom"
-LABORATORY = Path(__file__).resolve().parents[1] / "lab" / LABORATORY_COMMAND
 """Draws a synthetic clip. It is the laboratory's, which a checkout has and no installation."""
+LABORATORY = Path(__file__).resolve().parents[1] / "lab" / LABORATORY_COMMAND
 NO_SERVER = UnavailableError(
     "This command needs the server, which is not installed here.", "Install intrasplat-server."
 )

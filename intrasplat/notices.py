@@ -6,12 +6,15 @@ code.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
 
 from intrasplat.codes import known_code
+
+MAX_NAMED = 8
 
 
 class Severity(StrEnum):
@@ -139,3 +142,8 @@ class Notice(BaseModel):
     def warning(cls, code: NoticeCode, text: str) -> Notice:
         """A notice that gives a reason to distrust the result."""
         return cls(code=code, severity=Severity.WARNING, text=text)
+
+
+def named_frames(frames: Sequence[int]) -> str:
+    """The numbers of frames for a text, the first MAX_NAMED of them."""
+    return ", ".join(map(str, frames[:MAX_NAMED])) + ", ..." * (len(frames) > MAX_NAMED)

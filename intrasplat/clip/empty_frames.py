@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.sampling import Thumbnail
-from intrasplat.notices import Notice, NoticeCode
+from intrasplat.notices import Notice, NoticeCode, named_frames
 
 PATCH_PX = 4
 PATCH_CENTRES = slice(PATCH_PX // 2, None, PATCH_PX)
@@ -34,7 +34,6 @@ MIN_COMPARED = 5
 """Frames from which the usual change of a row is measured."""
 TORN_SHARE = 0.15
 """Least share of the picture's rows on either side of a tear."""
-MAX_NAMED = 8
 
 EMPTY_FRAME, FADE, EYE_LOST, COVERED, TORN = (
     "show nothing", "fade", "show nothing to one eye", "are covered by masks", "are torn",
@@ -57,8 +56,7 @@ class EmptyFrames:
         found = []
         for reason in dict.fromkeys(self.reasons.values()):
             frames = sorted(index for index, why in self.reasons.items() if why == reason)
-            named = ", ".join(str(index) for index in frames[:MAX_NAMED]) + (", ..." if len(frames) > MAX_NAMED else "")
-            text = f"frames that {reason} were left out: {named} ({len(frames)} of {frame_count:,})"
+            text = f"frames that {reason} were left out: {named_frames(frames)} ({len(frames)} of {frame_count:,})"
             if reason == COVERED:
                 found.append(Notice.warning(NoticeCode.FRAMES_WITHOUT_TISSUE, text))
             else:

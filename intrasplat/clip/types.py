@@ -142,6 +142,11 @@ class DepthClip(Eye):
         """The frames that are not in skipped, in order."""
         return sorted(set(range(self.frame_count)) - set(self.skipped))
 
+    @property
+    def frame_s(self) -> float:
+        """The median time in seconds from frame to frame."""
+        return float(np.median(np.diff(self.frame_times_s)))
+
     def moment(self, index: int) -> DepthClip:
         """A clip of one frame of both eyes, with views of this clip's arrays."""
         only = slice(index, index + 1)

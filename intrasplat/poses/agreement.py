@@ -40,7 +40,7 @@ FAR_PX = 20.0
 MAX_OFF_PX = 40.0
 """Limit of a match's residual."""
 MIN_APART_PX = 0.5
-"""Readings that put matches less far apart cannot be declared apart."""
+"""Readings that put matches less far apart cannot be distinguished."""
 MIN_SUPPORT = 0.7
 """A reading replaces the one declared if the matches lie this share of the way from the one's prediction to its own."""
 CONTRADICTED, LARGE = 0.4, 0.5
@@ -76,7 +76,7 @@ class Agreement:
     """What the pictures say about poses.
 
     convention   the reading that they support; the declared one where they support no other
-    determined   whether they tell readings apart; not if the camera hardly moves
+    determined   whether they distinguish readings; not if the camera hardly moves
     contradicts  whether they contradict the poses in every reading
     """
 

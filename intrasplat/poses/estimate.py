@@ -104,8 +104,7 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     if not chain.links:
         return _unknown(clip.frame_count)
     used = chain.frames
-    frame_s = float(np.median(np.diff(clip.frame_times_s)))
-    fit = fitted(frames.camera, chain, frame_s, lambda share: on_progress(CHAINING + FITTING * share))
+    fit = fitted(frames.camera, chain, clip.frame_s, lambda share: on_progress(CHAINING + FITTING * share))
     on_progress(CHAINING + FITTING)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics

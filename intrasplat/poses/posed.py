@@ -12,7 +12,7 @@ from intrasplat.clip import DepthClip, training_frames
 from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
-from intrasplat.notices import Notice, NoticeCode
+from intrasplat.notices import Notice, NoticeCode, named_frames
 from intrasplat.options import ReconstructionOptions
 from intrasplat.poses.brought import MIN_FRAMES, contradicted, with_checked_poses, with_stored_poses
 from intrasplat.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
@@ -27,7 +27,6 @@ if TYPE_CHECKING:  # imported when needed: a fixed camera needs none of it
 STAGE = "poses"
 WORTH = 0.7
 """Smoothed poses replace the given ones only if less than this share of the jitter remains."""
-MAX_NAMED = 8
 MAX_UNSURE = 0.5
 """With a larger share of unsure frames, the path is rejected."""
 
@@ -170,8 +169,7 @@ def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOp
 
 def _named(clip: DepthClip, found: FoundPath) -> str:
     """How many frames' pose is unreliable, and which."""
-    named = ", ".join(str(index) for index in found.unsure[:MAX_NAMED]) + ", ..." * (len(found.unsure) > MAX_NAMED)
-    return f"{len(found.unsure)} of {clip.frame_count} frames ({named})"
+    return f"{len(found.unsure)} of {clip.frame_count} frames ({named_frames(found.unsure)})"
 
 
 def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings: Notice) -> DepthClip:
@@ -188,7 +186,6 @@ def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings:
 
 def _report_entry(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:
     """A path's entry in the report."""
-    frame_s = float(np.median(np.diff(clip.frame_times_s)))
     return CameraPoses(
         source=source,
         path_mm=found.path_mm,
@@ -198,6 +195,6 @@ def _report_entry(clip: DepthClip, source: Literal["fixed", "estimated"], found:
         sigma_deg=found.sigma_deg,
         rigid_fit_mm=found.rigid_fit_mm,
         tissue_mm=found.tissue_mm,
-        tissue_period_s=None if found.period_frames is None else found.period_frames * frame_s,
+        tissue_period_s=None if found.period_frames is None else found.period_frames * clip.frame_s,
         unsure_frames=found.unsure,
     )
