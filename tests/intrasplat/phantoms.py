@@ -7,13 +7,16 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, FrameSplit, split_frames
-from intrasplat.machine.timing import Stopwatch
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.timing import Stopwatch, Timings
 from intrasplat.methods.method import Preset
 from intrasplat.methods.registry import PRESETS
 from intrasplat.options import ReconstructionOptions
 from intrasplat.outcome import scene_of
+from intrasplat.stereo import match_eyes
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from intrasplat.train.loop import train
 from intrasplat.train.prepare import prepare
@@ -49,6 +52,14 @@ def phantom_clip(
         period_frames=12.0,
     )
     return make_phantom(settings).depth_clip()
+
+
+def matched_stereo(settings: PhantomSettings) -> tuple[DepthClip, NDArray[np.float64]]:
+    """A stereo clip without poses, whose depth is stereo's, and its true poses [T, 4, 4], mm."""
+    phantom = make_phantom(settings)
+    drawn = phantom.stereo_recording()
+    clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
+    return clip, np.stack([phantom.world_from_camera(i) for i in range(settings.frames)])
 
 
 def prepared(

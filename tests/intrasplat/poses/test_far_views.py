@@ -18,8 +18,8 @@ from intrasplat.poses.estimate import find_path
 from intrasplat.poses.links import Frames
 from intrasplat.poses.rigid import Reals, inverse
 from intrasplat.poses.trajectory import trajectory_error
-from intrasplat.stereo import match_eyes
-from lab.phantom import CameraPath, PhantomSettings, make_phantom
+from lab.phantom import CameraPath, PhantomSettings
+from tests.intrasplat.phantoms import matched_stereo
 
 
 @cache
@@ -36,10 +36,7 @@ def clip_of(camera: CameraPath, frames: int, seed: int = 0, breath: float = 1e6)
         period_frames=breath,
         frame_rate_hz=0.6,
     )
-    phantom = make_phantom(settings)
-    drawn = phantom.stereo_recording()
-    clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
-    return clip, np.stack([phantom.world_from_camera(i) for i in range(frames)])
+    return matched_stereo(settings)
 
 
 def picked(clip: DepthClip, frames: list[int]) -> DepthClip:

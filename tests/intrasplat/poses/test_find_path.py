@@ -18,8 +18,8 @@ from intrasplat.poses import camera_rests, with_poses
 from intrasplat.poses.estimate import FoundPath, find_path
 from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import trajectory_error
-from intrasplat.stereo import match_eyes
 from lab.phantom import CameraPath, Motion, PhantomSettings, make_phantom
+from tests.intrasplat.phantoms import matched_stereo
 
 FRAMES = 24
 TRAIN = training_frames(FRAMES, "every8")
@@ -38,10 +38,7 @@ def clip_of(motion: Motion, *camera: CameraPath, period_frames: float = 12.0) ->
         period_frames=period_frames,
         frame_rate_hz=10.0,
     )
-    phantom = make_phantom(settings)
-    drawn = phantom.stereo_recording()
-    clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
-    return clip, np.stack([phantom.world_from_camera(i) for i in range(FRAMES)])
+    return matched_stereo(settings)
 
 
 @cache
