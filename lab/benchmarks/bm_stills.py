@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 import intrasplat as isp
 from intrasplat.poses.trajectory import trajectory_error
 from lab.evaluate.rows import commit, machine, write_rows
+from lab.evaluate.sources import DATA_VARIABLE, source_of
 from lab.phantom import Phantom, PhantomSettings, make_phantom
 
 FRAMES, EVERY_S, BREATH_S = 25, 1.7, 4.2
@@ -34,6 +35,8 @@ BULGE, SHIFT_PX = 0.06, 7.0
 is moved, in opposite directions for the two eyes."""
 MARGIN_PX = 4
 """Around the field of view, for the motion of the tissue and of the right eye."""
+STAGES = ("poses_s", "finish_s", "shrink_s", "t_post_s")
+"""Frames in memory are placed before the clock of the report starts: they have no poses_s."""
 FIELDS = (
     "clip", "ate_mm", "ate_deg", "sigma_mm", "lost", "psnr_tissue_db", "psnr_right_db", "blend_db", "train_db",
     "gaussians", "outside_field", "poses_s", "finish_s", "shrink_s", "t_post_s", "machine", "commit",
@@ -51,13 +54,11 @@ def main() -> None:
     rows = []
     for seed in options.seeds:
         frames, true = stills(seed)
-        rows.append({"clip": f"stills:seed{seed}", **measured(frames, options.budget_s, true)})
-        print("  ".join(f"{each} {rows[-1].get(each, '')}" for each in FIELDS[:-2]), flush=True)
-    if folder := os.environ.get("INTRASPLAT_DATA"):
-        recording = Path(folder, "hamlyn20")
-        frames = isp.read_clip(recording / "clip", calibration=recording / "calibration.json")
-        rows.append({"clip": "hamlyn20", **measured(frames, 20.0, None)})
-        print("  ".join(f"{each} {rows[-1].get(each, '')}" for each in FIELDS[:-2]), flush=True)
+        rows.append(measured(f"stills:seed{seed}", frames, options.budget_s, true))
+    if os.environ.get(DATA_VARIABLE):
+        recording = source_of("hamlyn20")
+        frames = isp.read_clip(recording.clip, calibration=recording.files["calibration"])
+        rows.append(measured(recording.name, frames, 20.0, None))
     write_rows(options.out, FIELDS, [row | {"machine": machine(), "commit": commit()} for row in rows])
 
 
@@ -107,14 +108,15 @@ def bordered(rgb: Rgb, side: int) -> Rgb:
     return np.where(cv2.erode(seen.astype(np.uint8), np.ones((3, 3)))[..., None] > 0, rgb, np.uint8(0))
 
 
-def measured(recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | None) -> dict[str, Any]:
-    """A row."""
+def measured(name: str, recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | None) -> dict[str, Any]:
+    """A row, which it prints."""
     scene = isp.reconstruct(recording, method="fast", budget_s=budget_s)
     report = scene.report
     poses, seconds = report.poses, report.seconds
     assert poses is not None
     field = recording.with_depth().field_of_view
     row: dict[str, Any] = {
+        "clip": name,
         "sigma_mm": poses.sigma_mm and round(poses.sigma_mm, 2),
         "lost": len(poses.unsure_frames),
         "psnr_tissue_db": round(report.psnr_tissue_db or 0.0, 2),
@@ -123,13 +125,14 @@ def measured(recording: isp.Clip, budget_s: float, true: NDArray[np.float64] | N
         "train_db": round(report.train_psnr_tissue_db or 0.0, 2),
         "gaussians": report.gaussians,
         "outside_field": 0.0 if field is None else round(outside(scene, field), 4),
-        **{name: round(seconds.get(name, 0.0), 1) for name in ("poses_s", "finish_s", "shrink_s", "t_post_s")},
+        **{name: round(seconds[name], 1) for name in STAGES if name in seconds},
     }
     if true is not None:
         found = scene.world_from_camera
         placed = [i for i in range(len(true)) if i not in poses.unsure_frames]
         error = trajectory_error(found[placed], true[placed])
         row |= {"ate_mm": round(error.mm, 2), "ate_deg": round(error.deg, 2)}
+    print("  ".join(f"{each} {row.get(each, '')}" for each in FIELDS[:-2]), flush=True)
     return row
 
 

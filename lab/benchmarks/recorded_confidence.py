@@ -8,18 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 import intrasplat as isp
 from lab.evaluate.ranking import PixelErrors, pixel_errors, together
+from lab.evaluate.sources import DATA_VARIABLE, source_of
 
-RECORDINGS = {
-    "d4d-a-stereo": ("d4d_stereo/stereo_sbs.mp4", "d4d_stereo/calibration.json", "d4d_stereo/tool_masks.zip"),
-    "hamlyn20": ("hamlyn20/clip", "hamlyn20/calibration.json", None),
-}
-"""Clip, calibration and masks in the folder that INTRASPLAT_DATA names."""
+RECORDINGS = ("d4d_stereo", "hamlyn20")
 ITERATIONS = 300
 MIN_CONFIDENCE = 128
 """Minimum confidence of stereo depth, of 255, that counts as the truth."""
@@ -27,10 +23,8 @@ MIN_CONFIDENCE = 128
 
 def recorded_errors() -> Iterator[tuple[str, str, PixelErrors]]:
     """The recording, the eye, and the errors of its views, of each recording that is at hand."""
-    folder = os.environ.get("INTRASPLAT_DATA")
-    for name, (clip, calibration, masks) in RECORDINGS.items() if folder else ():
-        files = Path(folder or "")
-        recording = isp.read_clip(files / clip, calibration=files / calibration, masks=masks and files / masks)
+    for source in map(source_of, RECORDINGS if os.environ.get(DATA_VARIABLE) else ()):
+        recording = isp.read_clip(source.clip, calibration=source.files["calibration"], masks=source.files.get("masks"))
         matched = recording.with_depth(holdout="every8")
         scene = isp.reconstruct(matched, method="fast", iterations=ITERATIONS, holdout="every8")
         frames = [frame.frame for frame in scene.report.frames]
@@ -44,4 +38,4 @@ def recorded_errors() -> Iterator[tuple[str, str, PixelErrors]]:
                 judged = eye.tissue[index] & (eye.depth_confidence[index] >= MIN_CONFIDENCE)
                 depths_mm = (view.depth_mm, eye.depth_mm[index])
                 found.append(pixel_errors(view.confidence, (shown, true), depths_mm, judged))
-            yield name, views, together(found)
+            yield source.name, views, together(found)

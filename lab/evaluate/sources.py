@@ -11,7 +11,7 @@ phantom:MOTION[:...]:nomasks                without masks of the instruments
 phantom:MOTION[:...]:stereo                 the same tissue as a stereo clip: both eyes without loss, their calibration
                                             and the left eye's masks, rectified and matched as a user's clip is; it has
                                             no poses
-d4d_endonerf[:WxH], d4d_stereo              the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a.
+d4d_endonerf[:WxH], d4d_stereo, hamlyn20    the recordings in the folder INTRASPLAT_DATA names; rows call them d4d-a.
                                             WxH, of a clip with depth: shrunk by a whole number to this size
 """
 
@@ -47,6 +47,7 @@ PHANTOM_SPELLING = "phantom:MOTION[+PATH...][:WxH][:FRAMESframes][:seedN][:TOOL[
 RECORDINGS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
     "d4d_endonerf": ("d4d-a", "d4d_endonerf", {}),
     "d4d_stereo": ("d4d-a-stereo", "d4d_stereo/stereo_sbs.mp4", _STEREO),
+    "hamlyn20": ("hamlyn20", "hamlyn20/clip", {"calibration": "calibration.json"}),
 }
 """By argument: the name in rows, the file, and the files beside it that `reconstruct` needs. Rows never give a
 patient's recording its own name."""

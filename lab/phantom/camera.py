@@ -22,8 +22,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from intrasplat.poses.pose_file import read_tum
+from intrasplat.poses.trajectory import from_first
 from lab.phantom.settings import CAMERA_PATHS, FOCAL_PER_WIDTH, MEAN_DEPTH_MM, CameraPath, PhantomSettings
 
 SWING_DEG = (4.0, 2.5)  # yaw and pitch
@@ -143,11 +144,7 @@ def _shake(frame: float, settings: PhantomSettings) -> Pose:
 @cache
 def _recorded(path: Path) -> Pose:
     """The poses [lines, 4, 4] of a TUM file, from the first one."""
-    rows = np.loadtxt(path)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
-    poses[:, :3, 3] = 1000 * rows[:, 1:4]
-    return np.asarray(np.linalg.inv(poses[0]) @ poses)
+    return from_first(read_tum(path)[1])
 
 
 def _done(frame: float, settings: PhantomSettings) -> float:
