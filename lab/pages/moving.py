@@ -17,6 +17,7 @@ _PATHS = """
 Stereo clips of 320x256 without poses; each row is the median over clips of one camera motion ([how paths are
 found](../decisions/camera-path.md)). Error: the absolute trajectory error of the estimated path; `d4d_stereo` has a
 camera at rest. Clips of 64 frames: the same with `--frames 64 --motions breathing --paths pan advance shake --seeds 1`.
+`p1_...`: paths of a robot, `--frames 150 --motions breathing --paths p1_00240 p1_06768 p1_07344 p1_16608`.
 """
 _NOISY = """
 ### Given poses that jump

@@ -21,7 +21,8 @@ _CONFIDENCE = """
 Pixels by the confidence that the model reports: `right` is the share of them that is right, in synthetic clips
 (chart) and at held-out frames of recordings (table, against the recorded picture and stereo depth). On the
 diagonal, confidence is a probability ([rank
-correlations](../decisions/views.md#confidence-is-the-probability-that-a-pixel-is-right)).
+correlations](../decisions/views.md#confidence-is-the-probability-that-a-pixel-is-right)); between stills
+(`hamlyn20`) it is not.
 
 ![Share of right pixels against confidence](confidence.png)
 """
