@@ -69,7 +69,7 @@ def test_one_trace_leads_from_a_request_through_the_queue_and_every_stage_of_the
             job_id = sent.json()["id"]
             client.wait(job_id)
             view = httpx.get(f"{client.url}/render", params={"scene": job_id, "t": "0.25", "width": "64"}).headers
-            collector.wait_for("score", "encode")
+            collector.wait_for("score", "encode", "GET /render", "attempt")
     spans = collector.spans
     of_job = [each for each in spans if each.trace_id == CALLERS_TRACE]
     (request,) = [each for each in of_job if each.name == "POST /reconstruct"]
