@@ -66,6 +66,9 @@ def _add_submit(commands: Commands) -> None:
     parser.add_argument(
         "--masks", type=Path, metavar="F", help="zip of PNGs or a video: the instruments, of the left eye or of both"
     )
+    parser.add_argument(
+        "--fov-mask", type=Path, metavar="F", help="PNG of the field of view, white inside: of the left eye, or of both"
+    )
     parser.add_argument("--poses-file", type=Path, metavar="F", help="the camera's poses: TUM, or a matrix a frame")
     source.add_argument(
         "--clip-of",
@@ -166,6 +169,7 @@ def _submit(options: argparse.Namespace) -> int:
                 calibration=options.calibration,
                 masks=options.masks,
                 poses_file=options.poses_file,
+                fov_mask=options.fov_mask,
                 label=options.label,
                 metadata=dict(options.metadata or ()),
                 callback_url=options.callback_url,

@@ -194,7 +194,7 @@ def open_with_poses(request: ReconstructionRequest, hooks: Hooks, timings: Timin
             hooks.report_stage("compile", 0.0)
             timings.add("compile_s", examine(device))
 
-    paths = ClipPaths(request.clip, request.right, request.calibration, request.masks)
+    paths = ClipPaths(request.clip, request.right, request.calibration, request.masks, request.fov_mask)
     clip = open_with_depth(
         paths,
         request.options,

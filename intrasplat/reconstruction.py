@@ -283,7 +283,7 @@ def reconstruct(
     if isinstance(source, ClipPaths):
         request = dataclasses.replace(
             request, clip=source.clip, right=source.right, calibration=source.calibration, masks=source.masks,
-            segmenter=segmenter, poses=poses,
+            fov_mask=source.fov_mask, segmenter=segmenter, poses=poses,
         )  # fmt: skip
     elif isinstance(source, DepthClip):
         request = dataclasses.replace(request, clip=source, segmenter=segmenter, poses=poses)

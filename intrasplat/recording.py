@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip
 from intrasplat.clip.calibration import load_calibration
+from intrasplat.clip.given_field import Mask, read_field, with_field
 from intrasplat.clip.video import FALLBACK_RATE_HZ
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.fit import fitted
@@ -117,6 +118,7 @@ class Clip:
             right=paths.right,
             calibration=paths.calibration,
             masks=paths.masks,
+            fov_mask=paths.fov_mask,
             options=chosen,
             segmenter=self.segmenter,
             poses=self.poses,
@@ -130,6 +132,7 @@ def read_clip(
     *,
     calibration: FilePath | Mapping[str, Any] | None = None,
     masks: FilePath | NDArray[np.bool_] | None = None,
+    fov_mask: FilePath | NDArray[np.bool_] | None = None,
     depth_mm: NDArray[np.floating[Any]] | None = None,
     poses: FilePath | NDArray[np.floating[Any]] | None = None,
     intrinsics: Intrinsics | None = None,
@@ -149,6 +152,9 @@ def read_clip(
         right: the right eye, likewise.
         calibration: of both eyes, a file or the values of our JSON (docs/input.md). Needed for stereo frames.
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
+        fov_mask: PNG, white where the left eye shows the scene; or [H, W] bool, True there; as recorded, before
+            rectification. Both eyes may be packed side by side; else the right eye's field is found. None: both are
+            found. It does not go with fov="all".
         depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
         poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; or a file of them (docs/conventions.md). None: with
             depth_mm the camera is fixed, else its path is found. Poses are checked against the pictures.
@@ -176,6 +182,7 @@ def read_clip(
         },
     )
     network = _existing(segmenter, "segmenter")
+    field_of_view = _field(fov_mask)
     if isinstance(source, np.ndarray):
         times_s = _times_s(frame_times_s, source)
         if depth_mm is not None:
@@ -183,11 +190,15 @@ def read_clip(
             _refuse("calibration", calibration, "frames with depth_mm have intrinsics", "Give intrinsics instead.")
             array = poses if isinstance(poses, np.ndarray) else None
             clip = _depth_clip(source, depth_mm, masks, array, intrinsics, times_s)
+            clip = clip if field_of_view is None else with_field(clip, _mask(field_of_view))
             if poses is None or array is not None:
                 return Clip(clip, chosen, network)
             return Clip(replace(clip, poses=None), chosen, network, _stored(poses))
         _refuse("intrinsics", intrinsics, "the cameras of a stereo clip are in its calibration", "Leave them out.")
-        return Clip(_stereo_frames(source, right, calibration, masks, times_s), chosen, network, _stored(poses))
+        frames = _stereo_frames(source, right, calibration, masks, times_s)
+        if field_of_view is not None:
+            frames = replace(frames, clip=with_field(frames.clip, _mask(field_of_view)))
+        return Clip(frames, chosen, network, _stored(poses))
     in_memory = {"depth_mm": depth_mm, "intrinsics": intrinsics, "frame_times_s": frame_times_s}
     for name, value in in_memory.items():
         _refuse(name, value, "it goes with frames in memory alone", "Leave it out; files bring their own.")
@@ -198,7 +209,7 @@ def read_clip(
         raise InputError("calibration", "it is a mapping, but the clip is a file.", "Give the calibration's file.")
     paths = ClipPaths(
         _path(source, "source"), _existing(right, "right"), _existing(calibration, "calibration"),
-        _existing(masks, "masks"),
+        _existing(masks, "masks"), field_of_view,
     )  # fmt: skip
     return Clip(paths, chosen, network, _stored(poses))
 
@@ -207,6 +218,18 @@ def _stored(poses: FilePath | NDArray[Any] | None) -> Path | StoredPoses | None:
     if not isinstance(poses, np.ndarray):
         return _existing(poses, "poses")
     return StoredPoses(rigid(poses, "poses"), None, "poses", Convention())
+
+
+def _field(fov_mask: FilePath | NDArray[np.bool_] | None) -> Path | Mask | None:
+    if not isinstance(fov_mask, np.ndarray):
+        return _existing(fov_mask, "fov_mask")
+    if fov_mask.dtype != np.bool_ or fov_mask.ndim != 2:
+        raise _shape_error("fov_mask", fov_mask, "[H, W] bool, True where the picture shows the scene")
+    return fov_mask
+
+
+def _mask(fov_mask: Path | Mask) -> Mask:
+    return read_field(fov_mask, ClipLimits()) if isinstance(fov_mask, Path) else fov_mask
 
 
 def _path(path: FilePath, field: str) -> Path:

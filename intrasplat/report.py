@@ -108,7 +108,9 @@ class FieldOfView(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    source: Literal["found", "all"] = Field(description="found in the pictures; all: the whole picture, as asked")
+    source: Literal["found", "given", "all"] = Field(
+        description="found in the pictures; given: the left eye's by the caller; all: the whole picture, as asked"
+    )
     share: float = Field(ge=0, le=1, description="share of the left eye's picture")
     shape: FieldShape = Field(description="whole: nothing of the picture was left out")
     right_share: float | None = Field(default=None, ge=0, le=1, description="share of the right eye's; None: one eye")

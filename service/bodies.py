@@ -24,11 +24,12 @@ ABOUT = {
     "calibration": "of the cameras",
     "masks": "where instruments are",
     "poses_file": "the camera's poses: TUM, or a matrix a frame",
+    "fov_mask": "the field of view, white inside: of the left eye, or of both side by side",
 }
 CLIP_OF_ID = {
     "type": "string",
     "pattern": JOB_ID_PATTERN,
-    "description": "a job whose clip is used again, with its calibration, masks and poses unless others are sent",
+    "description": "a job whose clip is used again, with its other files unless others are sent",
 }
 CALLBACK_URL = {
     "type": "string",

@@ -23,7 +23,7 @@ from intrasplat.intake.calibration.opencv import look_at_calibration
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.intake.fit import STEREO_VIDEOS, calibration_missing
 from intrasplat.intake.limits import ClipLimits
-from intrasplat.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_head
+from intrasplat.intake.sniff import ZIP_SUFFIX, check_calibration_file, check_field_head, check_head
 from intrasplat.options import JobOptions, parse_options
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
@@ -94,7 +94,9 @@ def _of_file(part: str, file: DescribedFile) -> Iterator[Finding]:
     head = bytes.fromhex(file.head)
     if part in ("calibration", "poses_file") or not head:
         return
-    if file.suffix.lower() != ZIP_SUFFIX:
+    if part == "fov_mask":
+        yield from _found(FindingCode.KIND, lambda: check_field_head(head, part, "the file"))
+    elif file.suffix.lower() != ZIP_SUFFIX:
         yield from _found(FindingCode.KIND, lambda: check_head(head, file.suffix, part, "the file"))
     elif not head.startswith(b"PK"):
         yield _finding(part, FindingCode.KIND, "the file is not a zip.", "Zip the files again.", refused=False)

@@ -74,6 +74,7 @@ class Submission(BaseModel):
     calibration: str | None = None
     masks: str | None = None
     poses_file: str | None = None
+    fov_mask: str | None = None
     clip_of: str | None = None
     label: str | None = None
     metadata: dict[str, object] | None = None

@@ -35,7 +35,8 @@ MAX_OPEN_UPLOADS = 100
 
 REST_REMEDY = "Ask for the offset (HEAD) and send the bytes that follow."
 METADATA_REMEDY = (
-    "Send `part` (clip, left, right, calibration, masks or poses_file) and `suffix` (.mp4), each value in base64."
+    "Send `part` (clip, left, right, calibration, masks, poses_file or fov_mask) and `suffix` (.mp4), each value in "
+    "base64."
 )
 
 

@@ -18,7 +18,7 @@ from contract.wire.job import JobFiles
 from contract.wire.labels import LABEL_FIELD, METADATA_FIELD, Labels, parse_labels
 from contract.wire.webhooks import CALLBACK_PART
 from intrasplat.errors import InputError, LimitError
-from intrasplat.intake.limits import MAX_CALIBRATION_BYTES, MAX_POSE_FILE_BYTES
+from intrasplat.intake.limits import MAX_CALIBRATION_BYTES, MAX_FOV_MASK_BYTES, MAX_POSE_FILE_BYTES
 from service.problems import Problem, disk_full_for_upload
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".zip")
@@ -29,6 +29,7 @@ SUFFIXES = {
     "calibration": (".json", ".yaml", ".yml", ".xml", ".ini"),
     "masks": CLIP_SUFFIXES,
     "poses_file": (".tum", ".txt", ".csv", ".json"),
+    "fov_mask": (".png",),
 }
 """File parts and their allowed endings. Only the ending of the caller's file name is stored."""
 
@@ -49,13 +50,14 @@ MAX_BYTES = {
     METADATA_FIELD: MAX_OPTIONS_BYTES,
     "calibration": MAX_CALIBRATION_BYTES,
     "poses_file": MAX_POSE_FILE_BYTES,
+    "fov_mask": MAX_FOV_MASK_BYTES,
 }
 """Maximum bytes of the small parts."""
 LIMIT_REMEDY = "Send a shorter clip, or raise INTRASPLAT_MAX_UPLOAD_BYTES."
 MAX_HEADER_BYTES = 8 * 1024
 FORM_REMEDY = (
     "Send multipart/form-data with clip, or left and right, or clip_of, and optionally calibration, masks, poses_file, "
-    "options, label, metadata and callback_url; "
+    "fov_mask, options, label, metadata and callback_url; "
     'options is JSON, such as {"budget_s": 20}, and clip_of the id of a job whose clip is used again.'
 )
 
@@ -135,6 +137,7 @@ class Received:
             calibration=self.names.get("calibration"),
             masks=self.names.get("masks"),
             poses_file=self.names.get("poses_file"),
+            fov_mask=self.names.get("fov_mask"),
         )
 
     def sha256(self) -> str:

@@ -274,13 +274,17 @@ class _Reporter:
 def request_of(
     record: JobRecord, spool: Path, device: str, limits: ClipLimits | None = None, segmenter: Path | None = None
 ) -> ReconstructionRequest:
-    """The reconstruction request of a job, with its files in the folder `spool`."""
+    """The reconstruction request of a job, with its files in the folder `spool`.
+
+    With fov "all" the field of view that came with an earlier job of the same clip is left out.
+    """
     files = record.files
     return ReconstructionRequest(
         clip=spool / files.clip,
         right=spool / files.right if files.right else None,
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
+        fov_mask=spool / files.fov_mask if files.fov_mask and record.options.fov != "all" else None,
         poses=spool / files.poses_file if files.poses_file else None,
         segmenter=segmenter,
         options=record.options,

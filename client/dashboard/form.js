@@ -8,8 +8,10 @@ import { carriedFrom, limit, nameChoices, OPTIONS, optionsOf } from "./options.j
 import { showProblem } from "./problem.js";
 import { interrupted, isSame, planOf, Sending } from "./sending.js";
 
-const PARTS = ["clip", "right", "calibration", "masks"];
+const PARTS = ["clip", "right", "calibration", "masks", "poses_file", "fov_mask"];
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
+const POSES = /\.(tum|txt|csv)$|(^|[^a-z])poses?[^a-z].*json$/i;
+const PICTURE = /\.png$/i;
 const UNAUTHORISED = 401;
 
 /**
@@ -20,7 +22,9 @@ const UNAUTHORISED = 401;
 function partsOf(files) {
   const parts = new Map();
   for (const file of files) {
-    if (CALIBRATION.test(file.name)) parts.set("calibration", file);
+    if (POSES.test(file.name)) parts.set("poses_file", file);
+    else if (PICTURE.test(file.name)) parts.set("fov_mask", file);
+    else if (CALIBRATION.test(file.name)) parts.set("calibration", file);
     else if (/mask/i.test(file.name)) parts.set("masks", file);
     else if (/right/i.test(file.name)) parts.set("right", file);
     else parts.set(parts.has("clip") ? "right" : "clip", file);
@@ -107,10 +111,12 @@ export class ClipForm {
     for (const part of PARTS) {
       const label = this.form.elements[part].closest("label");
       label.hidden = !asked.includes(part);
-      const group = label.closest("details");
-      group?.classList.toggle("asked", !label.hidden);
-      if (group && this.resumed && !label.hidden) group.open = true;
     }
+    const inGroup = PARTS.filter((part) => this.form.elements[part].closest("details"));
+    const group = this.form.querySelector("details");
+    const isAsked = inGroup.some((part) => asked.includes(part));
+    group.classList.toggle("asked", isAsked);
+    if (this.resumed && isAsked) group.open = true;
     this.form.classList.toggle("resumed", this.resumed !== null);
     clip.required = asked.includes("clip");
     this.again.hidden = this.earlier === null && this.resumed === null;

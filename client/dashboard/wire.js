@@ -49,7 +49,7 @@
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
- *   source: "found"|"all",
+ *   source: "found"|"given"|"all",
  *   share: number,
  *   shape: "whole"|"round"|"rectangular"|"other",
  *   right_share?: number | null,

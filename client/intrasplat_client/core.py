@@ -48,6 +48,7 @@ class Core:
         calibration: Path | None = None,
         masks: Path | None = None,
         poses_file: Path | None = None,
+        fov_mask: Path | None = None,
         label: str | None = None,
         metadata: Mapping[str, str] | None = None,
         callback_url: str | None = None,
@@ -58,9 +59,10 @@ class Core:
     ) -> JobView:
         """Upload a clip and get its queued job; `right` is the right eye's file, if there are two.
 
-        `clip_of`, instead of a clip, is the id of a job or scene whose clip is used again, with its calibration, masks
-        and poses unless others are given here: so better masks need no second upload of the clip.
+        `clip_of`, instead of a clip, is the id of a job or scene whose clip is used again, with its other files unless
+        others are given here: so better masks need no second upload of the clip.
         `poses_file` holds the camera's poses: TUM, or a matrix a frame as JSON or text.
+        `fov_mask` is a PNG of the field of view, white inside, of the recorded left eye or of both eyes side by side.
         A large clip is sent in pieces, and its upload resumes where a lost connection cut it off; `in_pieces` forces
         or forbids that. on_upload(sent_bytes, total_bytes) is called while the clip is sent. The same idempotency_key
         with the same clip and options always yields the same job, also later and from another process.
@@ -72,7 +74,7 @@ class Core:
             InputError: a file cannot be read, there is no clip or both clip and clip_of, or an option cannot be used;
                 nothing was sent.
         """
-        others = {"calibration": calibration, "masks": masks, "poses_file": poses_file}
+        others = {"calibration": calibration, "masks": masks, "poses_file": poses_file, "fov_mask": fov_mask}
         prepared = submission.prepare(
             clip,
             right,

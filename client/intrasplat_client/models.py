@@ -253,7 +253,7 @@ class FieldOfView(Model):
     """The part of the pictures that shows the scene. Outside it the model has nothing (docs/conventions.md)."""
 
     source: str
-    """found in the pictures; all: the whole picture, as asked"""
+    """found in the pictures; given: the left eye's by the caller; all: the whole picture, as asked"""
     share: float
     """share of the left eye's picture"""
     shape: str

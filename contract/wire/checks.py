@@ -76,10 +76,11 @@ class DescribedClip(BaseModel):
     calibration: DescribedFile | None = None
     masks: DescribedFile | None = None
     poses_file: DescribedFile | None = None
+    fov_mask: DescribedFile | None = None
     clip_of: str | None = Field(default=None, max_length=64)
     options: dict[str, object] = Field(default={})
 
     def files(self) -> dict[str, DescribedFile]:
         """Those that are there, by part."""
-        parts = ("clip", "left", "right", "calibration", "masks", "poses_file")
+        parts = ("clip", "left", "right", "calibration", "masks", "poses_file", "fov_mask")
         return {part: getattr(self, part) for part in parts if getattr(self, part) is not None}

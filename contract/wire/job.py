@@ -69,7 +69,7 @@ class JobFiles(BaseModel):
     """File names inside the job's spool folder, made by the service (`clip.mp4`), never the caller's.
 
     clip: of an imported scene, its archive.
-    poses_file: left out of JSON if there is none, because workers of older versions do not know it.
+    poses_file, fov_mask: left out of JSON if there is none, because workers of older versions do not know them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -79,6 +79,7 @@ class JobFiles(BaseModel):
     calibration: str | None = None
     masks: str | None = None
     poses_file: str | None = Field(default=None, exclude_if=lambda name: name is None)
+    fov_mask: str | None = Field(default=None, exclude_if=lambda name: name is None)
 
 
 class JobProgress(BaseModel):

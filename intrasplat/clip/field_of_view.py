@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from intrasplat.clip.sampling import Mapping
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import RgbFrame
+from intrasplat.intake.fit import check_not_all
 from intrasplat.machine.mapped import let_go
 from intrasplat.names import Fov
 from intrasplat.notices import Notice, NoticeCode
@@ -71,36 +72,49 @@ class Fields:
         """The assumption for the report, where something of the pictures is left out."""
         if self.left is None and self.right is None:
             return ()
-        text = f"field of view: {self.entry.shape}, {self.entry.share:.1%} of the picture"
+        given = "as given, " if self.entry.source == "given" else ""
+        text = f"field of view: {given}{self.entry.shape}, {self.entry.share:.1%} of the picture"
         text += "" if self.entry.right_share is None else f" ({self.entry.right_share:.1%} of the right eye's)"
         text += f", {self.entry.label_share:.1%} of it under labels" if self.entry.label_share else ""
         return (Notice.info(NoticeCode.FIELD_OF_VIEW, f"{text}; nothing is modelled outside"),)
 
 
-def find_fields(eyes: Sequence[NDArray[np.uint8]], frames: Sequence[int], fov: Fov, mapping: Mapping = map) -> Fields:
+def find_fields(
+    eyes: Sequence[NDArray[np.uint8]],
+    frames: Sequence[int],
+    fov: Fov,
+    mapping: Mapping = map,
+    given: Sequence[Mask] = (),
+) -> Fields:
     """The fields of view of a clip's eyes, one or two.
 
     Args:
         eyes: [T, H, W, 3] of each eye.
         frames: those that show something and are not held out.
         mapping: a replacement of map(), such as a thread pool's.
+        given: [H, W] of the eyes whose field the caller gave, from the left one on; it stays as it is, labels included.
+
+    Raises:
+        InputError: a field is given, and fov is "all".
     """
+    if given:
+        check_not_all(fov)
     if fov == "all":
         right_share = 1.0 if len(eyes) > 1 else None
         return Fields(None, None, FieldOfView(source="all", share=1, shape="whole", right_share=right_share))
     chosen = spread(frames, SAMPLED)
-    found = list(mapping(lambda eye: find_field(_released(eye, chosen)), eyes))
+    found = [*given, *mapping(lambda eye: find_field(_released(eye, chosen)), eyes[len(given) :])]
     shape = shape_of(found[0])
     label_share = 0.0
-    if len(eyes) > 1:
+    if len(given) < len(eyes) > 1:
         pairs = ([eye[index] for eye in eyes] for index in spread(chosen, COMPARED))
         labels = mapping(lambda pair: find_labels(pair[0], pair[1], found[0] & found[1]), pairs)
         label = np.logical_and.reduce(list(labels))
         label_share = float(label.mean())
-        found = [field & ~label for field in found]
+        found[len(given) :] = [field & ~label for field in found[len(given) :]]
     shares = [float(field.mean()) for field in found]
     entry = FieldOfView(
-        source="found",
+        source="given" if given else "found",
         share=shares[0],
         shape=shape,
         right_share=shares[1] if len(eyes) > 1 else None,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.empty_frames import EmptyFrames, find_empty
-from intrasplat.clip.field_of_view import Fields, find_fields
+from intrasplat.clip.field_of_view import Fields, Mask, find_fields
 from intrasplat.clip.sampling import Mapping, Thumbnail, sampled, thumbnail
 from intrasplat.clip.split import training_frames
 from intrasplat.clip.types import DepthClip
@@ -22,21 +22,25 @@ from intrasplat.options import ReconstructionOptions
 def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthClip:
     """A clip with depth of one eye, without tissue outside the field of view, and with its skipped frames.
 
+    The clip's own field of view is taken as given; None: it is found.
+
     Raises:
-        InputError: no frame shows anything.
+        InputError: no frame shows anything, or a field is given and options.fov is "all".
     """
     thumbnails = [[thumbnail(rgb) for rgb in clip.rgb]]
     shares = [float(tissue.mean()) for tissue in clip.tissue]
     train = training_frames(clip.frame_count, options.holdout)
-    fields, empty = find_shown([clip.rgb], thumbnails, train, options.fov, shares)
+    given = () if clip.field_of_view is None else (clip.field_of_view,)
+    fields, empty = find_shown([clip.rgb], thumbnails, train, options.fov, shares, given=given)
     if fields.left is not None:
         inside = mapped_zeros(clip.tissue.shape, np.bool_)
         for index, tissue in enumerate(clip.tissue):
             np.logical_and(tissue, fields.left, out=inside[index])
             let_go(inside[index])
-        clip = replace(clip, tissue=inside, field_of_view=fields.left)
+        clip = replace(clip, tissue=inside)
     clip = replace(
         clip,
+        field_of_view=fields.left,
         fov=fields.entry,
         assumptions=(*clip.assumptions, *fields.notices),
         warnings=(*clip.warnings, *empty.notices(clip.frame_count)),
@@ -51,6 +55,7 @@ def find_shown(
     fov: Fov,
     tissue_shares: Sequence[float],
     mapping: Mapping = map,
+    given: Sequence[Mask] = (),
 ) -> tuple[Fields, EmptyFrames]:
     """The fields of view of a clip's eyes, and the frames that show no whole scene within them.
 
@@ -62,12 +67,13 @@ def find_shown(
         train: the frames that are not held out, rising.
         tissue_shares: T shares of each frame that the masks leave; none: no masks.
         mapping: a replacement of map(), such as a thread pool's.
+        given: fields of view [H, W] that the caller gave, from the left eye's on.
 
     Raises:
-        InputError: no training frame shows anything.
+        InputError: no training frame shows anything, or a field is given and fov is "all".
     """
     empty = find_empty(thumbnails, train, tissue_shares=tissue_shares)
-    fields = find_fields(eyes, _some(train, empty), fov, mapping)
+    fields = find_fields(eyes, _some(train, empty), fov, mapping, given)
     found = [fields.left, fields.right][: len(eyes)]
     empty = find_empty(thumbnails, train, found, tissue_shares)
     _some(train, empty)

@@ -39,6 +39,7 @@ class StereoClip:
     frame_times_s is [T] float64, from the container, or i / 30 if it has none.
     damaged lists frames with a damaged picture or mask, rising. No stage reads them.
     pixel_aspect is width / height of a pixel by the container.
+    given_fields are the fields of view that the caller gave, [H, W] bool as recorded: none, the left eye's, or both.
     """
 
     frame_count: int
@@ -52,6 +53,7 @@ class StereoClip:
     tissue_right: NDArray[np.bool_] | None = None
     damaged: tuple[int, ...] = ()
     pixel_aspect: float = 1.0
+    given_fields: tuple[NDArray[np.bool_], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ class DepthClip(Eye):
     right            the same times and size; None for a clip of one eye
     registration     corrections of the right eye's camera and colours; None for a clip of one eye
     masks            source of `tissue`
-    fov              entry of the field of view for the report; None: it was not looked for
+    fov              entry of the field of view for the report; None: it was not looked for, and field_of_view is as
+                     the caller gave it
     rectification    rectification of the recorded left eye; None: it is as recorded
     poses            source of world_from_camera; None: poses are not set yet
     first_pose       [4, 4] of frame 0 in the layout's own world, mm, OpenCV axes; None: not known

@@ -40,6 +40,7 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--calibration", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--masks", type=Path, metavar="F", help="as for reconstruct")
+    parser.add_argument("--fov-mask", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--poses-file", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument("--segmenter", type=Path, metavar="F", help="as for reconstruct")
     parser.add_argument(
@@ -78,7 +79,7 @@ def run_cli(options: argparse.Namespace) -> int:
     keep_decoder_ready()
     with ProgressBar(sys.stderr) as bar:
         hooks = Hooks(on_progress=bar.show)
-        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks, options.fov_mask)
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
         true = None if known is None else poses_of_frames(clip, known)
         clip = with_poses(clip, given, hooks, timings, stored)

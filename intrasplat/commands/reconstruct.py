@@ -54,6 +54,12 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         help="zip or folder of PNGs, or a video: the instruments, of the left eye or of both",
     )
     parser.add_argument(
+        "--fov-mask",
+        type=Path,
+        metavar="F",
+        help="PNG of the field of view, white inside: of the left eye, or of both side by side; replaces the search",
+    )
+    parser.add_argument(
         "--poses-file", type=Path, metavar="F", help="the camera's poses: TUM, or a matrix a frame as JSON or text"
     )
     parser.add_argument(
@@ -126,7 +132,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
     pipeline = background.submit(import_module, "intrasplat.pipeline")
     background.submit(_compile, on_cpu)  # not awaited here: the pipeline waits for it, and shows that as a stage
     if on_cpu:
-        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks)
+        paths = ClipPaths(options.clip, options.right, options.calibration, options.masks, options.fov_mask)
         if options.poses_file is not None:
             read_poses(options.poses_file)  # fails before the clip is opened
         clip = open_with_depth(paths, given, hooks, timings, segmenter=options.segmenter)
@@ -141,6 +147,7 @@ def _reconstruct(options: argparse.Namespace, out: Path, hooks: Hooks, accepted_
         right=options.right,
         calibration=options.calibration,
         masks=options.masks,
+        fov_mask=options.fov_mask,
         poses=options.poses_file,
         segmenter=options.segmenter,
         options=given,

@@ -21,7 +21,7 @@ from intrasplat.clip.layouts import registered_files
 from intrasplat.clip.types import RgbFrame
 from intrasplat.decode.contained import MALFORMED, REMEDY, Decoder, take_decoder
 from intrasplat.decode.guard import LIMITED_MEMORY, PROTECTIONS, Allowance
-from intrasplat.decode.handover import EYES, MASKS, ArrayFile, map_array
+from intrasplat.decode.handover import EYES, FIELDS, MASKS, ArrayFile, map_array
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.check import check_calibration
 from intrasplat.intake.calibration.types import (
@@ -86,11 +86,14 @@ def decode_clip(
     *,
     calibration: Path | None = None,
     masks: Path | None = None,
+    fov_mask: Path | None = None,
     options: ClipOptions | None = None,
     limits: ClipLimits | None = None,
     hooks: Hooks | None = None,
 ) -> StereoRecording | DepthClip:
     """The clip and calibration in these files, bit-identical to those of open_clip and load_calibration.
+
+    fov_mask is a PNG of the field of view (intrasplat/clip/given_field.py), which the clip then has.
 
     Another process decodes every frame into a private folder below tempfile.gettempdir(). Its memory and time are
     limited. If the kernel allows it, the process has no network and can read only these files. `assumptions` lists the
@@ -98,13 +101,14 @@ def decode_clip(
     decoded. The folder is removed with the process; arrays and open files live as long as the clip.
 
     Raises:
-        InputError, LimitError: as open_clip and load_calibration raise them; or the stereo clip has no calibration; or
-            the decoder crashed, made no progress for 10 s, or took more memory or time than allowed.
+        InputError, LimitError: as open_clip, load_calibration, read_field and with_field raise them; or the stereo clip
+            has no calibration; or the decoder crashed, made no progress for 10 s, or took more memory or time than
+            allowed.
         Cancelled: hooks.should_stop returned True.
         UnavailableError: the disk is full.
     """
     limits, hooks = limits or ClipLimits(), hooks or Hooks()
-    given = {"path": clip, "right": right, "masks": masks, "calibration": calibration}
+    given = {"path": clip, "right": right, "masks": masks, "calibration": calibration, "fov_mask": fov_mask}
     paths = {name: str(path.absolute()) for name, path in given.items() if path is not None}
     layouts = [str(file) for file in registered_files()]
     request = {
@@ -165,6 +169,7 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
         raise ValueError("frame times that are not finite")
     assumptions = (*_notices(described["assumptions"]), _protection(described["granted"], allowance))
     warnings = _notices(described["warnings"])
+    fields = tuple(ArrayFile(folder, name, size).whole() != 0 for name in FIELDS[: int(described["fields"])])
     if decoder.opened is None:
         whole = DepthClip(
             rgb=map_array(folder, "rgb", size),
@@ -174,6 +179,7 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
             intrinsics=Intrinsics.parsed(described["intrinsics"]),
             world_from_camera=_finite(map_array(folder, "world_from_camera", size).copy()),
             frame_times_s=frame_times_s,
+            field_of_view=fields[0] if fields else None,
             masks=described["masks"] and Masks.model_validate(described["masks"]),
             first_pose=described["first_pose"] and _finite(np.array(described["first_pose"], np.float64).reshape(4, 4)),
             assumptions=assumptions,
@@ -186,7 +192,10 @@ def _received(decoder: Decoder, allowance: Allowance) -> StereoRecording | Depth
     if not set(damaged) <= set(range(frames)):
         raise ValueError(f"damaged frames that are not some of {frames}")
     pairs = _ArrivingPairs(decoder, size)
-    clip = StereoClip(frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right, damaged)
+    clip = StereoClip(
+        frames, height, width, pairs, tissue, frame_times_s, assumptions, warnings, tissue_right, damaged,
+        given_fields=fields,
+    )  # fmt: skip
     return StereoRecording(clip, _calibration(described["calibration"]), decoder.close)
 
 

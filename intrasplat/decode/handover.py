@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 EYES = ("left", "right")
 MASKS = ("tissue", "tissue_right")
 """Names of the arrays that a stereo clip may lack."""
+FIELDS = ("field_of_view", "field_of_view_right")
+"""Names of the fields of view that the caller gave: none, the left eye's, or both."""
 
 _TYPES: dict[str, type[np.generic]] = {
     "left": np.uint8,
@@ -29,6 +31,8 @@ _TYPES: dict[str, type[np.generic]] = {
     "depth_confidence": np.uint8,
     "world_from_camera": np.float64,
     "frame_times_s": np.float64,
+    "field_of_view": np.uint8,
+    "field_of_view_right": np.uint8,
 }
 _SHAPES: dict[str, Callable[[int, int, int], tuple[int, ...]]] = {
     "left": lambda t, h, w: (t, h, w, 3),
@@ -40,6 +44,8 @@ _SHAPES: dict[str, Callable[[int, int, int], tuple[int, ...]]] = {
     "depth_confidence": lambda t, h, w: (t, h, w),
     "world_from_camera": lambda t, h, w: (t, 4, 4),
     "frame_times_s": lambda t, h, w: (t,),
+    "field_of_view": lambda t, h, w: (h, w),
+    "field_of_view_right": lambda t, h, w: (h, w),
 }
 
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip, find_calibration, open_clip
 from intrasplat.clip.calibration import load_calibration
+from intrasplat.clip.given_field import read_field, with_field
 from intrasplat.clip.layouts import register_layout
-from intrasplat.decode.handover import MASKS, write_arrays
+from intrasplat.decode.handover import FIELDS, MASKS, write_arrays
 from intrasplat.decode.reports import Reports
 from intrasplat.errors import InputError
 from intrasplat.options import ClipOptions
@@ -56,14 +57,21 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
     for file in request["layouts"]:
         register_layout(Path(file))
     paths = dict(request["paths"])
-    given_calibration = paths.pop("calibration", None)
+    given_calibration, fov_mask = paths.pop("calibration", None), paths.pop("fov_mask", None)
     options = ClipOptions.model_construct(**request["options"])  # checked by the parent; may name a user's layout
     clip = open_clip(**paths, options=options, limits=limits)
+    if fov_mask is not None:
+        reports.reading("fov_mask")
+        clip = with_field(clip, read_field(Path(fov_mask), limits))
+        reports.reading("clip")
+    fields = _given_fields(clip)
+    write_arrays(folder, zip(FIELDS, fields, strict=False))
     height, width = clip.rgb.shape[1:3] if isinstance(clip, DepthClip) else (clip.height, clip.width)
     description = {
         "size": [clip.frame_count, height, width],
         "assumptions": [each.model_dump() for each in clip.assumptions],
         "warnings": [each.model_dump() for each in clip.warnings],
+        "fields": len(fields),
         "damaged": [] if isinstance(clip, DepthClip) else list(clip.damaged),
     }
     if isinstance(clip, DepthClip):
@@ -80,6 +88,13 @@ def _read_clip(request: dict[str, Any], folder: Path, reports: Reports) -> dict[
     reports.opened(description | {"masked": masked, "calibration": calibration})
     write_arrays(folder, _stereo_frames(clip, reports))
     return {}
+
+
+def _given_fields(clip: StereoClip | DepthClip) -> tuple[NDArray[Any], ...]:
+    """The fields of view [H, W] that the caller gave."""
+    if isinstance(clip, StereoClip):
+        return clip.given_fields
+    return () if clip.field_of_view is None else (clip.field_of_view,)
 
 
 def _depth_arrays(clip: DepthClip, reports: Reports) -> Iterator[tuple[str, NDArray[Any]]]:

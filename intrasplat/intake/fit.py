@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from intrasplat.errors import InputError
 from intrasplat.intake.sniff import ZIP_SUFFIX
-from intrasplat.names import POSES_FILE
+from intrasplat.names import POSES_FILE, Fov
 from intrasplat.options import ReconstructionOptions
 
 _OF_MANY_FILES = ("endonerf", "stereomis", "frames")
@@ -28,8 +28,8 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
         sent: the parts that came with the options; the others belong to an earlier job's clip.
 
     Raises:
-        InputError: names the option; the clip, if it lacks a file of the requested layout; or the calibration, if it is
-            missing for a video that certainly shows two eyes.
+        InputError: names the option; the clip, if it lacks a file of the requested layout; the field of view, if the
+            whole picture is asked for; or the calibration, if it is missing for a video that certainly shows two eyes.
     """
     layout, clip = options.layout, files.get("clip")
     if clip is None and layout != "auto":
@@ -51,9 +51,18 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
     if options.poses in ("fixed", "estimate") and "poses_file" in sent:
         problem = f'"{options.poses}" uses no given poses, and poses_file came with it.'
         raise InputError("options.poses", problem, "Leave out either of them.")
+    if "fov_mask" in sent:
+        check_not_all(options.fov)
     if options.mask_source == "none" and "masks" in sent:
         problem = '"none" uses no masks, and masks came with it.'
         raise InputError("options.mask_source", problem, "Leave out either of them.")
+
+
+def check_not_all(fov: Fov) -> None:
+    """InputError if the options ask for the whole picture although a field of view is given."""
+    if fov == "all":
+        problem = 'it came with fov "all", which takes the whole picture.'
+        raise InputError("fov_mask", problem, "Leave one of them out.")
 
 
 def calibration_missing() -> InputError:

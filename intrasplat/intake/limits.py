@@ -29,6 +29,7 @@ EYES = 2  # of a stereo clip; the largest accepted picture contains both
 
 MAX_POSES_BYTES = 1 << 16, 1024  # of poses_bounds.npy: its header, and each frame's 17 numbers
 MAX_POSE_FILE_BYTES = 16 * 2**20  # a file of poses has some 100 bytes a frame
+MAX_FOV_MASK_BYTES = 16 * 2**20  # a PNG of two areas has some kB
 MAX_CALIBRATION_BYTES = 250_000  # a calibration has a few kB, or some ten with its calibration points
 MAX_IMAGE_BYTES = 1 << 20, 8  # of a PNG or JPEG: its metadata, and each pixel as uncompressed 16-bit RGBA
 

@@ -52,6 +52,11 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
     elif part == "poses_file":
         if b"\0" in path.read_bytes():
             raise InputError(part, f"{path.name} is not a text file.", "Send poses as TUM, JSON or text.")
+    elif part == "fov_mask":
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        check_field_head(head, part, path.name)
+        _check_image(head, path.name, part, limits)
     elif path.suffix.lower() == ZIP_SUFFIX:
         _check_zip(path, part, limits)
     else:
@@ -129,6 +134,15 @@ def check_head(head: bytes, suffix: str, part: str, label: str) -> None:
     if found is not None and found != wanted:
         raise InputError(part, f"{label} is {found}.", "Give the file the ending of what it is.")
     check_is_video(head, part, label)
+
+
+def check_field_head(head: bytes, part: str, label: str) -> None:
+    """InputError if the first bytes of a field of view are not those of a PNG: JPEG blurs the border into the black.
+
+    head: the first 8 bytes or more.
+    """
+    if not head.startswith(PNG_MAGIC):
+        raise InputError(part, f"{label} is not a PNG image.", "Write it as PNG, white inside and black outside.")
 
 
 def _check_zip(path: Path, part: str, limits: ClipLimits) -> None:

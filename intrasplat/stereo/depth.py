@@ -78,11 +78,11 @@ def estimate_depth(
     """Depth (mm) and confidence of every frame, corrected for rotation, row shift (up to 8 px) and colour of the eyes.
 
     The correction and the disparity range are common to all frames. They are measured on measured_frames alone (None:
-    on all), and so is the field of view with `fov` "auto". Otherwise a frame's depth depends on its own pair only, so
-    frames outside measured_frames do not change the depth of others. Frames that are damaged or show no whole scene
-    (clip/empty_frames.py) get no depth, nor, with skip_redundant, measured frames that show nothing new
-    (clip/sampling.py). If the right eye is out of step (in_step.py), which all frames tell, its frames are moved, and
-    frames without a partner are skipped.
+    on all), and so is the field of view with `fov` "auto" unless the clip has one that was given. Otherwise a frame's
+    depth depends on its own pair only, so frames outside measured_frames do not change the depth of others. Frames that
+    are damaged or show no whole scene (clip/empty_frames.py) get no depth, nor, with skip_redundant, measured frames
+    that show nothing new (clip/sampling.py). If the right eye is out of step (in_step.py), which all frames tell, its
+    frames are moved, and frames without a partner are skipped.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
     matching. None: `clip.tissue` is used.
@@ -94,7 +94,7 @@ def estimate_depth(
     Raises:
         ValueError: measured_frames is empty or contains a frame that does not exist.
         InputError: no frame shows anything, there is no depth, the frames are rectified already, the eyes seem to be
-            swapped, or their rows differ by more than 8 px.
+            swapped, their rows differ by more than 8 px, or a field of view is given and fov is "all".
         Cancelled: hooks.should_stop said so.
     """
     hooks = Hooks() if hooks is None else hooks
@@ -113,7 +113,9 @@ def estimate_depth(
             measured = sorted(set(measured) - set(unpaired))
         rgb, right_rgb = received.rgb, received.right_rgb
         shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
-        fields, empty = find_shown([rgb, right_rgb], received.thumbnails, measured, fov, shares, pool.map)
+        fields, empty = find_shown(
+            [rgb, right_rgb], received.thumbnails, measured, fov, shares, pool.map, clip.given_fields
+        )
         measured = sorted(set(measured) - set(empty.frames))
         matches = received.matches(spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()

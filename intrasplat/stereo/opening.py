@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip, training_frames
 from intrasplat.clip.calibration import rectify
+from intrasplat.clip.given_field import Mask, with_field
 from intrasplat.clip.sampling import most_frames
 from intrasplat.clip.shown import with_shown_parts
 from intrasplat.decode import DecoderKilledError, decode_clip
 from intrasplat.instruments import Finder, load_segmenter, with_instruments_found
 from intrasplat.intake.calibration.types import StereoCalibration
+from intrasplat.intake.fit import check_not_all
 from intrasplat.machine.hooks import Hooks, ignore
 from intrasplat.machine.timing import Timings
 from intrasplat.names import Fov, MaskSource
@@ -32,12 +34,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ClipPaths:
-    """The files of one clip (intrasplat/clip/opening.py); `clip` may contain both eyes."""
+    """The files of one clip (intrasplat/clip/opening.py); `clip` may contain both eyes.
+
+    fov_mask: the field of view, a PNG or [H, W] bool (intrasplat/clip/given_field.py); None: it is found.
+    """
 
     clip: Path
     right: Path | None = None
     calibration: Path | None = None
     masks: Path | None = None
+    fov_mask: Path | Mask | None = field(default=None, compare=False)
 
 
 def open_with_depth(
@@ -61,11 +67,14 @@ def open_with_depth(
     If something outside kills the decoding process, it is restarted, TRIES attempts in all.
 
     Raises:
-        InputError: the clip, its calibration, its masks or the holdout cannot be used.
+        InputError: the clip, its calibration, its masks, its field of view or the holdout cannot be used.
         UnavailableError: the disk is full, before_matching raised it, the segmenter cannot be used, or the decoding
             process was killed every time.
         Cancelled: hooks.should_stop said so.
     """
+    if paths.fov_mask is not None:
+        check_not_all(options.fov)
+    in_memory = None if isinstance(paths.fov_mask, Path) else paths.fov_mask
 
     def once() -> DepthClip:
         hooks.report_stage("decode", 0.0)
@@ -75,12 +84,13 @@ def open_with_depth(
                 paths.right,
                 calibration=paths.calibration,
                 masks=paths.masks,
+                fov_mask=paths.fov_mask if isinstance(paths.fov_mask, Path) else None,
                 options=options,
                 limits=limits,
                 hooks=hooks,
             )
         if isinstance(decoded, DepthClip):
-            clip = with_shown_parts(decoded, options)
+            clip = with_shown_parts(decoded if in_memory is None else with_field(decoded, in_memory), options)
             measured = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
             hooks.on_first_moment(clip.moment(measured[0]))
             without = clip.masks is not None and clip.masks.source == "none"
@@ -91,7 +101,7 @@ def open_with_depth(
                 return with_instruments_found(clip, measured, hooks, network)
         with closing(decoded):
             return match_eyes(
-                decoded.clip,
+                decoded.clip if in_memory is None else with_field(decoded.clip, in_memory),
                 decoded.calibration,
                 options.holdout,
                 hooks,

@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from intrasplat.clip import DepthClip
 from intrasplat.clip.layouts import registered_files
 from intrasplat.clip.stored import load_clip, save_clip
@@ -159,10 +161,20 @@ def _lower_priority() -> None:
 
 def _identity(request: ReconstructionRequest) -> str:
     """A hash that identifies the prepared clip: name, size and mtime of every file, the options, our version."""
-    given = (request.clip, request.right, request.calibration, request.masks, request.segmenter, request.poses)
+    given = (
+        request.clip,
+        request.right,
+        request.calibration,
+        request.masks,
+        request.segmenter,
+        request.poses,
+        request.fov_mask,
+    )
     found = hashlib.sha256(f"{version('intrasplat')} {request.options.model_dump_json()}".encode())
     if isinstance(request.poses, StoredPoses):
         found.update(request.poses.matrices.tobytes())
+    if isinstance(request.fov_mask, np.ndarray):
+        found.update(request.fov_mask.tobytes())
     for place, path in enumerate((*given, *registered_files())):
         if isinstance(path, Path):
             for file in _files_of(path):

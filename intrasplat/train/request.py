@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from intrasplat.clip import ClipLimits, DepthClip
+from intrasplat.clip.given_field import Mask
 from intrasplat.methods.method import Preset
 from intrasplat.methods.registry import preset_named
 from intrasplat.options import ReconstructionOptions
@@ -19,6 +20,7 @@ class ReconstructionRequest:
 
     clip           a path, or a clip with depth in memory, which is neither decoded nor matched
     seconds        seconds by stage already spent on such a clip, for the report
+    fov_mask       the field of view of clips on disk, a PNG or [H, W] bool (intrasplat/clip/given_field.py)
     poses          of the camera, a file or as stored (intrasplat/poses/pose_file.py)
     own_preset     used instead of the preset that options name
     accepted_at_s  Unix time at which the clip was accepted, for t_post_s; None means now
@@ -31,6 +33,7 @@ class ReconstructionRequest:
     right: Path | None = None
     calibration: Path | None = None
     masks: Path | None = None
+    fov_mask: Path | Mask | None = None
     poses: Path | StoredPoses | None = None
     segmenter: Path | None = None
     own_preset: Preset | None = None

@@ -77,14 +77,15 @@ def test_what_is_dropped_finds_its_place(page: Page) -> None:
     chosen = page.script(
         """
         const transfer = new DataTransfer();
-        for (const name of ["tool_masks.zip", "left.mp4", "right.mp4", "calibration.json"])
-          transfer.items.add(new File(["x"], name));
+        const names = ["tool_masks.zip", "left.mp4", "right.mp4", "calibration.json", "poses.json", "fov_mask.png"];
+        for (const name of names) transfer.items.add(new File(["x"], name));
         const target = document.querySelector("#upload");
         target.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, bubbles: true, cancelable: true }));
-        return ["clip", "right", "masks", "calibration"].map((name) => target.elements[name].files[0]?.name);
+        const parts = ["clip", "right", "masks", "calibration", "poses_file", "fov_mask"];
+        return parts.map((name) => target.elements[name].files[0]?.name);
         """
     )
-    assert chosen == ["left.mp4", "right.mp4", "tool_masks.zip", "calibration.json"]
+    assert chosen == ["left.mp4", "right.mp4", "tool_masks.zip", "calibration.json", "poses.json", "fov_mask.png"]
 
 
 def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Page) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.report import CameraPoses, Masks, Report
+from intrasplat.report import CameraPoses, FieldOfView, Masks, Report
 from tests.client.page import REPORT_OF_THE_PAGE, Page, Site
 from tests.client.test_theatre_in_browser import SIZES, screen_of
 from tests.client.words import say
@@ -54,6 +54,17 @@ def test_the_first_layer_says_in_mm_and_seconds_what_can_be_trusted(site: Site, 
     assert page.script(LINES, "reasons") == []
     assert say("report.tested_beside") in page.text("#report")
     assert "dB" not in page.text("#report")
+
+
+@pytest.mark.parametrize(
+    ("source", "key"), [("found", "report.field_of_view"), ("given", "report.field_of_view_given")]
+)
+def test_the_field_of_view_is_named_as_found_or_given(
+    site: Site, page: Page, source: Literal["found", "given"], key: str
+) -> None:
+    field = FieldOfView(source=source, share=0.72, shape="round")
+    show(site, page, GOOD.model_copy(update={"field_of_view": field}))
+    assert say(key, share="72 %") in page.script(LINES, "trusted")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
@@ -96,6 +98,28 @@ def test_two_eyes_that_differ_are_told_and_doubts_do_not_stop_a_clip(site: Site,
     (record,) = site.queue.records()
     assert record.labels.label == "liver, left lobe"
     assert record.files.right == "right.mp4"
+
+
+def test_poses_and_a_field_of_view_are_sent_with_the_clip(site: Site, page: Page, tmp_path: Path) -> None:
+    poses, notes, field = (tmp_path / name for name in ("path.tum", "notes.png", "field.png"))
+    poses.write_text("0 0 0 0 0 0 0 1\n")
+    notes.write_text("no picture")
+    assert cv2.imwrite(str(field), np.full((80, 96), 255, np.uint8))
+    page.show("drawer")
+    page.script("document.querySelector('#upload details').open = true")
+    assert say("form.poses_file") in page.text("#upload")
+    assert say("form.fov_mask") in page.text("#upload")
+    page.choose("clip", CLIP)
+    page.choose("calibration", calibration_at(tmp_path / "eyes.json", width=192, height=80))
+    page.choose("poses_file", poses)
+    page.choose("fov_mask", notes)
+    page.until(lambda: ["fov_mask", "kind"] in page.script(FINDINGS))
+    page.choose("fov_mask", field)
+    page.until(lambda: ["fov_mask", "kind"] not in page.script(FINDINGS))
+    page.click("#upload [type=submit]")
+    page.until(lambda: site.queue.records())
+    (record,) = site.queue.records()
+    assert (record.files.poses_file, record.files.fov_mask) == ("poses_file.tum", "fov_mask.png")
 
 
 def test_a_file_that_changes_after_it_was_chosen_is_told(site: Site, page: Page, large_clip: Path) -> None:

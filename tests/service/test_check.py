@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from contract.access.keys import KeyScope
+from intrasplat.intake.sniff import PNG_MAGIC
 from tests.client.local_service import CLIP
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer
 
@@ -92,6 +93,8 @@ def test_nothing_speaks_against_a_clip_with_the_calibration_of_its_eyes(service:
         ("clip", {"width": 8_960, "height": 3_584}, "too_large", False),
         ("clip", {"duration_s": 100_000.0}, "too_long", False),
         ("masks", {"head": b"no film at all".hex()}, "kind", True),
+        ("fov_mask", {"head": b"\xff\xd8\xff\xe0 jpeg".hex()}, "kind", True),
+        ("fov_mask", {"suffix": ".jpg"}, "ending", True),
         ("calibration", {"size_bytes": 2_000_000, "text": None}, "too_large", True),
         ("calibration", {"text": "<!DOCTYPE x>"}, "calibration_unreadable", True),
         ("calibration", {"text": '{"fx_px": NaN}'}, "calibration_unreadable", True),
@@ -106,6 +109,7 @@ def test_a_wrong_file_is_told_with_its_field(
     service: ServiceUnderTest, part: str, changes: dict[str, Any], code: str, refused: bool
 ) -> None:
     described = {"clip": video(width=1280, height=512), "calibration": calibration(), "masks": video()}
+    described["fov_mask"] = {"suffix": ".png", "size_bytes": 90, "head": PNG_MAGIC.hex()}
     described[part] = described[part] | changes
     assert findings(service, **described) == [(part, code, refused)]
 

@@ -10,6 +10,8 @@ import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from fastapi import FastAPI
 
@@ -56,6 +58,24 @@ def test_a_file_of_poses_is_kept_and_one_that_is_no_text_is_refused(service: Ser
     assert '"poses_file"' in record.model_dump_json()
     parts["poses_file"] = ("poses.tum", b"\0\0")
     assert_problem(service.upload(parts=parts), 422, "poses_file")
+
+
+def test_a_field_of_view_is_stored_and_what_is_no_png_or_contradicts_the_options_is_refused(
+    service: ServiceUnderTest,
+) -> None:
+    written, png = cv2.imencode(".png", np.full((64, 80), 255, np.uint8))
+    assert written
+    parts = {"clip": ("c.mp4", CLIP), "fov_mask": ("Smith.PNG", png.tobytes())}
+    record = service.queue.get(service.upload(parts=parts).json()["id"])
+    assert record is not None
+    assert record.files.fov_mask == "fov_mask.png"
+    assert JobRecord.model_validate_json(record.model_dump_json()) == record
+    assert_problem(service.upload('{"fov": "all"}', parts), 422, "fov_mask")
+    for name, content in (("f.png", b"\xff\xd8\xff\xe0"), ("f.jpg", png.tobytes())):
+        assert_problem(service.upload(parts={**parts, "fov_mask": (name, content)}), 422, "fov_mask")
+    without = service.queue.get(service.upload(parts={"clip": ("c.mp4", CLIP)}).json()["id"])
+    assert without is not None
+    assert '"fov_mask"' not in without.model_dump_json()  # workers of older versions do not know it
 
 
 def test_two_eyes_calibration_and_masks_are_kept_under_our_names(service: ServiceUnderTest) -> None:

@@ -42,6 +42,7 @@ class RectifiedClip:
     the rectified left eye (a read-only view if no masks were given), False where the rectified image extends beyond the
     recorded one. tissue_right is the same for the right eye, None if no masks show it. intrinsics are the left eye's.
     rectification has the left eye's mapping; None: the frames are unchanged. damaged: as in the recorded clip.
+    given_fields: those of the recorded clip, in rectified pixels.
 
     equal_rows_px is y_right - y_left, in these frames, of points on equal rows of the recorded frames. If frames that
     were rectified already are rectified again, about this row shift is measured.
@@ -60,6 +61,7 @@ class RectifiedClip:
     tissue_right: NDArray[np.bool_] | None = None
     rectification: Rectification | None = None
     damaged: tuple[int, ...] = ()
+    given_fields: tuple[NDArray[np.bool_], ...] = ()
 
 
 def rectify(clip: StereoClip, calibration: StereoCalibration) -> RectifiedClip:
@@ -116,6 +118,7 @@ def _pass_through(clip: StereoClip, calibration: RectifiedCalibration) -> Rectif
         warnings=clip.warnings + _scale_warning(c) + _view_warning(c.fx_px, c.width),
         tissue_right=clip.tissue_right,
         damaged=clip.damaged,
+        given_fields=clip.given_fields,
     )
 
 
@@ -156,6 +159,7 @@ def _remapped(clip: StereoClip, calibration: RawCalibration) -> RectifiedClip:
             projection=_rows_of(left_p),
         ),
         damaged=clip.damaged,
+        given_fields=_warp_fields(clip.given_fields, left_maps, right_maps),
     )
 
 
@@ -212,6 +216,15 @@ def _warp_tissue(tissue: NDArray[np.bool_], maps: Maps) -> NDArray[np.bool_]:
         warped[i] = cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST, borderValue=0) > 0
         let_go(warped[i])
         let_go(mask)
+    return warped
+
+
+def _warp_fields(fields: tuple[NDArray[np.bool_], ...], *maps: Maps) -> tuple[NDArray[np.bool_], ...]:
+    """The fields of view that were given, in rectified pixels. InputError if nothing is left of one."""
+    warped = tuple(_warp_tissue(field[None], each)[0] for field, each in zip(fields, maps, strict=False))
+    if not all(field.any() for field in warped):
+        problem = "all that it marks lies where rectification crops the pictures."
+        raise InputError("fov_mask", problem, "Mark the part of the recorded picture that shows the scene.")
     return warped
 
 

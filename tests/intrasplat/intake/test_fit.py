@@ -42,6 +42,7 @@ def files_in(folder: Path, *names: str) -> dict[str, Path]:
         ({"poses": "given", "layout": "frames"}, ("poses.zip",), ("clip",), "options.poses"),
         ({"poses": "estimate"}, (*PAIR, "poses_file.tum"), ("poses_file",), "options.poses"),
         ({"mask_source": "none"}, ("clip.mp4", "masks.zip"), ("masks",), "options.mask_source"),
+        ({"fov": "all"}, (*PAIR, "fov_mask.png"), (*PAIR, "fov_mask"), "fov_mask"),
         ({}, ("left.mp4", "right.mp4"), ("left", "right"), "calibration"),
         ({"layout": "sbs"}, ("clip.mp4",), ("clip",), "calibration"),
         ({"layout": "tb"}, ("clip.webm", "masks.zip"), ("clip", "masks"), "calibration"),
@@ -70,6 +71,8 @@ def test_what_cannot_go_together_names_the_field_and_a_remedy(
         ({"poses": "given"}, (*PAIR, "poses_file.tum"), PAIR),
         ({"poses": "estimate"}, (*PAIR, "poses_file.tum"), PAIR),
         ({"mask_source": "none"}, ("clip.mp4", "masks.zip"), ()),
+        ({}, (*PAIR, "fov_mask.png"), (*PAIR, "fov_mask")),
+        ({"fov": "all"}, (*PAIR, "fov_mask.png"), PAIR),
         ({"mask_source": "auto"}, ("clip.mp4", "masks.zip"), ("masks",)),
     ],
 )
