@@ -107,6 +107,7 @@ class NoticeCode(StrEnum):
     HELD_OUT_SCORE_LOW = "held_out_score_low"
     HELD_OUT_WITHOUT_TISSUE = "held_out_without_tissue"
     HOLES = "holes"
+    MOTION_GUESSED = "motion_guessed"
     NOTHING_HELD_OUT = "nothing_held_out"
     OUTLIER_FRAMES = "outlier_frames"
     TIME_TOO_SHORT = "time_too_short"

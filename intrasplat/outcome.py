@@ -17,6 +17,7 @@ from intrasplat.quality.report import Training
 from intrasplat.quality.trust import trust
 from intrasplat.quality.visibility import drop_strays
 from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
+from intrasplat.splat.metrics import RIGHT_COLOUR
 from intrasplat.train.rate_distortion import QuantizedScene
 from intrasplat.train.run import Run
 
@@ -56,6 +57,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
             "eyes": run.trained_eyes,
             "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_WARNINGS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
+            **({} if run.motion_error is None else {"motion_error": run.motion_error}),
         },
     )
 
@@ -106,6 +108,12 @@ def _warnings(run: Run) -> tuple[Notice, ...]:
             "made all the same. Give a larger budget_s."
         )
         found.append(Notice.warning(NoticeCode.TIME_TOO_SHORT, text))
+    if (run.motion_error or 0) > (255 * RIGHT_COLOUR) ** 2:
+        text = (
+            "The tissue moves too far from one training frame to the next to be followed: between them its place is a "
+            "guess, and confidence is low there. Record more frames a second."
+        )
+        found.append(Notice.warning(NoticeCode.MOTION_GUESSED, text))
     if run.setup.gpu_is_idle:
         text = f"The motion of preset {run.preset.name} trains on the CPU only, so the GPU was left idle."
         found.append(Notice.warning(NoticeCode.GPU_IDLE, text))

@@ -54,6 +54,7 @@ export const DE = {
     "masks_unsure": "Teile der Instrumente gelten vielleicht als Gewebe, oder Gewebe als Instrument.",
     "mask_gaps": "Einigen Bildern fehlt eine Maske.",
     "mask_levels": "Die Masken haben mehrere Stufen; alle außer der des Gewebes gelten als Teile von Instrumenten.",
+    "motion_guessed": "Zwischen den aufgenommenen Momenten ist die Bewegung des Gewebes geraten.",
     "no_instrument_masked": "Kein Instrument ist maskiert; Instrumente werden Teil des Gewebes.",
     "no_texture": "Viel Gewebe ist zu glatt, um es gut zu vermessen.",
     "no_time": "Einige Bilder wurden weggelassen, um Zeit zu sparen.",

@@ -54,6 +54,7 @@ export const EN = {
     "masks_unsure": "Parts of the instruments may have been taken for tissue, or tissue for instruments.",
     "mask_gaps": "Some frames lack a mask.",
     "mask_levels": "The masks have several levels; all but that of tissue were taken as parts of instruments.",
+    "motion_guessed": "Between the recorded moments the tissue's motion is a guess.",
     "no_instrument_masked": "No instrument is masked; instruments become part of the tissue.",
     "no_texture": "Much of the tissue is too smooth to measure well.",
     "no_time": "Some frames were left out to save time.",

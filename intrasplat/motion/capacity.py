@@ -53,10 +53,14 @@ MIN_TRIAL_FRAMES = 8
 
 @dataclass(frozen=True)
 class BasisChoice:
-    """The chosen number and the reason, a text for the report."""
+    """The chosen number and the reason, a text for the report.
+
+    motion_error: error of the motion in validation frames, in squared grey levels, if no number of bases follows it.
+    """
 
     count: int
     reason: str
+    motion_error: float | None = None
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,8 @@ def choose_bases(trials: BasisTrials, floor: float, frames: int, max_bases: int 
         allowed = min(each.motion for each in errors.values()) * 10 ** (MAX_LOSS_DB / 10)
         most = max(bases for bases, each in errors.items() if each.motion <= allowed)
         why = limit.reason if most == max(errors) else f"more lose over {MAX_LOSS_DB} dB"
-        return BasisChoice(most, f"{why}, for none that was tried follows the motion in validation frames")
+        reason = f"{why}, for none that was tried follows the motion in validation frames"
+        return BasisChoice(most, reason, errors[most].motion)
     total = {bases: each.total for bases, each in trials.decisive.items()}
     best = min(total, key=lambda each: total[each])
     allowed = (total[best] + floor) * 10 ** (MIN_GAIN_DB / 10)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from intrasplat.clip import spread
 from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.layout import COLOUR
+from intrasplat.splat.metrics import RIGHT_COLOUR, RIGHT_DEPTH
 from intrasplat.splat.model import Model
 from intrasplat.train.targets import TrainingFrames
 
@@ -26,8 +27,6 @@ MIN_TISSUE_PX = 0.5
 MIN_TISSUE_SHARE = 0.2
 """And if they are this share of all its weights there. At an instrument's edge, the visible part fixes the rest."""
 
-RIGHT_COLOUR, RIGHT_DEPTH = 0.03, 0.02
-"""Largest errors that count as right: mean error of R G B, with white as 1, and relative error of depth."""
 MAX_DEPTH_ERROR = 10 * RIGHT_DEPTH
 """Larger relative errors of depth are clamped to it."""
 LEAST = np.array([0.03, 0.05])

@@ -47,7 +47,7 @@ def take_scene(
     on_step(0.3)
     try:
         scene = load_scene(folder)
-        warnings = scene.pose_warnings
+        warnings, motion_error = scene.pose_warnings, scene.motion_error
     except SceneError as error:
         words = str(error).replace(f"{folder}/", "").replace(str(folder), archive.name)
         raise InputError(FIELD, words, AGAIN) from error
@@ -61,7 +61,7 @@ def take_scene(
     for name in kept:
         check_file(folder / name, FIELD, limits)
     (folder / THUMBNAIL).unlink(missing_ok=True)  # a new one is rendered, so that it shows this scene
-    save_scene(folder, _known(scene, warnings), {name: (folder / name).read_bytes() for name in kept})
+    save_scene(folder, _known(scene, warnings, motion_error), {name: (folder / name).read_bytes() for name in kept})
     report = _from_elsewhere(read.report, imported)
     if RECORDED not in kept:
         report = report.model_copy(update={"recorded": None})
@@ -70,9 +70,9 @@ def take_scene(
     return report
 
 
-def _known(scene: TrainedScene, warnings: tuple[Notice, ...]) -> TrainedScene:
+def _known(scene: TrainedScene, warnings: tuple[Notice, ...], motion_error: float) -> TrainedScene:
     """The scene with only the settings that views need: its report says how it was trained."""
-    settings = {"pose_warnings": [each.model_dump(mode="json") for each in warnings]}
+    settings = {"pose_warnings": [each.model_dump(mode="json") for each in warnings], "motion_error": motion_error}
     return replace(scene, settings=settings)
 
 

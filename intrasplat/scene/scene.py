@@ -76,6 +76,18 @@ class TrainedScene:
         """The clip's warnings in POSE_WARNINGS: why the endoscope's poses may be wrong."""
         return tuple(Notice.model_validate(each) for each in self.settings.get("pose_warnings", ()))
 
+    @cached_property
+    def motion_error(self) -> float:
+        """Error of the motion between training frames, in squared grey levels of 255; 0 where motion was followed.
+
+        Raises:
+            ValueError: the stored number is negative or not finite.
+        """
+        error = float(self.settings.get("motion_error", 0))
+        if not 0 <= error < math.inf:
+            raise ValueError(f"motion_error is {error}")
+        return error
+
     def without_motion(self) -> TrainedScene:
         """The scene without the weights of its motion, for a caller that has them elsewhere."""
         return replace(self, deformation=self.deformation.select(torch.zeros(0, dtype=torch.int64)))

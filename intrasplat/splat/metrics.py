@@ -26,6 +26,8 @@ HIGHLIGHT_LEVEL, HIGHLIGHT_PX = 0.6, 7
 """A pixel whose least channel exceeds this level is a highlight, with the square of HIGHLIGHT_PX pixels around it."""
 COVERED_ALPHA = 0.5
 """Least sum of blending weights at which a pixel counts as covered and its depth as valid."""
+RIGHT_COLOUR, RIGHT_DEPTH = 0.03, 0.02
+"""Largest errors that count as right: mean error of R G B, with white as 1, and relative error of depth."""
 MASK_OVERREAD = 32
 """Bytes allocated after a mask: with AVX2, cv2.norm of OpenCV 4.14 reads up to 8 bytes past its end."""
 

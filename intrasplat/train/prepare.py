@@ -36,7 +36,7 @@ def prepare(setup: Setup) -> Run:
     tracks = _tracks(setup)
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
-        preset, chosen = resolve_preset(setup.preset, tracks, clip, train)
+        preset, chosen, motion_error = resolve_preset(setup.preset, tracks, clip, train)
     with timings.measure("fusion_s"):
         moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
         right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
@@ -50,6 +50,7 @@ def prepare(setup: Setup) -> Run:
         )
     run = new_run(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
     keep_free_memory(LITTLE_BYTES)
+    run.motion_error = motion_error
     run.schedule = _schedule(run)
     return run
 

@@ -83,6 +83,7 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
             "stride": run.preset.fusion.stride,
             "units_per_mm": run.frames.scale,
             "box": run.box,
+            "motion_error": run.motion_error,
             "chosen": [notice.model_dump() for notice in run.chosen],
         },
         "iteration": run.iteration,
@@ -119,6 +120,7 @@ def _put(run: Run, tensors: dict[str, Tensor], state: Mapping[str, Any]) -> None
         run.densifier.load_arrays(tensors)
     run.iteration = state["iteration"]
     run.schedule = Schedule.of(state["schedule"])
+    run.motion_error = state["start"]["motion_error"]
     run.curve = [CurvePoint(*row) for row in state["curve"]]
 
 

@@ -40,18 +40,19 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 class Run:
     """A training run.
 
-    setup        clip, split, options, device, hooks, clocks
-    model        Gaussians, deformation, Adam's moments
-    frames       targets and cameras of the left eye
-    preset       rates, loss, order, densification; all that it left to the scene is filled in
-    schedule     the cycles, their rates, and early stopping
-    box          bounding box of the Gaussians' centres before the first step, units
-    iteration    iterations done
-    right        targets and cameras of the right eye; None where only the left eye is trained on
-    average      mean of the last models of a cycle
-    densifier    splits and prunes Gaussians; None where the preset has no densification
-    chosen       what the preset left to the scene: the value chosen and the reason
-    curve        scores of held-out frames so far
+    setup         clip, split, options, device, hooks, clocks
+    model         Gaussians, deformation, Adam's moments
+    frames        targets and cameras of the left eye
+    preset        rates, loss, order, densification; all that it left to the scene is filled in
+    schedule      the cycles, their rates, and early stopping
+    box           bounding box of the Gaussians' centres before the first step, units
+    iteration     iterations done
+    right         targets and cameras of the right eye; None where only the left eye is trained on
+    average       mean of the last models of a cycle
+    densifier     splits and prunes Gaussians; None where the preset has no densification
+    chosen        what the preset left to the scene: the value chosen and the reason
+    motion_error  error of the motion between training frames, squared grey levels, where no motion model follows it
+    curve         scores of held-out frames so far
     """
 
     setup: Setup
@@ -65,6 +66,7 @@ class Run:
     average: RunningMean = field(default_factory=RunningMean)
     densifier: Densifier | None = None
     chosen: tuple[Notice, ...] = ()
+    motion_error: float | None = None
     curve: list[CurvePoint] = field(default_factory=list)
 
     @property

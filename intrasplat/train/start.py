@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,6 +36,18 @@ MIN_STRIDE = 2
 """Least pixels between the points of a grid. A Gaussian for every pixel would fit noise, not surface."""
 
 
+class Resolved(NamedTuple):
+    """A preset without choices left to the scene.
+
+    notices       what was chosen and why, for the report
+    motion_error  as in BasisChoice; None where some number of bases follows the motion, or none was tried
+    """
+
+    preset: Preset
+    notices: tuple[Notice, ...]
+    motion_error: float | None
+
+
 def fusion_for(preset: Preset, intrinsics: Intrinsics) -> FusionSettings:
     """The preset's fusion; "fill" with the stride whose grid comes nearest to points_per_image points."""
     if preset.points_per_image is None or preset.fusion.mode != "fill":
@@ -47,11 +60,10 @@ def stride_for(points: int, intrinsics: Intrinsics) -> int:
     return max(MIN_STRIDE, round(math.sqrt(intrinsics.width * intrinsics.height / points)))
 
 
-def resolve_preset(
-    preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]
-) -> tuple[Preset, tuple[Notice, ...]]:
+def resolve_preset(preset: Preset, tracks: Sequence[Tracks], clip: DepthClip, train: Sequence[int]) -> Resolved:
     """The preset with the stride of the points' grid and the number of bases chosen for the scene, where it leaves them
-    open, and notices with the reasons for the report. tracks: of each keyframe, if there are any."""
+    open. tracks: of each keyframe, if there are any."""
+    motion_error = None
     notices, keys = [], [train[each.reference] for each in tracks] or [train[0]]
     left_open = preset.bases is None or (preset.points_per_image is None and preset.fusion.mode == "fill")
     trials = BasisTrials({})
@@ -78,14 +90,14 @@ def resolve_preset(
     if preset.bases is None:
         floor = mean_floor_error(clip, keys, fusion.stride)
         choice = choose_bases(trials, floor, len(train), preset.max_bases)
-        preset = preset.with_bases(choice.count)
+        preset, motion_error = preset.with_bases(choice.count), choice.motion_error
         notices.append(
             Notice.info(
                 NoticeCode.BASES,
                 f"Motion has {choice.count} {'basis' if choice.count == 1 else 'bases'}: {choice.reason}.",
             )
         )
-    return preset, tuple(notices)
+    return Resolved(preset, tuple(notices), motion_error)
 
 
 def bounded(preset: Preset, points: int) -> tuple[Preset, tuple[Notice, ...]]:

@@ -11,11 +11,16 @@ texture       standard deviation of brightness around the pixel: where it is lar
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.metrics import RIGHT_COLOUR
 
 Image = NDArray[np.float32]
 
@@ -32,6 +37,23 @@ def confidence(found: NDArray[np.float32]) -> Image:
     """[H, W] confidence in (0, 1) from the evidence [3, H, W]."""
     odds = np.tensordot(WEIGHTS.astype(np.float32), found, axes=1) + np.float32(BIAS)
     return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
+
+
+def followed(scene: TrainedScene, t: float) -> float:
+    """The factor of confidence at model time t: 1 at training times, least half way between them and beyond them.
+
+    Where no number of bases follows the tissue, its places between training frames are guesses, although the Gaussians
+    are right at those frames. Half way the factor is r / (r + s), where s = sqrt(scene.motion_error) is the size of
+    colour errors there and r of those that are right: errors of one density near 0 are right in proportion to r / s.
+    """
+    times = scene.trained_t
+    if not scene.motion_error or len(times) < 2:
+        return 1.0
+    after = min(max(bisect_left(times, t), 1), len(times) - 1)
+    before, behind = times[after - 1], times[after]
+    distance = min(1.0, min(abs(t - before), abs(t - behind)) / ((behind - before) / 2))
+    size = distance * (2 - distance) * math.sqrt(scene.motion_error) / 255
+    return RIGHT_COLOUR / (RIGHT_COLOUR + size)
 
 
 def evidence(trust: Image, rgb: Image, known_rgb: Image) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.metrics import COVERED_ALPHA
 from intrasplat.train.targets import solid_depth_mm
 from intrasplat.view.camera import as_recorded, endoscope_pose
-from intrasplat.view.confidence import confidence, evidence
+from intrasplat.view.confidence import confidence, evidence, followed
 from intrasplat.view.render import renderer_of
 from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
@@ -128,7 +128,7 @@ class _View:
         likely = 0.0
         if trust[i, j] > 0:
             known = self._known_rgb(image[:3], (i, j), self.pose[:3, 3] + depth_mm * middle_ray)
-            likely = float(confidence(evidence(trust, image[:3], known))[i, j])
+            likely = float(confidence(evidence(trust, image[:3], known))[i, j]) * followed(scene, self.t)
         gaussians, shares, spread_mm = self._gaussians(window, i, j)
         own_depth_mm = float(to_camera(point_mm, self.own_pose)[2])
         if own_depth_mm <= 0:

@@ -30,7 +30,7 @@ from intrasplat.splat.model import ProjectedPicture
 from intrasplat.train.hooks import RenderedFrame
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 from intrasplat.view.camera import endoscope_pose, view_camera
-from intrasplat.view.confidence import confidence, evidence, seen_from_endoscope
+from intrasplat.view.confidence import confidence, evidence, followed, seen_from_endoscope
 from intrasplat.view.depth_range import DepthRange
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses, pixel_count
@@ -302,6 +302,7 @@ def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float3
         known_rgb = seen_from_endoscope(own_rgb, judged.depth_mm, camera, endoscope)
         yield
     likely = confidence(evidence(judged.trust, judged.colours, known_rgb))
+    likely *= np.float32(followed(view.scene, view.shown_t))
     likely = np.where(judged.trust > 0, likely, 0).astype(np.float32)
     if judged is picture:
         return likely

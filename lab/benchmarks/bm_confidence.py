@@ -31,6 +31,7 @@ from intrasplat.quality import trust
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.metrics import RIGHT_COLOUR, RIGHT_DEPTH
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import TrainingFrames
@@ -109,11 +110,11 @@ def evidence_of(run: Trained, rng: np.random.Generator) -> tuple[NDArray[np.floa
         blended = [model.blend_values(np.ascontiguousarray(each, np.float32)) / alpha for each in found]
         known = seen_from_endoscope(own[:3], shown.depth_mm, (k, expected.pose), (k, own_pose))
         seen = evidence(np.full_like(alpha, 0.5), image[:3], known)[1:]
-        depth_right = np.abs(shown.depth_mm - expected.depth_mm) < trust.RIGHT_DEPTH * expected.depth_mm
+        depth_right = np.abs(shown.depth_mm - expected.depth_mm) < RIGHT_DEPTH * expected.depth_mm
         colour = np.abs(np.clip(image[:3], 0, 1).transpose(1, 2, 0) - expected.rgb).mean(-1)
         judged = (shown.depth_mm > 0) & ~shown.unseen & (expected.depth_mm > 0)
         numbers.append(np.stack([*blended, *seen, np.ones_like(alpha)], -1)[judged])
-        rights.append((depth_right & (colour < trust.RIGHT_COLOUR))[judged])
+        rights.append((depth_right & (colour < RIGHT_COLOUR))[judged])
     every, right = np.concatenate(numbers), np.concatenate(rights)
     chosen = rng.permutation(len(every))[:PIXELS_FITTED]
     return every[chosen], right[chosen]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from intrasplat.quality.trust import RIGHT_COLOUR, RIGHT_DEPTH
+from intrasplat.splat.metrics import RIGHT_COLOUR, RIGHT_DEPTH
 
 SQUARE_PX = 8
 LEAST_JUDGED = 0.5

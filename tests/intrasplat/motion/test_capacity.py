@@ -135,7 +135,9 @@ def test_motion_too_fast_for_any_number_gets_the_most() -> None:
     choice = choose_bases(errors, 5.0, 40)
     assert choice.count == 17
     assert "none that was tried follows the motion" in choice.reason
-    assert choose_bases(errors, 1000.0, 40).count == 3  # it does not show beside what the Gaussians leave
+    assert choice.motion_error == 860.0
+    hidden = choose_bases(errors, 1000.0, 40)  # motion does not show beside what the Gaussians leave
+    assert (hidden.count, hidden.motion_error) == (3, None)
 
 
 def test_between_stills_bases_that_miss_the_motion_by_far_more_are_not_taken() -> None:
@@ -208,7 +210,7 @@ def test_a_flat_picture_gets_points_farther_apart() -> None:
 @pytest.mark.parametrize("points", [100, 500, 2000])
 def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
     clip, train, tracks = followed("still")
-    fixed, _ = resolve_preset(dataclasses.replace(FAST, points_per_image=points), tracks, clip, train)
+    fixed, _, _ = resolve_preset(dataclasses.replace(FAST, points_per_image=points), tracks, clip, train)
     assert fixed.points_per_image == points
     assert fusion_for(fixed, clip.intrinsics).stride == max(MIN_STRIDE, round(math.sqrt(96 * 80 / points)))
 
@@ -217,7 +219,7 @@ def test_a_fixed_number_of_points_is_kept_to(points: int) -> None:
 def test_too_short_a_clip_gets_no_more_bases_than_frames_and_is_told_so(frames: int) -> None:
     clip = phantom_clip(frames=frames)
     train = list(range(frames))
-    preset, notices = resolve_preset(FAST, [track(clip, train)] if frames > 1 else [], clip, train)
+    preset, notices, _ = resolve_preset(FAST, [track(clip, train)] if frames > 1 else [], clip, train)
     assert preset.bases is not None
     assert 1 <= preset.bases <= frames
     assert any("too little could be followed" in each.text for each in notices)
@@ -231,7 +233,7 @@ def test_where_nothing_could_be_followed_bases_come_by_the_frames_up_to_the_most
 @pytest.mark.parametrize("most", [2, 5, 12, 1000])
 def test_a_preset_may_allow_fewer_bases_than_the_scene_would_get(most: int) -> None:
     clip, train, tracks = followed("breathing")
-    limited, notices = resolve_preset(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
+    limited, notices, _ = resolve_preset(dataclasses.replace(FAST, max_bases=most), tracks, clip, train)
     assert limited.bases is not None
     assert limited.bases <= most
     assert limited.bases == bases_for("breathing") or most < bases_for("breathing")

@@ -65,7 +65,7 @@ def test_what_no_reader_of_ours_knows_is_not_kept(tmp_path: Path) -> None:
     _, folder = taken(tmp_path, zipped(files))
     kept = json.loads((folder / MANIFEST).read_text())
     assert "more" not in kept
-    assert kept["settings"] == {"pose_warnings": []}
+    assert kept["settings"] == {"pose_warnings": [], "motion_error": 0.0}
     assert sorted(path.name for path in folder.iterdir()) == sorted([SCENE, MANIFEST, REPORT, CURVE])
 
 
@@ -172,6 +172,7 @@ SPOILT: dict[str, tuple[Callable[[Files], Files], str]] = {
     "times that stand": (with_manifest(frame_times_s=[0.0] * 6), "rise"),
     "a scale of 0": (with_manifest(units_per_mm=0), "units_per_mm"),
     "a scale of infinity": (with_manifest(units_per_mm=float("inf")), "units_per_mm"),
+    "an error of motion that is none": (with_manifest(settings={"motion_error": -1}), "settings"),
     "warnings that are none": (with_manifest(settings={"pose_warnings": [{"code": "<b>"}]}), "settings"),
     "warnings without end": (
         with_manifest(settings={"pose_warnings": [{"code": "pose_jitter", "severity": "warning", "text": "x" * 5000}]}),

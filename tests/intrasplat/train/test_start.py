@@ -39,7 +39,7 @@ def started(clip: DepthClip, preset: Preset, train: list[int] | None = None) -> 
     frames = train or list(range(clip.frame_count))
     scale = units_per_mm(clip, frames)
     tracks = track_keyframes(clip, frames) if preset.tracks and len(frames) > 1 else []
-    preset, _ = resolve_preset(preset, tracks, clip, frames)
+    preset, _, _ = resolve_preset(preset, tracks, clip, frames)
     moved = {frames[each.reference]: moved_along(each, frames, clip.intrinsics.width) for each in tracks}
     cloud = fuse(clip, frames, fusion_for(preset, clip.intrinsics), seed=0, moved=moved)
     return start_model(cloud, tracks, clip, frames, preset, scale, seed=0), cloud, scale

@@ -20,6 +20,8 @@ from intrasplat.machine.hooks import Progress
 from intrasplat.machine.timing import Stopwatch
 from intrasplat.methods.method import DensifySettings, Preset
 from intrasplat.methods.registry import PRESETS
+from intrasplat.notices import NoticeCode
+from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.splat.optimize import Rate
 from intrasplat.train.calibrate import GROWTH_ALLOWANCE, TIMED_STEPS, UNTIMED_STEPS, measured_schedule
@@ -266,6 +268,27 @@ def test_a_run_does_not_go_on_with_another_clip(tmp_path: Path) -> None:
     with pytest.raises(ResumeMismatch, match="another clip"):
         kept(tmp_path, prepared(phantom_clip("pull"), "fast")[0])
     assert resume(tmp_path / "nothing", prepared(phantom_clip(), "fast")[0].setup) is None
+
+
+def test_a_scene_says_that_its_motion_was_not_followed_also_after_a_stop(tmp_path: Path) -> None:
+    clip = phantom_clip()
+    first = prepared(clip)[0]
+    first.motion_error = None
+    assert "motion_error" not in snapshot_of(first).settings
+    first.motion_error = 500.0
+    keep(tmp_path, first)
+    again = kept(tmp_path, prepared(clip)[0])
+    scene = snapshot_of(again)
+    assert scene.motion_error == 500.0
+    assert NoticeCode.MOTION_GUESSED in {each.code for each in training_of(again, scene, None).warnings}
+
+
+def test_stills_too_far_apart_are_not_followed() -> None:
+    clip = phantom_clip("breathing")
+    order = np.random.default_rng(3).permutation(clip.frame_count)
+    names = ("rgb", "tissue", "depth_mm", "depth_confidence")
+    shuffled = dataclasses.replace(clip, **{name: getattr(clip, name)[order] for name in names})
+    assert (prepared(shuffled)[0].motion_error or 0) > 500
 
 
 def test_the_curve_is_kept_over_a_stop(tmp_path: Path) -> None:

@@ -45,8 +45,12 @@ def scene(phantom: Phantom) -> TrainedScene:
     return scene_of(trained(run))
 
 
+@pytest.mark.parametrize("motion_error", [0, 200])
 @pytest.mark.parametrize("pose", [None, BESIDE], ids=["endoscope", "beside"])
-def test_depth_and_confidence_are_those_of_the_layers(scene: TrainedScene, pose: NDArray[np.float64] | None) -> None:
+def test_depth_and_confidence_are_those_of_the_layers(
+    scene: TrainedScene, pose: NDArray[np.float64] | None, motion_error: float
+) -> None:
+    scene = dataclasses.replace(scene, settings={"motion_error": motion_error})
     frame = render_frame(scene, T_SHOWN, pose)
     for (x, y), place in zip(POINTS, places_at(scene, T_SHOWN, pose, scene.intrinsics, POINTS), strict=True):
         assert place.depth_mm == pytest.approx(frame.depth_mm[int(y), int(x)], abs=0.02)

@@ -22,6 +22,7 @@ from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.run import Run
 from intrasplat.view.camera import endoscope_pose
+from intrasplat.view.confidence import followed
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import judged_camera
 from intrasplat.view.render import FAR_POSE, ViewRequest, frame_in_parts, render_frame, renderer_of
@@ -95,6 +96,25 @@ def test_every_layer_has_the_asked_size(scene: TrainedScene, size: tuple[int, in
     solid = frame.depth_mm > 0
     assert solid.mean() > 0.9
     assert not frame.confidence[~solid].any()
+
+
+def test_confidence_falls_between_training_times_where_motion_was_not_followed(scene: TrainedScene) -> None:
+    scene = dataclasses.replace(scene, settings={})
+    unfollowed = dataclasses.replace(scene, settings={"motion_error": (3 * 0.03 * 255) ** 2})
+    before, after = scene.trained_t[3:5]
+    assert after - before == pytest.approx(1 / FRAMES)
+    for share, factor in ((0.0, 1.0), (0.25, 1 / 3.25), (0.5, 1 / 4), (1.0, 1.0)):
+        t = before + share * (after - before)
+        sure, unsure = render_frame(scene, t), render_frame(unfollowed, t)
+        np.testing.assert_array_equal(unsure.rgb, sure.rgb)
+        np.testing.assert_allclose(unsure.confidence, factor * sure.confidence, rtol=1e-4)
+    assert followed(unfollowed, LAST) == (1.0 if scene.trained_t[-1] == LAST else 0.25)
+
+
+def test_what_a_scene_says_of_its_motion_is_checked(scene: TrainedScene) -> None:
+    for wrong in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="motion_error"):
+            _ = dataclasses.replace(scene, settings={"motion_error": wrong}).motion_error
 
 
 @pytest.fixture(scope="module")
