@@ -4,11 +4,12 @@
         1]
         [--iterations 600] [--out keyframes.csv]
 
-Draws stereo clips of 320x256 and trains `fast` on each with true poses and with those that `auto` finds. Prints and
+Draws stereo clips of 320x256 and trains `fast` on each with true poses and with those that `auto` finds, or with a
+file of the true poses (--poses file), in metres and from world to camera, which nothing in the file says. Prints and
 writes of each run: held-out psnr_tissue of the left and the right eye; the share of the tissue seen by any frame that
 the scene covers (lab/evaluate/seen.py); Gaussians, bases, and seconds of poses and of tracks. Then of what has left
-the view, from where the camera was a quarter of the clip before: the median error of its depth in mm, had it stayed as
-it was then (rest_mm), and as the scene shows it (gone_mm); the mean confidence there, and that of what is in view.
+the view, from where the camera was a quarter of the clip before: the median error of its depth in mm, had it stayed
+as it was then (rest_mm), and as the scene shows it (gone_mm); the mean confidence there, and that of what is in view.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from statistics import mean
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from intrasplat.camera import unproject
 from intrasplat.fusion.points import cells_of
@@ -52,11 +54,11 @@ MIN_LEFT_SHARE = 0.05
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motions", nargs="+", default=["breathing"])
-    parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS)
+    parser.add_argument("--paths", nargs="+", default=PATHS)
     parser.add_argument("--frames", type=int, default=128)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--iterations", type=int, default=600)
-    parser.add_argument("--poses", nargs="+", choices=("true", "auto"), default=["true", "auto"])
+    parser.add_argument("--poses", nargs="+", choices=("true", "auto", "file"), default=["true", "auto"])
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
@@ -82,8 +84,9 @@ def measured(opened: OpenClip, poses: str, iterations: int) -> dict[str, object]
     if poses == "true":
         clip = replace(placed(clip, true), poses=CameraPoses(source="given"))
     with tempfile.TemporaryDirectory() as folder:
+        file = write_tum(Path(folder) / "poses.tum", clip.frame_times_s, true) if poses == "file" else None
         options = ReconstructionOptions(preset="fast", iterations=iterations, holdout=HOLDOUT)
-        report = reconstruct(ReconstructionRequest(clip, options), Path(folder), TrainingHooks())
+        report = reconstruct(ReconstructionRequest(clip, options, poses=file), Path(folder), TrainingHooks())
         scene = load_scene(Path(folder))
     return {
         "iterations": iterations,
@@ -96,6 +99,14 @@ def measured(opened: OpenClip, poses: str, iterations: int) -> dict[str, object]
         "bases": report.bases,
         **seconds(report),
     }
+
+
+def write_tum(path: Path, times_s: NDArray[np.float64], world_from_camera: NDArray[np.float64]) -> Path:
+    """The path, to which poses [T, 4, 4] in mm are written as camera_from_world in metres, in TUM's format."""
+    inverse = np.linalg.inv(world_from_camera)
+    turns = Rotation.from_matrix(inverse[:, :3, :3]).as_quat()
+    np.savetxt(path, np.column_stack([times_s, inverse[:, :3, 3] / 1000, turns]), fmt="%.7f")
+    return path
 
 
 def seconds(report: Report) -> dict[str, str]:

@@ -28,7 +28,8 @@ medians over clips ([how](../decisions/camera-path.md#given-poses-that-jump-are-
 _TISSUE = """
 ### Tissue that comes into view later
 
-`fast` on stereo clips of 320x256, with true poses and those that `auto` finds; medians over clips, held-out dB
+`fast` on stereo clips of 320x256, with true poses, with a file of them that names neither unit nor direction, and with
+those that `auto` finds; medians over clips, held-out dB
 ([how](../decisions/motion.md#tissue-that-comes-into-view-is-tracked-from-keyframes)). The last three columns are of
 tissue that has left the view: its depth error in mm, had it stayed as it was and as shown, and its confidence.
 """
@@ -80,11 +81,12 @@ def moving_sections(folder: Path) -> list[str]:
         )
         parts += [_NOISY, source(command, "noisy_poses.csv"), table(header, cells)]
     if rows := read_rows(folder / "keyframes.csv"):
-        header = ["camera", "true poses, dB", *(name for name, _ in _TISSUE_COLUMNS.values())]
+        header = ["camera", "true poses, dB", "from a file", *(name for name, _ in _TISSUE_COLUMNS.values())]
         cells = []
         for camera, here in _by_camera(rows).items():
-            true, found = ([row for row in here if row["poses"] == poses] for poses in ("true", "auto"))
-            cells.append([camera, median_of(true, "left_db", 1), *_medians(found, _TISSUE_COLUMNS)])
+            by_poses = {poses: [row for row in here if row["poses"] == poses] for poses in ("true", "file", "auto")}
+            given = [median_of(by_poses[poses], "left_db", 1) for poses in ("true", "file")]
+            cells.append([camera, *given, *_medians(by_poses["auto"], _TISSUE_COLUMNS)])
         command = (
             "python -m lab.benchmarks.bm_keyframes --motions breathing pull --seeds 1 --out lab/rows/keyframes.csv"
         )
