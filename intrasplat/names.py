@@ -36,8 +36,11 @@ Fov = Literal["auto", "all"]
 """The part of the pictures that shows the scene. auto: all but black borders, bars and labels. all: everything."""
 
 Poses = Literal["auto", "given", "fixed", "estimate"]
-"""Where the camera's poses come from. given: from the clip. fixed: the camera does not move. estimate: from the
-pictures. auto: from the clip; if it has none, check whether the camera is fixed, and estimate its path if it is not."""
+"""Where the camera's poses come from. given: from the clip or a file. fixed: the camera does not move. estimate: from
+the pictures. auto: those given, if there are any and the pictures do not contradict them; else check whether the camera
+is fixed, and estimate its path if it is not."""
+POSES_UNUSED: tuple[Poses, ...] = ("fixed", "estimate")
+"""Values of the option that use no given poses."""
 
 Eyes = Literal["left", "both"]
 """The eyes of a stereo clip that a model is trained on."""

@@ -138,11 +138,12 @@ def score_stored_scene(request: ReconstructionRequest, directory: Path, hooks: T
         SceneError: the scene is missing or damaged.
     """
     device = device_for(request.preset.deformation, request.device)
-    scene, unplaced = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
-    clip = open_with_poses(dataclasses.replace(request, options=unplaced), hooks, Timings(), device)
-    clip = placed(clip, scene.world_from_camera)
-    split = split_frames(clip, request.options.holdout)
+    scene, resting = load_scene(directory), request.options.model_copy(update={"poses": "fixed"})
+    clip = open_with_poses(dataclasses.replace(request, options=resting, poses=None), hooks, Timings(), device)
     report = Report.model_validate_json((directory / REPORT).read_bytes())
+    unplaced = () if report.poses is None or report.poses.source != "estimated" else report.poses.unsure_frames
+    clip = dataclasses.replace(placed(clip, scene.world_from_camera), skipped=tuple(sorted({*clip.skipped, *unplaced})))
+    split = split_frames(clip, request.options.holdout)
     return score_scene(Made(clip, split, scene, report, device), hooks)
 
 

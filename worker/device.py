@@ -25,7 +25,7 @@ from intrasplat.instruments import load_segmenter
 from intrasplat.intake.limits import ClipLimits
 from intrasplat.machine.hooks import Progress
 from intrasplat.machine.processes import die_with_parent
-from intrasplat.names import REPORT
+from intrasplat.names import POSES_UNUSED, REPORT
 from intrasplat.pipeline import Made, make, score_scene, score_stored_scene
 from intrasplat.report import Imported, Report
 from intrasplat.scene.compact import compile_coder
@@ -276,7 +276,8 @@ def request_of(
 ) -> ReconstructionRequest:
     """The reconstruction request of a job, with its files in the folder `spool`.
 
-    With fov "all" the field of view that came with an earlier job of the same clip is left out.
+    The field of view and the poses that came with an earlier job of the same clip are left out if the options of this
+    one do not use them.
     """
     files = record.files
     return ReconstructionRequest(
@@ -285,7 +286,7 @@ def request_of(
         calibration=spool / files.calibration if files.calibration else None,
         masks=spool / files.masks if files.masks else None,
         fov_mask=spool / files.fov_mask if files.fov_mask and record.options.fov != "all" else None,
-        poses=spool / files.poses_file if files.poses_file else None,
+        poses=spool / files.poses_file if files.poses_file and record.options.poses not in POSES_UNUSED else None,
         segmenter=segmenter,
         options=record.options,
         device=device,

@@ -11,11 +11,12 @@ from pathlib import Path, PurePosixPath
 
 from intrasplat.errors import InputError
 from intrasplat.intake.sniff import ZIP_SUFFIX
-from intrasplat.names import POSES_FILE, Fov
+from intrasplat.names import POSES_FILE, POSES_UNUSED, Fov, Poses
 from intrasplat.options import ReconstructionOptions
 
 _OF_MANY_FILES = ("endonerf", "stereomis", "frames")
 """Layouts whose clip is a zip."""
+EITHER_REMEDY = "Leave one of them out."
 STEREO_VIDEOS = ("sbs", "tb")
 """Layouts whose clip shows both eyes. A video, unlike a zip, cannot contain a calibration."""
 
@@ -48,21 +49,26 @@ def check_fit(options: ReconstructionOptions, files: Mapping[str, Path], sent: C
     if options.poses == "given" and not of_layout and "poses_file" not in files:
         problem = "it asks for poses that come with the clip, and only the EndoNeRF layout brings poses."
         raise InputError("options.poses", problem, 'Send poses_file too, or say "auto" or "estimate".')
-    if options.poses in ("fixed", "estimate") and "poses_file" in sent:
-        problem = f'"{options.poses}" uses no given poses, and poses_file came with it.'
-        raise InputError("options.poses", problem, "Leave out either of them.")
+    if "poses_file" in sent:
+        check_poses_used(options.poses, "poses_file")
     if "fov_mask" in sent:
         check_not_all(options.fov)
     if options.mask_source == "none" and "masks" in sent:
         problem = '"none" uses no masks, and masks came with it.'
-        raise InputError("options.mask_source", problem, "Leave out either of them.")
+        raise InputError("options.mask_source", problem, EITHER_REMEDY)
+
+
+def check_poses_used(poses: Poses, field: str) -> None:
+    """InputError if the options use no given poses although this field gives some."""
+    if poses in POSES_UNUSED:
+        raise InputError("options.poses", f'"{poses}" uses no given poses, and {field} came with it.', EITHER_REMEDY)
 
 
 def check_not_all(fov: Fov) -> None:
     """InputError if the options ask for the whole picture although a field of view is given."""
     if fov == "all":
         problem = 'it came with fov "all", which takes the whole picture.'
-        raise InputError("fov_mask", problem, "Leave one of them out.")
+        raise InputError("fov_mask", problem, EITHER_REMEDY)
 
 
 def calibration_missing() -> InputError:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from intrasplat.clip import spread
 from intrasplat.poses.links import FrameLink, Frames
@@ -55,7 +57,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
 
     def linked(i: int, last: int) -> tuple[FrameLink, float]:
         """Link the current keyframe to frame i, which sets i's pose; also the share of the keyframe that agrees."""
-        key, start = keys[-1], inverse(_ahead(poses, last, i)) @ poses[keys[-1]]
+        key, start = keys[-1], inverse(_ahead(poses, parts[-1], i)) @ poses[keys[-1]]
         link = frames.link(key, i, frames.predicted(key, start)[0] if flow is None else flow)
         aligned = align(frames.camera, link.before, link.after, link.trust, start)
         poses[i] = poses[key] @ inverse(aligned.motion)
@@ -78,6 +80,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
                 link, share, poses[i] = far_link, far_share, poses[keys[-1]] @ inverse(aligned.motion)
         on_progress(train.index(i) / (len(train) - 1))
         if share < MIN_AGREEING:
+            poses[i] = poses[last]
             keys.append(i)
             parts.append([i])
             flow = None
@@ -94,17 +97,27 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
         train = sorted(main)
         keys = [key for key in keys if key in train]
         links = [link for link in links if link.a in train and link.b in train]
-        poses = {i: inverse(poses[train[0]]) @ poses[i] for i in train}
-    links += _loops(frames, keys, poses)
-    return Chain(train, np.stack([poses[i] for i in train]), [each for each in links if each.overlap >= MIN_OVERLAP])
+    links = [link for link in (*links, *_loops(frames, keys, poses)) if link.overlap >= MIN_OVERLAP]
+    train = tied(train, links)
+    links = [link for link in links if link.a in train]
+    return Chain(train, np.stack([inverse(poses[train[0]]) @ poses[i] for i in train]), links)
+
+
+def tied(frames: Sequence[int], links: Sequence[FrameLink]) -> list[int]:
+    """The largest set of these frames that links between them tie together, in their order."""
+    places = {frame: place for place, frame in enumerate(frames)}
+    ends = np.array([(places[link.a], places[link.b]) for link in links], np.intp).reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), ends.T), shape=(len(frames), len(frames)))
+    _, part = connected_components(graph, directed=False)
+    return [frame for frame, each in zip(frames, part, strict=True) if each == np.bincount(part).argmax()]
 
 
 def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> list[FrameLink]:
     """Links between parts that show common tissue. The parts become one in parts, and in poses."""
     looks, links = dict[int, list[int]](), list[FrameLink]()
     for number in sorted(range(len(parts)), key=lambda each: -len(parts[each])):
-        room = MAX_LOOKS - sum(map(len, looks.values()))
-        looks[number] = list(spread(parts[number], min(PART_LOOKS, room))) if room else []
+        left = MAX_LOOKS - sum(map(len, looks.values()))
+        looks[number] = list(spread(parts[number], min(PART_LOOKS, left))) if left else []
     pairs = [(a, b) for one, other in combinations(looks.values(), 2) for a in one for b in other]
     found = {pair: far for pair in pairs if (far := frames.far_motion(*pair)) is not None}
     for a, b in sorted(found, key=lambda pair: -len(found[pair].before))[:MAX_LOOPS]:
@@ -121,11 +134,11 @@ def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> 
     return links
 
 
-def _ahead(poses: dict[int, Reals], last: int, index: int) -> Reals:
-    """The camera pose in a later frame, extrapolated at constant velocity."""
-    before = max((each for each in poses if each < last), default=last)
-    if before == last:
-        return poses[last]
+def _ahead(poses: dict[int, Reals], part: Sequence[int], index: int) -> Reals:
+    """The camera pose in a later frame, extrapolated at constant velocity from the last two frames of a part."""
+    if len(part) < 2:
+        return poses[part[-1]]
+    before, last = part[-2:]
     step = log(poses[last] @ inverse(poses[before]))
     return exp(step * (index - last) / (last - before)) @ poses[last]
 

@@ -12,14 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from intrasplat.clip import DepthClip, spread
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.poses.beside import place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
-from intrasplat.poses.chain import MIN_AGREEING, chained
+from intrasplat.poses.chain import MIN_AGREEING, chained, tied
 from intrasplat.poses.common_motion import RIGID_PER_BENT, Gauged, gauged
 from intrasplat.poses.fitting import Fit, fitted
 from intrasplat.poses.links import FrameLink, Frames
@@ -135,17 +133,11 @@ def _unknown(count: int) -> FoundPath:
 
 def _apart(used: Sequence[int], fit: Fit, links: Sequence[FrameLink]) -> list[int]:
     """Frames outside the largest connected component. Only links that find enough tissue as the fit expects count."""
-    place = {index: k for k, index in enumerate(used)}
-    tied = [
-        (place[link.a], place[link.b])
-        for link, residual_px in zip(links, fit.residual_px, strict=True)
+    found = [
+        link for link, residual_px in zip(links, fit.residual_px, strict=True)
         if link.agreeing(residual_px) >= MIN_AGREEING
-    ]
-    ends = np.array(tied, np.intp).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(tied)), (ends[0], ends[1])), shape=(len(used), len(used)))
-    _, piece = connected_components(graph, directed=False)
-    most = np.bincount(piece).argmax()
-    return [index for index, each in zip(used, piece, strict=True) if each != most]
+    ]  # fmt: skip
+    return sorted(set(used) - set(tied(used, found)))
 
 
 def _found_path(

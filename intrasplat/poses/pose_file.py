@@ -27,6 +27,8 @@ from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import MM_PER_M, at_times
 
 RIGID_TOLERANCE = 1e-3
+MAX_POSITION = 1e6
+"""Largest coordinate of a position, in the file's unit."""
 TUM_COLUMNS, MATRIX_COLUMNS = 8, (12, 16)
 REMEDY = "Give a TUM file (t x y z qx qy qz qw), or a 3x4 or 4x4 matrix a frame as JSON or text."
 
@@ -55,14 +57,16 @@ def read_poses(path: Path, field: str = "poses_file") -> StoredPoses:
     """
     try:
         if path.stat().st_size > MAX_POSE_FILE_BYTES:
-            raise InputError(field, f"{path} is larger than {MAX_POSE_FILE_BYTES // 2**20} MiB.", REMEDY)
+            raise InputError(field, f"{path.name} is larger than {MAX_POSE_FILE_BYTES // 2**20} MiB.", REMEDY)
         text = decoded_text(path.read_bytes())
         if text is None:
-            raise InputError(field, f"{path} is not a text file.", REMEDY)
+            raise InputError(field, f"{path.name} is not a text file.", REMEDY)
         if text.lstrip()[:1] in ("[", "{"):
             return StoredPoses(rigid(_of_json(json.loads(text)), field), None, field)
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(field, f"{path} cannot be read as poses ({error}).", REMEDY) from error
+    except OSError as error:
+        raise InputError(field, f"{path.name} cannot be read ({error.strerror}).", REMEDY) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(field, f"{path.name} is not valid JSON ({error}).", REMEDY) from error
     rows = _rows(text, path, field)
     columns = rows.shape[1]
     if columns == TUM_COLUMNS:
@@ -72,7 +76,7 @@ def read_poses(path: Path, field: str = "poses_file") -> StoredPoses:
     is_whole = len(rows) % 4 == 0 and (rows[3::4] == (0, 0, 0, 1)).all()
     height = 4 if is_whole else 3
     if columns != 4 or len(rows) % height:
-        raise InputError(field, f"{path} has {len(rows)} lines of {columns} numbers.", REMEDY)
+        raise InputError(field, f"{path.name} has {len(rows)} lines of {columns} numbers.", REMEDY)
     return StoredPoses(rigid(rows.reshape(-1, height, 4), field), None, field)
 
 
@@ -84,7 +88,7 @@ def read_tum(path: Path, field: str = "--against") -> tuple[Reals, Reals]:
     """
     stored = read_poses(path, field)
     if stored.stamps is None:
-        raise InputError(field, f"{path} is no TUM file.", "Give lines `timestamp tx ty tz qx qy qz qw`.")
+        raise InputError(field, f"{path.name} is no TUM file.", "Give lines `timestamp tx ty tz qx qy qz qw`.")
     poses = stored.matrices.copy()
     poses[:, :3, 3] *= MM_PER_M
     return stored.stamps, poses
@@ -98,7 +102,7 @@ def rigid(given: Any, field: str) -> Reals:
     """
     try:
         matrices = np.asarray(given, np.float64)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise InputError(field, f"the poses are no numbers in matrices ({error}).", REMEDY) from error
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or not len(matrices):
         raise InputError(field, f"the poses have shape {list(matrices.shape)}, not [T, 4, 4].", REMEDY)
@@ -108,10 +112,11 @@ def rigid(given: Any, field: str) -> Reals:
     with np.errstate(invalid="ignore", over="ignore"):
         skew = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
         good = np.isfinite(poses).all((1, 2)) & (skew < RIGID_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    good &= (np.abs(poses[:, :3, 3]) <= MAX_POSITION).all(1)
     good &= np.isclose(poses[:, 3], (0, 0, 0, 1)).all(1)
     if not good.all():
-        problem = f"the pose of frame {int(np.argmin(good))} is not rigid."
-        raise InputError(field, problem, "Give [R | t; 0 0 0 1] with finite numbers and rotations R.")
+        problem = f"the pose of frame {int(np.argmin(good))} is not rigid, or farther than {MAX_POSITION:g} away."
+        raise InputError(field, problem, "Give [R | t; 0 0 0 1] with finite numbers and rotations R, in mm or m.")
     return poses
 
 
@@ -157,12 +162,12 @@ def _rows(text: str, path: Path, field: str) -> Reals:
         (number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"
     ]
     if not numbered:
-        raise InputError(field, f"{path} holds no pose.", REMEDY)
+        raise InputError(field, f"{path.name} holds no pose.", REMEDY)
     columns = len(numbered[0][1])
     for number, words in numbered:
         if len(words) != columns or not all(_is_number(word) for word in words):
             expected = TUM_COLUMNS if columns not in (4, *MATRIX_COLUMNS) else columns
-            raise InputError(field, f"line {number} of {path} does not hold {expected} finite numbers.", REMEDY)
+            raise InputError(field, f"line {number} of {path.name} does not hold {expected} finite numbers.", REMEDY)
     return np.array([words for _, words in numbered], np.float64)
 
 
@@ -176,8 +181,8 @@ def _is_number(word: str) -> bool:
 def _of_tum(rows: Reals, path: Path, field: str) -> Reals:
     lengths = np.linalg.norm(rows[:, 4:], axis=1)
     if not np.allclose(lengths, 1, atol=0.01):
-        raise InputError(field, f"{path} holds quaternions that are not of length 1.", REMEDY)
+        raise InputError(field, f"{path.name} holds quaternions that are not of length 1.", REMEDY)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
-    return poses
+    return rigid(poses, field)

@@ -10,12 +10,13 @@ import numpy as np
 
 from intrasplat.clip import DepthClip, training_frames
 from intrasplat.errors import InputError
+from intrasplat.intake.fit import check_poses_used
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import Notice, NoticeCode, named_frames
 from intrasplat.options import ReconstructionOptions
-from intrasplat.poses.brought import MIN_FRAMES, contradicted, with_checked_poses, with_stored_poses
-from intrasplat.poses.given import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
+from intrasplat.poses.given import MIN_FRAMES, contradicted, with_checked_poses, with_notice, with_stored_poses
+from intrasplat.poses.jitter import MAX_JITTER, MIN_JITTER, jitter_mm, steadied
 from intrasplat.poses.placing import placed
 from intrasplat.poses.pose_file import StoredPoses
 from intrasplat.poses.still import camera_rests
@@ -39,19 +40,22 @@ def with_poses(
     A fixed camera leaves all arrays unchanged. timings get poses_s. stored: poses that replace the clip's own.
 
     Raises:
-        InputError: options.poses asks for given poses, and there are none; or the stored ones do not fit the clip.
+        InputError: options.poses asks for given poses, and there are none; or poses are stored, and the option does not
+            use them, or they do not fit the clip.
         Cancelled: hooks.should_stop said so.
     """
-    brought = clip.right is None or stored is not None  # only layouts with depth bring poses
     if clip.poses is not None:
         return clip
-    if options.poses == "given" and not brought:
+    if stored is not None:
+        check_poses_used(options.poses, stored.field)
+    has_given = clip.right is None or stored is not None  # only layouts with depth bring poses
+    if options.poses == "given" and not has_given:
         problem = '"given" asks for poses that come with the clip, and stereo clips bring none.'
         raise InputError("options.poses", problem, 'Give a file of poses, or say "auto" or "estimate".')
     train = sorted(set(training_frames(clip.frame_count, options.holdout)) - set(clip.skipped))
     with timings.measure("poses_s"):
-        if brought and options.poses in ("auto", "given"):
-            clip = _brought(clip, train, options, hooks, stored)
+        if has_given and options.poses in ("auto", "given"):
+            clip = _given(clip, train, options, hooks, stored)
             if clip.poses is not None:
                 return clip
         hooks.report_stage(STAGE, 0.0)
@@ -67,7 +71,7 @@ def with_poses(
         return _posed_or_fixed(clip, find_path(clip, train, lambda share: hooks.report_stage(STAGE, share)), options)
 
 
-def _brought(
+def _given(
     clip: DepthClip, train: Sequence[int], options: ReconstructionOptions, hooks: Hooks, stored: StoredPoses | None
 ) -> DepthClip:
     """The clip with its given poses; unplaced and with a warning if the pictures contradict those of a file.
@@ -112,11 +116,12 @@ def _steadied(clip: DepthClip, train: Sequence[int], jumps_mm: float, depth_mm: 
     from intrasplat.poses.estimate import find_path
 
     found = find_path(clip, train, lambda share: hooks.report_stage(STAGE, share))
-    steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure)
-    if steady.jumps_mm < WORTH * jumps_mm:  # the found path has the same jitter: the camera itself shakes
+    is_found = len(found.unsure) <= MAX_UNSURE * clip.frame_count
+    steady = steadied(clip.world_from_camera, found.world_from_camera, found.unsure) if is_found else None
+    if steady is not None and steady.jumps_mm < WORTH * jumps_mm:  # the same jitter: the camera itself shakes
         return _as_given(clip, 0.0, depth_mm)
     text = f"poses: the given ones jump to and fro by about {jumps_mm:.2f} mm at the tissue from frame to frame; "
-    if len(found.unsure) > MAX_UNSURE * clip.frame_count or steady.left_mm > WORTH * jumps_mm:
+    if steady is None or steady.left_mm > WORTH * jumps_mm:
         notice = Notice.info(NoticeCode.POSES, f"{text}the pictures do not place the frames better, so they stay")
         return _as_given(replace(clip, assumptions=(*clip.assumptions, notice)), jumps_mm, depth_mm)
     text += "each frame was moved to where its picture places it between its neighbours, which may leave "
@@ -163,8 +168,8 @@ def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOp
     entry = _report_entry(clip, "estimated", found)
     clip = placed(clip, found.world_from_camera)
     clip = replace(clip, skipped=tuple(sorted({*clip.skipped, *found.unsure})))
-    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, text))
-    return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
+    clip = with_notice(replace(clip, poses=entry), Notice.info(NoticeCode.POSES, text))
+    return replace(clip, warnings=(*clip.warnings, *warnings))
 
 
 def _named(clip: DepthClip, found: FoundPath) -> str:
@@ -180,8 +185,8 @@ def _fixed(clip: DepthClip, how: str, found: FoundPath | None = None, *warnings:
         )
     if not (clip.world_from_camera == np.eye(4)).all():
         clip = placed(clip, np.tile(np.eye(4), (clip.frame_count, 1, 1)))
-    notices = (*clip.assumptions, Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
-    return replace(clip, poses=entry, assumptions=notices, warnings=(*clip.warnings, *warnings))
+    clip = with_notice(replace(clip, poses=entry), Notice.info(NoticeCode.POSES, f"poses: the camera {how}"))
+    return replace(clip, warnings=(*clip.warnings, *warnings))
 
 
 def _report_entry(clip: DepthClip, source: Literal["fixed", "estimated"], found: FoundPath) -> CameraPoses:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from intrasplat.options import ReconstructionOptions, parse_options
 from intrasplat.outcome import scene_of
 from intrasplat.picture import RecordedMasks
 from intrasplat.pipeline import make, reconstruct, score_scene, score_stored_scene
-from intrasplat.report import Masks, Report
+from intrasplat.report import CameraPoses, Masks, Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
 from intrasplat.scene.resume_file import RESUME_FILE
@@ -259,7 +260,9 @@ def test_a_scene_is_whole_before_it_is_scored_and_is_scored_alike_from_disk(
     assert again.warnings == straight.warnings
 
 
-def test_a_scene_of_a_moving_camera_is_scored_anew_from_its_own_poses(tmp_path: Path) -> None:
+def test_a_scene_of_a_moving_camera_is_scored_anew_from_its_own_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     moving = PhantomSettings(width=96, height=80, frames=10, camera=("swing",))
     write_endonerf(make_phantom(moving), tmp_path / "clip")
     asked = request(tmp_path / "clip", preset="fast")
@@ -267,6 +270,13 @@ def test_a_scene_of_a_moving_camera_is_scored_anew_from_its_own_poses(tmp_path: 
     assert (made.scene.world_from_camera != made.scene.world_from_camera[0]).any()
     again = score_stored_scene(asked, tmp_path / "out", TrainingHooks())
     assert again.frames == score_scene(made, TrainingHooks()).frames
+    lost = CameraPoses(source="estimated", unsure_frames=(2,))
+    unsure = made.report.model_copy(update={"poses": lost})
+    (tmp_path / "out" / "report.json").write_text(unsure.model_dump_json())
+    split = Mock(wraps=split_frames)
+    monkeypatch.setattr("intrasplat.pipeline.split_frames", split)
+    score_stored_scene(asked, tmp_path / "out", TrainingHooks())
+    assert split.call_args.args[0].skipped == (2,)
 
 
 def test_a_stopped_run_with_a_budget_keeps_its_schedule(opened: Opened, tmp_path: Path) -> None:

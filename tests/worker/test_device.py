@@ -69,6 +69,8 @@ def test_files_lie_where_the_store_keeps_them() -> None:
     assert (alone.right, alone.calibration, alone.masks, alone.poses) == (None, None, None, None)
     posed = request(JobFiles(clip="clip.zip", poses_file="poses_file.tum"), {})
     assert posed.poses == SPOOL / "poses_file.tum"
+    again = request(JobFiles(clip="clip.zip", poses_file="poses_file.tum"), {"poses": "estimate"})
+    assert again.poses is None  # they came with an earlier job of the clip
     files = JobFiles(clip="clip.zip", fov_mask="fov_mask.png")
     assert request(files, {}).fov_mask == SPOOL / "fov_mask.png"
     assert request(files, {"fov": "all"}).fov_mask is None  # it came with an earlier job of the clip

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from intrasplat.machine.timing import Timings
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.poses import with_poses
+from intrasplat.poses.chain import _ahead, tied
 from intrasplat.poses.estimate import find_path
-from intrasplat.poses.links import Frames
-from intrasplat.poses.rigid import Reals, inverse
+from intrasplat.poses.links import FrameLink, Frames
+from intrasplat.poses.rigid import Reals, exp, inverse
 from intrasplat.poses.trajectory import trajectory_error
 from lab.phantom import CameraPath, PhantomSettings
 from tests.intrasplat.phantoms import matched_stereo
@@ -99,3 +102,19 @@ def test_features_place_two_frames_of_common_tissue_and_no_others() -> None:
     rgb = clip.rgb.copy()
     rgb[8] = other.rgb[8]
     assert Frames(replace(clip, rgb=rgb)).far_motion(0, 8) is None
+
+
+def link(a: int, b: int) -> FrameLink:
+    return cast(FrameLink, SimpleNamespace(a=a, b=b))
+
+
+def test_frames_that_no_link_ties_to_the_largest_set_are_no_part_of_it() -> None:
+    assert tied([0, 1, 2, 3], [link(0, 1), link(1, 2)]) == [0, 1, 2]
+    assert tied([0, 2, 4, 6, 8], [link(0, 2), link(4, 6), link(6, 8)]) == [4, 6, 8]
+    assert tied([5], []) == [5]
+
+
+def test_after_a_jump_no_velocity_is_carried_over() -> None:
+    poses = {i: exp(np.array([10.0 * i, 0, 0, 0, 0, 0])) for i in range(4)}
+    np.testing.assert_allclose(_ahead(poses, [0, 1], 3)[0, 3], 30.0)
+    np.testing.assert_array_equal(_ahead(poses, [1], 3), poses[1])

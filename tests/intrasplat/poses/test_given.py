@@ -10,11 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
+from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import NoticeCode
 from intrasplat.options import Poses, ReconstructionOptions
-from intrasplat.poses import with_poses
+from intrasplat.poses import StoredPoses, estimate, with_poses
+from intrasplat.poses.chain import Chain
 from intrasplat.poses.trajectory import trajectory_error
 from intrasplat.scene.scene import POSE_WARNINGS
 from lab.conditions.clean import clean_of
@@ -89,3 +91,20 @@ def test_jumps_that_the_pictures_show_are_the_cameras() -> None:
     clip = clean_of(jumping).clip
     result = posed(clip)
     np.testing.assert_array_equal(result.world_from_camera, clip.world_from_camera)
+
+
+def test_poses_that_jump_stay_where_no_frames_show_common_tissue(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, given = brought("swing", 1.0)
+    monkeypatch.setattr(estimate, "chained", lambda *_: Chain([0], np.eye(4)[None], []))
+    result = posed(given)
+    np.testing.assert_array_equal(result.world_from_camera, given.world_from_camera)
+    assert [notice.code for notice in result.warnings] == [NoticeCode.POSE_JITTER]
+
+
+@pytest.mark.parametrize("poses", ["fixed", "estimate"])
+def test_a_file_of_poses_that_the_options_do_not_use_is_refused(poses: Poses) -> None:
+    clip = replace(drawn("swing"), poses=None)
+    stored = StoredPoses(clip.world_from_camera)
+    with pytest.raises(InputError) as refused:
+        with_poses(clip, ReconstructionOptions(poses=poses, holdout="none"), Hooks(), Timings(), stored)
+    assert refused.value.field == "options.poses"

@@ -76,3 +76,24 @@ def test_poses_go_to_frames_by_count_by_number_or_by_time() -> None:
     for refused in (few, replace(few, stamps=np.arange(3.0)), replace(few, stamps=np.arange(3) * 0.1)):
         with pytest.raises(InputError, match="poses"):
             poses_of_frames(clip, refused)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("huge.json", json.dumps([[[10**400] * 4] * 4])),
+        ("far.json", json.dumps([[[1, 0, 0, 1e305], [0, 1, 0, 0], [0, 0, 1, 0]]])),
+        ("far.tum", "0 1e300 0 0 0 0 0 1\n"),
+    ],
+)
+def test_positions_that_no_camera_has_are_refused_without_the_path_of_the_file(
+    tmp_path: Path, name: str, text: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as refused:
+        read_poses(tmp_path / name)
+    assert refused.value.field == "poses_file"
+    assert str(tmp_path) not in str(refused.value)
+    with pytest.raises(InputError, match="cannot be read") as absent:
+        read_poses(tmp_path / "none.tum")
+    assert str(tmp_path) not in str(absent.value)
