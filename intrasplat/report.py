@@ -112,7 +112,7 @@ class FieldOfView(BaseModel):
         description="found in the pictures; given: the left eye's by the caller; all: the whole picture, as asked"
     )
     share: float = Field(ge=0, le=1, description="share of the left eye's picture")
-    shape: FieldShape = Field(description="whole: nothing of the picture was left out")
+    shape: FieldShape = Field(description="of its border; whole: the picture has none")
     right_share: float | None = Field(default=None, ge=0, le=1, description="share of the right eye's; None: one eye")
     label_share: float = Field(default=0.0, ge=0, le=1, description="share of the picture under labels and menus")
 

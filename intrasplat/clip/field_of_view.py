@@ -75,7 +75,7 @@ class Fields:
         given = "as given, " if self.entry.source == "given" else ""
         text = f"field of view: {given}{self.entry.shape}, {self.entry.share:.1%} of the picture"
         text += "" if self.entry.right_share is None else f" ({self.entry.right_share:.1%} of the right eye's)"
-        text += f", {self.entry.label_share:.1%} of it under labels" if self.entry.label_share else ""
+        text += f"; labels cover {self.entry.label_share:.1%}" if self.entry.label_share else ""
         return (Notice.info(NoticeCode.FIELD_OF_VIEW, f"{text}; nothing is modelled outside"),)
 
 
@@ -85,6 +85,8 @@ def find_fields(
     fov: Fov,
     mapping: Mapping = map,
     given: Sequence[Mask] = (),
+    *,
+    may_coincide: bool = False,
 ) -> Fields:
     """The fields of view of a clip's eyes, one or two.
 
@@ -93,6 +95,7 @@ def find_fields(
         frames: those that show something and are not held out.
         mapping: a replacement of map(), such as a thread pool's.
         given: [H, W] of the eyes whose field the caller gave, from the left one on; it stays as it is, labels included.
+        may_coincide: whether both eyes may show tissue at the same pixels, so that labels cannot be found.
 
     Raises:
         InputError: a field is given, and fov is "all".
@@ -106,7 +109,7 @@ def find_fields(
     found = [*given, *mapping(lambda eye: find_field(_released(eye, chosen)), eyes[len(given) :])]
     shape = shape_of(found[0])
     label_share = 0.0
-    if len(given) < len(eyes) > 1:
+    if len(given) < len(eyes) > 1 and not may_coincide:
         pairs = ([eye[index] for eye in eyes] for index in spread(chosen, COMPARED))
         labels = mapping(lambda pair: find_labels(pair[0], pair[1], found[0] & found[1]), pairs)
         label = np.logical_and.reduce(list(labels))
@@ -195,10 +198,8 @@ def _bars(darkest: Levels, brightest: Levels) -> Mask:
 
 
 def find_labels(left: RgbFrame, right: RgbFrame, field: Mask) -> Mask:
-    """[H, W] labels and menus within the field: edges that both eyes [H, W, 3] show at the same pixels.
-
-    Tissue at these distances never is at the same pixels in both eyes.
-    """
+    """[H, W] labels and menus within the field: edges that both eyes [H, W, 3] show at the same pixels, where no
+    tissue is at the same pixels in both."""
     width = field.shape[1]
     within = cv2.erode(field.astype(np.uint8), _disc(LABEL_SHARE * width)) > 0
     same = cv2.blur(cv2.absdiff(left, right).max(axis=2), (BLUR_PX, BLUR_PX)) <= SAME_LEVELS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from intrasplat.clip.empty_frames import EmptyFrames, find_empty
 from intrasplat.clip.field_of_view import Fields, Mask, find_fields
+from intrasplat.clip.given_field import FIELD
 from intrasplat.clip.sampling import Mapping, Thumbnail, sampled, thumbnail
 from intrasplat.clip.split import training_frames
 from intrasplat.clip.types import DepthClip
@@ -28,10 +29,9 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
         InputError: no frame shows anything, or a field is given and options.fov is "all".
     """
     thumbnails = [[thumbnail(rgb) for rgb in clip.rgb]]
-    shares = [float(tissue.mean()) for tissue in clip.tissue]
     train = training_frames(clip.frame_count, options.holdout)
     given = () if clip.field_of_view is None else (clip.field_of_view,)
-    fields, empty = find_shown([clip.rgb], thumbnails, train, options.fov, shares, given=given)
+    fields, empty = find_shown([clip.rgb], thumbnails, train, options.fov, clip.tissue, given=given)
     if fields.left is not None:
         inside = mapped_zeros(clip.tissue.shape, np.bool_)
         for index, tissue in enumerate(clip.tissue):
@@ -53,9 +53,11 @@ def find_shown(
     thumbnails: Sequence[Sequence[Thumbnail]],
     train: Sequence[int],
     fov: Fov,
-    tissue_shares: Sequence[float],
+    tissue: Iterable[Mask],
     mapping: Mapping = map,
     given: Sequence[Mask] = (),
+    *,
+    may_coincide: bool = False,
 ) -> tuple[Fields, EmptyFrames]:
     """The fields of view of a clip's eyes, and the frames that show no whole scene within them.
 
@@ -65,28 +67,39 @@ def find_shown(
         eyes: [T, H, W, 3] of each eye.
         thumbnails: T thumbnails of each eye.
         train: the frames that are not held out, rising.
-        tissue_shares: T shares of each frame that the masks leave; none: no masks.
+        tissue: [T, H, W] what the masks leave; none: no masks.
         mapping: a replacement of map(), such as a thread pool's.
         given: fields of view [H, W] that the caller gave, from the left eye's on.
+        may_coincide: as in find_fields.
 
     Raises:
         InputError: no training frame shows anything, or a field is given and fov is "all".
     """
-    empty = find_empty(thumbnails, train, tissue_shares=tissue_shares)
-    fields = find_fields(eyes, _some(train, empty), fov, mapping, given)
-    found = [fields.left, fields.right][: len(eyes)]
-    empty = find_empty(thumbnails, train, found, tissue_shares)
-    _some(train, empty)
+    empty = find_empty(thumbnails, train, tissue_shares=_shares(tissue, None, mapping))
+    fields = find_fields(eyes, _some(train, empty), fov, mapping, given, may_coincide=may_coincide)
+    found = () if fov == "all" else [fields.left, fields.right][: len(eyes)]
+    empty = find_empty(thumbnails, train, found, _shares(tissue, fields.left, mapping))
+    _some(train, empty, " within the field of view" if given else "")
     return fields, empty
 
 
-def _some(train: Sequence[int], empty: EmptyFrames) -> list[int]:
+def _shares(tissue: Iterable[Mask], field: Mask | None, mapping: Mapping) -> list[float]:
+    """The share of the field [H, W] that each of tissue [T, H, W] fills; None: of the picture."""
+
+    def share(shown: Mask) -> float:
+        return float(np.count_nonzero(shown if field is None else shown & field) / shown.size)
+
+    size = 1.0 if field is None else max(float(field.mean()), 1e-9)
+    return [each / size for each in mapping(share, tissue)]
+
+
+def _some(train: Sequence[int], empty: EmptyFrames, where: str = "") -> list[int]:
     """The training frames that are not empty. Raises InputError if there are none."""
     shown = sorted(set(train) - set(empty.frames))
     if not shown:
         raise InputError(
-            "clip",
-            "no frame that may be trained on shows the scene: all are of one colour, or covered by masks.",
+            FIELD if where else "clip",
+            f"no frame that may be trained on shows the scene{where}: all are of one colour, or covered by masks.",
             "Give the recording of the operation, and masks of its instruments alone.",
         )
     return shown

@@ -102,6 +102,9 @@ def estimate_depth(
     measured = sorted(given - set(clip.damaged))
     if not measured or measured[0] < 0 or measured[-1] >= clip.frame_count:
         raise ValueError(f"measured_frames {measured} are not some of {clip.frame_count} frames")
+    nearest_px, farthest_px = (
+        clip.intrinsics.fx * clip.baseline_mm / each + clip.disparity_offset_px for each in depth_range_mm
+    )
     with one_opencv_thread(), _pool() as pool:
         received = _receive(clip, spread(measured, ALIGNMENT_PAIRS), pool, hooks)
         lag = find_lag(*received.profiles)
@@ -110,12 +113,12 @@ def estimate_depth(
             sources = lag.sources(clip.frame_count)
             unpaired = tuple(t for t, source in enumerate(sources) if source is None)
             clip = _in_step(clip, received, sources)
-            measured = sorted(set(measured) - set(unpaired))
+            measured = sorted(set(measured) - {*unpaired, *clip.damaged})
         rgb, right_rgb = received.rgb, received.right_rgb
-        shares = () if finder_of else list(pool.map(lambda tissue: float(tissue.mean()), clip.tissue))
         fields, empty = find_shown(
-            [rgb, right_rgb], received.thumbnails, measured, fov, shares, pool.map, clip.given_fields
-        )
+            [rgb, right_rgb], received.thumbnails, measured, fov, () if finder_of else clip.tissue, pool.map,
+            clip.given_fields, may_coincide=farthest_px <= 0 <= nearest_px,
+        )  # fmt: skip
         measured = sorted(set(measured) - set(empty.frames))
         matches = received.matches(spread(measured, ALIGNMENT_PAIRS), pool)
         unused = skippable_frames(rgb, measured, most_frames, pool.map) if skip_redundant else SkippedFrames()
@@ -235,12 +238,17 @@ def _receive(clip: RectifiedClip, aligned: Sequence[int], pool: ThreadPoolExecut
 
 
 def _in_step(clip: RectifiedClip, received: _Received, sources: Sequence[int | None]) -> RectifiedClip:
-    """The clip, whose right frames, their thumbnails and masks become those of `sources`; features are found anew."""
+    """The clip, whose right frames, their thumbnails and masks become those of `sources`; features are found anew.
+
+    A frame counts as damaged if it was, or if its new right frame was.
+    """
     move_frames(received.right_rgb, sources)
     chosen = [t if source is None else source for t, source in enumerate(sources)]
     received.thumbnails[1][:] = [received.thumbnails[1][source] for source in chosen]
     received.features.clear()
-    return clip if clip.tissue_right is None else replace(clip, tissue_right=clip.tissue_right[chosen])
+    damaged = tuple(t for t, source in enumerate(chosen) if {t, source} & set(clip.damaged))
+    tissue_right = None if clip.tissue_right is None else clip.tissue_right[chosen]
+    return replace(clip, tissue_right=tissue_right, damaged=damaged)
 
 
 def _plan(

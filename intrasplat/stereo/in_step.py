@@ -29,7 +29,7 @@ MIN_ALIKE = 0.5
 MIN_GAIN = 3.0
 """Sum of correlations over the frames that a lag must gain: about that of four frames."""
 MIN_FRAMES = 4
-"""A shorter part of a clip tells no lag."""
+"""A shorter part of a clip shows no lag."""
 
 Profile = NDArray[np.float32]
 """[2 ROWS]"""
@@ -57,7 +57,8 @@ class Lag:
         k = self.after or self.before
         where = "throughout" if self.before == self.after else f"{'from' if self.after else 'up to'} frame {self.at}"
         late = "late" if k > 0 else "early"
-        text = f"the right eye was out of step by {abs(k)} ({late}) {where}; it was moved to match, and"
+        by = f"{abs(k)} frame" + ("" if abs(k) == 1 else "s")
+        text = f"the right eye was out of step by {by} ({late}) {where}; it was moved to match, and"
         names = ", ".join(map(str, unpaired))
         return Notice.warning(NoticeCode.EYES_OUT_OF_STEP, f"{text} frames without a partner were left out ({names})")
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from intrasplat.clip import DepthClip
 from intrasplat.clip.field_of_view import find_field, find_fields, find_labels, shape_of
+from intrasplat.clip.shown import with_shown_parts
+from intrasplat.errors import InputError
+from intrasplat.names import Fov
+from intrasplat.options import ReconstructionOptions
+from tests.intrasplat.clips import plane_clip
 
 H, W = 120, 160
 Rgb = NDArray[np.uint8]
@@ -132,6 +140,7 @@ def test_a_label_that_both_eyes_show_at_the_same_place_is_outside_and_textured_t
     assert not fields.left[6:14, 6:40].any()
     assert fields.entry.label_share > 0.01
     assert find_fields(eyes_with(None), range(10), "auto").left is None
+    assert find_fields(eyes_with(label), range(10), "auto", may_coincide=True).left is None
 
 
 def test_each_eye_has_its_own_field_and_the_report_says_so() -> None:
@@ -168,3 +177,42 @@ def test_a_field_that_is_hardly_wider_than_its_rim_stays() -> None:
     found = find_field(outside_as(tissue(), inside, 0.0))
     assert found.any()
     assert not found[:50].any()
+
+
+def clip_in(field: NDArray[np.bool_], *, black: int | None = None, covered: int | None = None) -> DepthClip:
+    """A clip whose field of view is this [H, W], with noise outside, a black frame, and one that masks cover."""
+    clip = plane_clip(10)
+    noise = np.random.default_rng(0).integers(0, 3, clip.rgb.shape).astype(np.uint8)
+    rgb, shown = np.where(field[..., None], clip.rgb, noise), clip.tissue.copy()
+    if black is not None:
+        rgb[black] = noise[black]
+    if covered is not None:
+        shown[covered] &= ~field
+    return replace(clip, rgb=rgb, tissue=shown)
+
+
+def small_field() -> NDArray[np.bool_]:
+    height, width = plane_clip(10).tissue.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    return np.asarray((x - width / 2) ** 2 + (y - height / 2) ** 2 < (0.3 * height) ** 2)
+
+
+def shown_parts(clip: DepthClip, fov: Fov = "auto") -> DepthClip:
+    return with_shown_parts(clip, ReconstructionOptions(fov=fov, holdout="none", use_frames="all"))
+
+
+def test_a_frame_whose_field_is_covered_by_masks_is_left_out() -> None:
+    assert shown_parts(clip_in(small_field(), covered=4)).skipped == (4,)
+
+
+@pytest.mark.parametrize("fov", ["auto", "all"])
+def test_a_black_frame_is_found_in_a_small_field(fov: Fov) -> None:
+    assert shown_parts(clip_in(small_field(), black=4), fov).skipped == (4,)
+
+
+def test_a_given_field_without_tissue_is_refused() -> None:
+    field = small_field()
+    covered = replace(clip_in(field), tissue=np.tile(~field, (10, 1, 1)), field_of_view=field)
+    with pytest.raises(InputError) as refused:
+        shown_parts(covered)
+    assert refused.value.field == "fov_mask"

@@ -8,9 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from intrasplat.clip.calibration import rectify
+from intrasplat.camera import Intrinsics
+from intrasplat.clip.calibration import RectifiedClip, rectify
 from intrasplat.notices import NoticeCode
 from intrasplat.stereo import estimate_depth
+from intrasplat.stereo.depth import _in_step, _Received
 from intrasplat.stereo.in_step import Lag, Profile, find_lag, row_profile
 from lab.phantom import PhantomSettings, make_phantom
 
@@ -89,3 +91,17 @@ def test_depth_is_that_of_eyes_in_step(k: int) -> None:
     assert NoticeCode.EYES_OUT_OF_STEP not in [each.code for each in sound.warnings]
     for t in found.used:
         np.testing.assert_array_equal(found.depth_mm[t], sound.depth_mm[t])
+
+
+def test_damage_moves_along_with_the_right_eye() -> None:
+    frames = [np.full((8, 8, 3), t, np.uint8) for t in range(5)]
+    camera = Intrinsics(width=8, height=8, fx=8, fy=8, cx=4, cy=4)
+    clip = RectifiedClip(
+        5, camera, 4.0, 0.0, lambda: iter(zip(frames, frames, strict=True)), np.ones((5, 8, 8), np.bool_),
+        np.arange(5) / 30, damaged=(3,),
+    )  # fmt: skip
+    right, small = np.stack(frames), [np.zeros((4, 4), np.float32) for _ in frames]
+    received = _Received(np.stack(frames), right, (small, list(small)), ([], []), {})
+    moved = _in_step(clip, received, [1, 2, 3, 4, None])
+    assert moved.damaged == (2, 3)
+    np.testing.assert_array_equal(right[:4, 0, 0, 0], [1, 2, 3, 4])
