@@ -82,7 +82,7 @@ class ReconstructionOptions(ClipOptions):
     )
     poses: Poses = Field(
         default="auto",
-        description="the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out",
+        description="the camera's poses: given with the clip or in a file, fixed, or to estimate; auto decides",
     )
     fov: Fov = Field(
         default="auto",

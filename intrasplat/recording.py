@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import ClipLimits, DepthClip, StereoClip
 from intrasplat.clip.calibration import load_calibration
+from intrasplat.clip.frame_times import assumed_times
 from intrasplat.clip.given_field import Mask, read_field, with_field
-from intrasplat.clip.video import FALLBACK_RATE_HZ
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.fit import fitted
 from intrasplat.intake.calibration.text import checked_calibration
@@ -184,18 +184,15 @@ def read_clip(
     network = _existing(segmenter, "segmenter")
     field_of_view = _field(fov_mask)
     if isinstance(source, np.ndarray):
-        times_s = _times_s(frame_times_s, source)
+        times_s, assumed = _times_s(frame_times_s, source)
         if depth_mm is not None:
             _refuse("right", right, "frames with depth_mm are of one eye", "Leave it out, or leave out depth_mm.")
             _refuse("calibration", calibration, "frames with depth_mm have intrinsics", "Give intrinsics instead.")
-            array = poses if isinstance(poses, np.ndarray) else None
-            clip = _depth_clip(source, depth_mm, masks, array, intrinsics, times_s)
+            clip = _depth_clip(source, depth_mm, masks, intrinsics, times_s, assumed, rests=poses is None)
             clip = clip if field_of_view is None else with_field(clip, _mask(field_of_view))
-            if poses is None or array is not None:
-                return Clip(clip, chosen, network)
-            return Clip(replace(clip, poses=None), chosen, network, _stored(poses))
+            return Clip(clip, chosen, network, _stored(poses))
         _refuse("intrinsics", intrinsics, "the cameras of a stereo clip are in its calibration", "Leave them out.")
-        frames = _stereo_frames(source, right, calibration, masks, times_s)
+        frames = _stereo_frames(source, right, calibration, masks, times_s, assumed)
         if field_of_view is not None:
             frames = replace(frames, clip=with_field(frames.clip, _mask(field_of_view)))
         return Clip(frames, chosen, network, _stored(poses))
@@ -256,15 +253,16 @@ def _check_frames(rgb: NDArray[Any], field: str) -> None:
         raise _shape_error(field, rgb, "[T, H, W, 3] uint8, RGB, of at least one frame")
 
 
-def _times_s(given: NDArray[Any] | None, rgb: NDArray[Any]) -> NDArray[np.float64]:
+def _times_s(given: NDArray[Any] | None, rgb: NDArray[Any]) -> tuple[NDArray[np.float64], tuple[Notice, ...]]:
+    """Times [T] in seconds from the first frame, and the notice of times that are assumed."""
     _check_frames(rgb, "source")
     if given is None:
-        return np.arange(len(rgb)) / FALLBACK_RATE_HZ
+        times_s, notice = assumed_times(len(rgb))
+        return times_s, (notice,)
     times_s = np.asarray(given, np.float64)
     if times_s.shape != (len(rgb),) or not np.isfinite(times_s).all() or not (np.diff(times_s) > 0).all():
         raise _shape_error("frame_times_s", times_s, f"[{len(rgb)}] finite seconds that rise")
-    from_first: NDArray[np.float64] = times_s - times_s[0]
-    return from_first
+    return times_s - times_s[0], ()
 
 
 def _tissue(masks: FilePath | NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
@@ -285,9 +283,11 @@ def _depth_clip(
     rgb: NDArray[np.uint8],
     depth_mm: NDArray[Any],
     masks: FilePath | NDArray[np.bool_] | None,
-    poses: NDArray[Any] | None,
     intrinsics: Intrinsics | None,
     times_s: NDArray[np.float64],
+    assumed: tuple[Notice, ...],
+    *,
+    rests: bool,
 ) -> DepthClip:
     count, height, width = rgb.shape[:3]
     ClipLimits().check_frame("source", "the clip", width, height)
@@ -310,30 +310,17 @@ def _depth_clip(
         depth_mm=depth,
         depth_confidence=np.where(depth > 0, np.uint8(CERTAIN), np.uint8(0)),
         intrinsics=intrinsics,
-        world_from_camera=_poses(poses, count),
+        world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
         frame_times_s=times_s,
         masks=_masks_of(tissue),
-        poses=CameraPoses(source="fixed") if poses is None else None,
+        poses=CameraPoses(source="fixed") if rests else None,
         assumptions=(
             Notice.info(NoticeCode.LAYOUT, "layout: frames and depth in memory"),
-            Notice.info(NoticeCode.POSES, f"poses: {'none were given: a fixed camera' if poses is None else 'given'}"),
+            Notice.info(NoticeCode.POSES, f"poses: {'none were given: a fixed camera' if rests else 'given'}"),
             Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),
+            *assumed,
         ),
     )
-
-
-def _poses(given: NDArray[Any] | None, count: int) -> NDArray[np.float64]:
-    """[T, 4, 4] world_from_camera, transformed so that the world is the camera of frame 0."""
-    if given is None:
-        return np.tile(np.eye(4), (count, 1, 1))
-    poses = np.asarray(given, np.float64)
-    if poses.shape != (count, 4, 4) or not np.isfinite(poses).all():
-        raise _shape_error("poses", poses, f"[{count}, 4, 4] finite world_from_camera in mm")
-    rotation = poses[:, :3, :3]
-    is_rigid = np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-    if not (is_rigid and (np.linalg.det(rotation) > 0).all() and np.allclose(poses[:, 3], (0, 0, 0, 1))):
-        raise InputError("poses", "they are not rigid.", "Give [R | t; 0 0 0 1] with rotations R, in OpenCV axes.")
-    return np.asarray(np.linalg.inv(poses[0]) @ poses)
 
 
 def _stereo_frames(
@@ -342,6 +329,7 @@ def _stereo_frames(
     calibration: FilePath | Mapping[str, Any] | None,
     masks: FilePath | NDArray[np.bool_] | None,
     times_s: NDArray[np.float64],
+    assumed: tuple[Notice, ...],
 ) -> StereoFrames:
     if not isinstance(right, np.ndarray):
         raise InputError("right", "frames in memory need the right eye's frames.", "Give right, or depth_mm.")
@@ -354,13 +342,13 @@ def _stereo_frames(
     if calibration is None:
         raise InputError("calibration", "frames of both eyes need one.", "Give a file or the values of our JSON.")
     if isinstance(calibration, Mapping):
-        stood = fitted(checked_calibration(dict(calibration)), width, height)
+        parsed = fitted(checked_calibration(dict(calibration)), width, height)
     else:
-        stood = load_calibration(_path(calibration, "calibration"), eye_width=width, eye_height=height)
+        parsed = load_calibration(_path(calibration, "calibration"), eye_width=width, eye_height=height)
 
     def pairs() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
         return zip(left, right, strict=True)
 
     layout = Notice.info(NoticeCode.LAYOUT, "layout: frames of both eyes in memory")
-    clip = StereoClip(count, height, width, pairs, _tissue(masks, left.shape[:3]), times_s, (layout,))
-    return StereoFrames(clip, stood)
+    clip = StereoClip(count, height, width, pairs, _tissue(masks, left.shape[:3]), times_s, (layout, *assumed))
+    return StereoFrames(clip, parsed)

@@ -258,7 +258,7 @@ class FieldOfView(Model):
     share: float
     """share of the left eye's picture"""
     shape: str
-    """whole: nothing of the picture was left out"""
+    """of its border; whole: the picture has none"""
     right_share: float | None = None
     """share of the right eye's; None: one eye"""
     label_share: float = 0.0
@@ -325,7 +325,7 @@ class JobOptions(Model):
     use_frames: str = "new"
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     poses: str = "auto"
-    """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
+    """the camera's poses: given with the clip or in a file, fixed, or to estimate; auto decides"""
     fov: str = "auto"
     """the part of the pictures that shows the scene: auto leaves out borders, bars and labels; all: everything"""
     min_depth_mm: float = 10.0
@@ -662,7 +662,7 @@ class GivenOptions(TypedDict, total=False):
     use_frames: Literal["new", "all"]
     """new leaves out frames of a long clip that show nothing new, such as repeats and pauses"""
     poses: Literal["auto", "given", "fixed", "estimate"]
-    """the camera's poses: given with the clip, fixed, or to estimate from a stereo clip; auto finds out"""
+    """the camera's poses: given with the clip or in a file, fixed, or to estimate; auto decides"""
     fov: Literal["auto", "all"]
     """the part of the pictures that shows the scene: auto leaves out borders, bars and labels; all: everything"""
     min_depth_mm: Annotated[float, Field(gt=0)]

@@ -22,7 +22,7 @@ def at_own_depth(*sequences: Pictures) -> tuple[Pictures, ...]:
     """The sequences, white in their 16-bit pictures being the largest number of the bits that they use, alike in all.
 
     The bits are the fewest of USUAL_BITS that hold the largest value of the whole clip: one dark frame decides nothing.
-    If these are fewer than 16, a notice tells them. Pictures are decoded until one needs all 16 bits.
+    If these are fewer than 16, a notice says so. Pictures are decoded until one needs all 16 bits.
     """
     largest = 0
     for sequence in sequences:

@@ -71,14 +71,14 @@ def frames_to_show(
     if not log.failures and not corrupt:  # frames at the ends are missing in sound videos that were cut
         missing = {time for time in missing if one_to_one and stamps[0] < time < stamps[-1]}
         missing = missing if len(missing) <= MAX_MISSING * len(packed) else set()
-    spoilt = _spoilt(log, {stamps[index] for index in corrupt} | missing)
+    unreliable = _unreliable(log, {stamps[index] for index in corrupt} | missing)
     places = sorted(numbers.keys() | missing)
-    return _shown(places, [None if time in spoilt else numbers[time] for time in places])
+    return _shown(places, [None if time in unreliable else numbers[time] for time in places])
 
 
-def _spoilt(log: PacketLog, bad: set[int]) -> set[int]:
+def _unreliable(log: PacketLog, bad: set[int]) -> set[int]:
     """The bad frames, and all that may refer to one: up to the next keyframe, and those shown before that one."""
-    spoilt, broken, leading_broken, key_time = set(bad), False, False, 0
+    unreliable, broken, leading_broken, key_time = set(bad), False, False, 0
     for sample in log.samples:
         if sample.time is None:
             continue
@@ -86,8 +86,8 @@ def _spoilt(log: PacketLog, bad: set[int]) -> set[int]:
             leading_broken, broken, key_time = broken, sample.time in bad, sample.time
         broken |= sample.time in bad
         if not sample.is_keyframe and (broken or (leading_broken and sample.time < key_time)):
-            spoilt.add(sample.time)
-    return spoilt
+            unreliable.add(sample.time)
+    return unreliable
 
 
 def _shown(times: Sequence[int | None], own: Sequence[int | None]) -> Shown:

@@ -173,8 +173,8 @@ def _tracked(first: RgbFrame, second: RgbFrame, where: NDArray[np.bool_]) -> tup
         return _NO_POINTS
     there, good, _ = cv2.calcOpticalFlowPyrLK(grey[0], grey[1], corners, None)
     back, good_back, _ = cv2.calcOpticalFlowPyrLK(grey[1], grey[0], there, None)
-    kept = (good & good_back).ravel().astype(bool) & (np.abs(back - corners).max(axis=(1, 2)) < 0.5)
-    return corners[kept, 0].astype(np.float64), there[kept, 0].astype(np.float64)
+    followed = (good & good_back).ravel().astype(bool) & (np.abs(back - corners).max(axis=(1, 2)) < 0.5)
+    return corners[followed, 0].astype(np.float64), there[followed, 0].astype(np.float64)
 
 
 def _values(depth: NDArray[np.float32], points: Reals) -> Reals:

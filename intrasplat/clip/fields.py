@@ -1,7 +1,7 @@
 """Interlaced video: finds frames whose rows are of two moments, whatever the container says, and deinterlaces them.
 
 Two fields in one frame comb wherever something moves: rows stand out from both neighbours. In film that was telecined
-to video (3:2), two of five frames comb. A field's moment within its frame is told by the frame before.
+to video (3:2), two of five frames comb. A field's moment within its frame follows from the frame before.
 
 Symbols: T frames, H W pixels, w columns of all strips.
 """

@@ -175,15 +175,15 @@ def _open_zip(path: Path, field: str, limits: ClipLimits) -> FileTree:
 
 def _without_wrapping(items: dict[str, _Item]) -> dict[str, _Item]:
     """The items without file managers' own files and wrapping folders ("clip/images/..." -> "images/...")."""
-    kept = {name: item for name, item in items.items() if not _is_litter(name)}
-    while kept:
-        first = {name.split("/", 1)[0] for name in kept}
-        if len(first) > 1 or any("/" not in name for name in kept) or first & _LAYOUT_FOLDERS:
+    items = {name: item for name, item in items.items() if not _is_system_file(name)}
+    while items:
+        first = {name.split("/", 1)[0] for name in items}
+        if len(first) > 1 or any("/" not in name for name in items) or first & _LAYOUT_FOLDERS:
             break
-        kept = {name.split("/", 1)[1]: item for name, item in kept.items()}
-    return kept
+        items = {name.split("/", 1)[1]: item for name, item in items.items()}
+    return items
 
 
-def _is_litter(name: str) -> bool:
+def _is_system_file(name: str) -> bool:
     parts = name.split("/")
     return "__MACOSX" in parts or parts[-1] == "Thumbs.db" or any(part.startswith(".") for part in parts)

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from intrasplat.notices import Notice, NoticeCode
 
+FALLBACK_RATE_HZ = 30.0
+"""Frames a second where a clip carries no times."""
 MAX_GAP_S = 10.0
 """A longer step between two frames is a jump of the clock, not a pause: no clip that is trained on rests for longer."""
 MAX_JUMPS = 0.25
@@ -39,10 +41,17 @@ def frame_times(
         if sound.all():
             return known - known[0], ()
         jumps = np.flatnonzero(~sound)
-        text = f"time: {field}: the time stamps jump {len(jumps)} times, first after frame {jumps[0]}: left out"
+        text = f"time: {field}: the time stamps jump {len(jumps)} times, first after frame {jumps[0]}: these steps "
+        text += "were replaced by the median one"
         return times_s, (Notice.info(NoticeCode.FRAME_TIMES, text),)
     if rate_hz is None or not 0 < rate_hz <= 1000:
         return None, ()
-    text = f"time: {field}: the time stamps do not rise, {rate_hz:g} frames a second are assumed"
+    text = f"time: {field}: the time stamps do not rise or are missing, {rate_hz:g} frames a second are assumed"
     notices = (Notice.info(NoticeCode.FRAME_TIMES, text),) if len(steps) else ()
     return np.arange(len(stamps_s)) / rate_hz, notices
+
+
+def assumed_times(frame_count: int) -> tuple[NDArray[np.float64], Notice]:
+    """Times [T] in seconds of frames that come without any, and the notice that says so."""
+    text = f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none"
+    return np.arange(frame_count) / FALLBACK_RATE_HZ, Notice.info(NoticeCode.FRAME_TIMES, text)

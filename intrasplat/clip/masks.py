@@ -159,8 +159,8 @@ def tissue_from_masks(
                 np.logical_not(eye, out=eye)
     assumption = Notice.info(NoticeCode.MASKS, f"masks: {_classes(levels, bright)} ({reason})")
     sequences = (masks.frames,) if masks.right is None else (masks.frames, masks.right)
-    remarks, doubts = by_severity(sequences)
-    warnings = (*_level_warnings(levels, bright), *_tissue_warnings(tissue, right), *doubts)
+    remarks, warned = by_severity(sequences)
+    warnings = (*_level_warnings(levels, bright), *_tissue_warnings(tissue, right), *warned)
     damaged = tuple(sorted({index for each in sequences for index in each.damaged}))
     if damaged and not both_eyes:
         raise InputError(_FIELD, f"{len(damaged)} of its frames are damaged.", "Export the masks again, as PNG.")

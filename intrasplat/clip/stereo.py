@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from intrasplat.clip.bit_depth import at_own_depth
 from intrasplat.clip.files import FileTree
+from intrasplat.clip.frame_times import assumed_times
 from intrasplat.clip.images import open_images
 from intrasplat.clip.masks import BrightClass, MaskFrames, tissue_from_masks
 from intrasplat.clip.naming import eye_folders, eye_of, left_eye_only, pair_names
@@ -24,7 +23,7 @@ from intrasplat.clip.packing import (
     pair_sequences,
 )
 from intrasplat.clip.types import StereoClip
-from intrasplat.clip.video import FALLBACK_RATE_HZ, open_video_in
+from intrasplat.clip.video import open_video_in
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import MIN_SIDE_PX, ClipLimits
 from intrasplat.names import MaskPolarity
@@ -109,9 +108,8 @@ def _stereo_clip(pairs: PackedPairs | TwoSequences, assumptions: tuple[Notice, .
     limits.check_clip("clip", first.label, first.frame_count, width, height, eyes=1)
     frame_times_s = first.frame_times_s
     if frame_times_s is None:
-        frame_times_s = np.arange(first.frame_count) / FALLBACK_RATE_HZ
-        text = f"time: {FALLBACK_RATE_HZ:g} frames a second, the clip carries none"
-        assumptions = (*assumptions, Notice.info(NoticeCode.FRAME_TIMES, text))
+        frame_times_s, notice = assumed_times(first.frame_count)
+        assumptions = (*assumptions, notice)
     infos, warnings = by_severity(pairs.sequences)
     return StereoClip(
         frame_count=first.frame_count,

@@ -28,7 +28,6 @@ from intrasplat.notices import Notice
 if TYPE_CHECKING:
     from intrasplat.clip.fields import Interlacing
 
-FALLBACK_RATE_HZ = 30.0
 MAX_CACHE_BYTES = 512 << 20
 
 

@@ -6,7 +6,6 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from intrasplat.commands.arguments import add_options, given_options
 from intrasplat.commands.exits import ExitCode
@@ -14,9 +13,6 @@ from intrasplat.commands.progress_bar import ProgressBar
 from intrasplat.errors import InputError
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
-
-if TYPE_CHECKING:
-    pass
 
 OPTIONS = (
     "layout",

@@ -50,7 +50,7 @@ def check_file(path: Path, part: str, limits: ClipLimits) -> None:
         with named_errors(path.name):
             look_at_calibration(text)
     elif part == "poses_file":
-        if b"\0" in path.read_bytes():
+        if decoded_text(path.read_bytes()) is None:
             raise InputError(part, f"{path.name} is not a text file.", "Send poses as TUM, JSON or text.")
     elif part == "fov_mask":
         with path.open("rb") as file:
@@ -168,7 +168,7 @@ def _head(archive: zipfile.ZipFile, member: zipfile.ZipInfo, part: str, size: in
 
 
 def _check_image(head: bytes, name: str, part: str, limits: ClipLimits) -> None:
-    if _is_litter(name):
+    if _is_system_file(name):
         return
     size = png_size(head)
     if size is not None:
@@ -177,14 +177,14 @@ def _check_image(head: bytes, name: str, part: str, limits: ClipLimits) -> None:
         raise InputError(part, f"{name} is not a PNG or JPEG image.", "Write the image again, as PNG.")
 
 
-def _is_litter(name: str) -> bool:
+def _is_system_file(name: str) -> bool:
     """Whether it is a file manager's own file, which clips ignore."""
     return "__MACOSX" in name or PurePosixPath(name).name.startswith(".")
 
 
 def _check_npy(head: bytes, name: str, part: str) -> None:
     """InputError for an array with an unusual header or of pickled objects, which run code on loading."""
-    if _is_litter(name):
+    if _is_system_file(name):
         return
     header_bytes = int.from_bytes(head[8:10] if head[6:7] == b"\1" else head[8:12], "little")
     remedy = "Save it with numpy.save as floating-point numbers."

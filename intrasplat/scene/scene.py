@@ -24,7 +24,14 @@ from intrasplat.scene.files import dtype_name
 from intrasplat.splat.deformation import Deformation
 from intrasplat.splat.gaussians import Gaussians
 
-POSE_WARNINGS = frozenset({NoticeCode.POSES_UNSURE, NoticeCode.CAMERA_OR_TISSUE, NoticeCode.POSE_JITTER})
+POSE_WARNINGS = frozenset(
+    {
+        NoticeCode.POSES_UNSURE,
+        NoticeCode.CAMERA_OR_TISSUE,
+        NoticeCode.POSE_JITTER,
+        NoticeCode.POSES_CONTRADICT,
+    }
+)
 """Warnings of a clip that every view of its scene repeats: a view is only as right as the poses of its training."""
 
 

@@ -56,6 +56,8 @@ def test_a_file_of_poses_is_kept_and_one_that_is_no_text_is_refused(service: Ser
     assert record is not None
     assert record.files.poses_file == "poses_file.tum"
     assert '"poses_file"' in record.model_dump_json()
+    parts["poses_file"] = ("poses.tum", "0 0 0 0 0 0 0 1\n".encode("utf-16"))
+    assert service.upload(parts=parts).status_code == 202
     parts["poses_file"] = ("poses.tum", b"\0\0")
     assert_problem(service.upload(parts=parts), 422, "poses_file")
 

@@ -25,13 +25,13 @@ from intrasplat.clip.depth_kind import (
     unit_warnings,
 )
 from intrasplat.clip.files import FileTree
+from intrasplat.clip.frame_times import assumed_times
 from intrasplat.clip.images import ImageSequence, as_depth_mm, open_images
 from intrasplat.clip.layouts.layout import ClipFiles, InputLayout
 from intrasplat.clip.masks import MaskFrames, TissueMasks, no_masks, tissue_from_masks
 from intrasplat.clip.naming import check_aligned
 from intrasplat.clip.poses import Poses, parse_poses
 from intrasplat.clip.types import DepthClip
-from intrasplat.clip.video import FALLBACK_RATE_HZ
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import MAX_POSES_BYTES
 from intrasplat.names import POSES_FILE, PoseConvention
@@ -77,7 +77,8 @@ def _open(files: ClipFiles) -> DepthClip:
         raise InputError(
             tree.field, f"depth/ has no valid depth {where}.", "Give millimetres as grey PNG, 0 = invalid."
         )
-    doubts = _kind_of_depth(rgb, depth_mm, masks.tissue, poses, images)
+    unusual = _kind_of_depth(rgb, depth_mm, masks.tissue, poses, images)
+    frame_times_s, rate = assumed_times(images.frame_count)
     return DepthClip(
         rgb=rgb,
         tissue=masks.tissue,
@@ -93,10 +94,10 @@ def _open(files: ClipFiles) -> DepthClip:
         ),
         world_from_camera=poses.world_from_camera,
         first_pose=poses.first_pose,
-        frame_times_s=np.arange(images.frame_count) / FALLBACK_RATE_HZ,
+        frame_times_s=frame_times_s,
         masks=Masks(source="given" if masks.given else "none", share=float(1 - masks.tissue.mean())),
-        assumptions=(*_assumptions(masks, poses, convention), *images.notices),
-        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue), *doubts),
+        assumptions=(*_assumptions(masks, poses, convention), rate, *images.notices),
+        warnings=(*masks.warnings, *_depth_warnings(depth_mm, masks.tissue), *unusual),
     )
 
 
@@ -109,7 +110,6 @@ def _assumptions(masks: TissueMasks, poses: Poses, convention: PoseConvention) -
         Notice.info(NoticeCode.POSES, f"poses: {convention} camera-to-world, {camera} camera"),
         Notice.info(NoticeCode.INTRINSICS, "intrinsics: principal point at the image centre"),
         Notice.info(NoticeCode.DEPTH_UNIT, "depth: millimetres"),
-        Notice.info(NoticeCode.FRAME_TIMES, f"time: {FALLBACK_RATE_HZ:g} frames a second, images carry none"),
     )
 
 

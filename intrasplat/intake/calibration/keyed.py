@@ -5,6 +5,7 @@ It is no parser of all of YAML: a calibration is keys with numbers, so only keys
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -147,12 +148,20 @@ def _walk_json(value: Any, parent: str, found: Keyed) -> None:
         _walk_json(below, key, found)
 
 
+def _float(value: float) -> float:
+    """As float; infinite beyond the largest, as in JSON's 1e999."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
 def _flatten(value: Any, entry: Entry) -> None:
     if isinstance(value, list):
         for each in value:
             _flatten(each, entry)
     elif isinstance(value, int | float) and not isinstance(value, bool):
-        entry.numbers.append(float(value))
+        entry.numbers.append(_float(value))
     elif isinstance(value, str) and (number := _number(value.strip())) is not None:
         entry.numbers.append(number)
     elif isinstance(value, str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -89,3 +90,12 @@ def test_no_text_keeps_who_looks_at_it(again: str, is_cut: bool) -> None:
     )
     assert ("was cut short" in looked.stderr) is is_cut
     assert looked.returncode == int(is_cut)
+
+
+def test_a_number_beyond_all_floats_is_refused_at_upload(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    matrices = {"M1": [10**400], "M2": [1], "D1": [0], "D2": [0], "R": [1], "T": [4, 0, 0]}
+    path.write_text(json.dumps(matrices))
+    with pytest.raises(InputError) as refused:
+        check_file(path, "calibration", ClipLimits())
+    assert refused.value.field == "calibration"
