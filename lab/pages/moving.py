@@ -32,6 +32,7 @@ _TISSUE = """
 those that `auto` finds; medians over clips, held-out dB
 ([how](../decisions/motion.md#tissue-that-comes-into-view-is-tracked-from-keyframes)). The last three columns are of
 tissue that has left the view: its depth error in mm, had it stayed as it was and as shown, and its confidence.
+`p1_...`: `--motions breathing --paths p1_00240 p1_06768 p1_07344 p1_16608 --frames 150 --poses true file auto`.
 """
 _MASKS = """
 ## Instruments found without masks
