@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip, StereoClip, held_out_frames, open_clip
 from intrasplat.clip.calibration import RectifiedClip, load_calibration, rectify
-from intrasplat.clip.features import find_features
 from intrasplat.clip.types import PIXELS
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.intake.calibration.types import StereoCalibration, parse_calibration
@@ -399,23 +398,3 @@ def test_damaged_frames_are_neither_measured_nor_matched_and_change_no_bit_of_th
     depth = estimate_depth(replace(clip_of(pairs), damaged=(1,)))
     assert depth.skipped == (1,)
     np.testing.assert_array_equal(depth.depth_mm[[0, 2, 3, 4]], estimate_depth(clip_of(sound)).depth_mm)
-
-
-def test_tissue_at_the_same_pixels_in_both_eyes_is_no_label() -> None:
-    offset_px = OFFSET_PX - 12
-    disparity = slanted(width=240, height=144) - np.float32(12)
-    assert np.abs(disparity).min() < 0.5
-    clip = estimate_depth(clip_of([draw_pair(disparity)] * 10, offset_px=offset_px), fov="auto")
-    assert clip.field_of_view is None
-    assert np.median(np.abs(errors_px(clip, disparity, offset_px=offset_px))) < 0.1
-
-
-def test_features_lie_at_the_same_place_in_a_picture_of_another_size() -> None:
-    large = draw_pair(slanted(width=1280, height=960))[0][:, :, 0]
-    large = cv2.GaussianBlur(large, (0, 0), 6)
-    full, reduced = (find_features(large, max_width_px=width) for width in (1280, 320))
-    apart = reduced.points[:, None] - full.points[None]
-    nearest = apart[np.arange(len(apart)), np.square(apart).sum(2).argmin(1)]
-    close = np.abs(nearest).max(1) < 2
-    assert close.sum() > 20
-    assert np.abs(np.median(nearest[close], axis=0)).max() < 0.2

@@ -99,3 +99,12 @@ def test_confidence_ranks_the_error() -> None:
     valid = clip.depth_mm[0] > 0
     rank = spearmanr(clip.depth_confidence[0][valid], np.abs(errors_px(clip, disparity))).statistic
     assert rank < -0.4
+
+
+def test_tissue_at_the_same_pixels_in_both_eyes_is_no_label() -> None:
+    offset_px = OFFSET_PX - 12
+    disparity = slanted(width=240, height=144) - np.float32(12)
+    assert np.abs(disparity).min() < 0.5
+    clip = estimate_depth(clip_of([draw_pair(disparity)] * 10, offset_px=offset_px), fov="auto")
+    assert clip.field_of_view is None
+    assert np.median(np.abs(errors_px(clip, disparity, offset_px=offset_px))) < 0.1
