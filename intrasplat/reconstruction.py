@@ -250,8 +250,8 @@ def reconstruct(
             temporary folder, which is deleted when the scene is no longer used.
         on_progress: receives a Progress between steps, for instance `print`.
         should_stop: called between steps; True ends the run.
-        options: eyes, use_frames, poses, min_depth_mm, max_depth_mm, keep_recorded, as `intrasplat reconstruct --help`
-            explains them.
+        options: eyes, use_frames, fov, poses (auto, given, fixed or estimate; read_clip takes a file of them),
+            min_depth_mm, max_depth_mm, keep_recorded, as `intrasplat reconstruct --help` explains them.
 
     Raises:
         InputError: the clip or an option cannot be used; it names the argument and the remedy.

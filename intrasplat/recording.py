@@ -154,7 +154,7 @@ def read_clip(
         masks: zip, folder or video of instruments; or [T, H, W] bool, True where an instrument hides the tissue.
         fov_mask: PNG, white where the left eye shows the scene; or [H, W] bool, True there; as recorded, before
             rectification. Both eyes may be packed side by side; else the right eye's field is found. None: both are
-            found. It does not go with fov="all".
+            found. It does not go with fov="all" of reconstruct.
         depth_mm: [T, H, W] camera z in mm, 0 where it is unknown. Only for frames of one eye in memory.
         poses: [T, 4, 4] world_from_camera in mm, OpenCV axes; or a file of them (docs/conventions.md). None: with
             depth_mm the camera is fixed, else its path is found. Poses are checked against the pictures.

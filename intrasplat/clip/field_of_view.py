@@ -27,7 +27,7 @@ from intrasplat.report import FieldOfView, FieldShape
 Mask = NDArray[np.bool_]
 Levels = NDArray[np.uint8]  # [H, W]
 
-SAMPLED, OUTLIERS, COMPARED = 24, 2, 3
+SAMPLED, OUTLIERS, COMPARED = 24, 2, 8
 """Pictures that are read, spread over the clip; how many of them may be flashes; pairs in which labels are searched."""
 BLUR_PX = 5
 MAX_BLACK_LEVELS = 32.0
@@ -53,6 +53,11 @@ LIKE_SHAPE = 0.93
 """Least share of a rectangle, or of a disc within the picture, that a field of this shape fills."""
 LABEL_SHARE, MIN_LABEL = 0.015, 5e-4
 """Share of the width: gaps between a label's edges that are closed. Share of the picture: the smallest label."""
+STROKE_LEVELS, STROKE_EDGE_LEVELS, STROKE_SHARE = 16.0, 150.0, 0.3
+"""Of text without a background: largest difference between the eyes, for codecs blur it; least gradient of its edges;
+least share of its area that these edges fill."""
+AGREEING = 0.6
+"""Share of the pairs in which an edge must lie at the same pixels in both eyes: the digits of a clock change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +115,8 @@ def find_fields(
     shape = shape_of(found[0])
     label_share = 0.0
     if len(given) < len(eyes) > 1 and not may_coincide:
-        pairs = ([eye[index] for eye in eyes] for index in spread(chosen, COMPARED))
-        labels = mapping(lambda pair: find_labels(pair[0], pair[1], found[0] & found[1]), pairs)
-        label = np.logical_and.reduce(list(labels))
+        pairs = [[eye[index] for eye in eyes] for index in spread(chosen, COMPARED)]
+        label = find_labels(pairs, found[0] & found[1], mapping)
         label_share = float(label.mean())
         found[len(given) :] = [field & ~label for field in found[len(given) :]]
     shares = [float(field.mean()) for field in found]
@@ -197,24 +201,43 @@ def _bars(darkest: Levels, brightest: Levels) -> Mask:
     return found
 
 
-def find_labels(left: RgbFrame, right: RgbFrame, field: Mask) -> Mask:
-    """[H, W] labels and menus within the field: edges that both eyes [H, W, 3] show at the same pixels, where no
-    tissue is at the same pixels in both."""
+def find_labels(pairs: Sequence[Sequence[RgbFrame]], field: Mask, mapping: Mapping = map) -> Mask:
+    """[H, W] labels and menus within the field: edges that both eyes show at the same pixels, where no tissue is at the
+    same pixels in both. They have a background of their own, or are text over the tissue.
+
+    Args:
+        pairs: pictures [H, W, 3] of the left and the right eye, spread over the clip.
+        mapping: a replacement of map(), such as a thread pool's.
+    """
     width = field.shape[1]
     within = cv2.erode(field.astype(np.uint8), _disc(LABEL_SHARE * width)) > 0
-    same = cv2.blur(cv2.absdiff(left, right).max(axis=2), (BLUR_PX, BLUR_PX)) <= SAME_LEVELS
-    label = within & same & (_gradient(left) > EDGE_LEVELS) & (_gradient(right) > EDGE_LEVELS)
-    closed = cv2.morphologyEx(label.astype(np.uint8), cv2.MORPH_CLOSE, _disc(LABEL_SHARE * width))
-    _, part, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= MIN_LABEL * closed.size
-    large[0] = False
-    return np.asarray(cv2.dilate(large[part].astype(np.uint8), _disc(RIM_SHARE * width)) > 0)
+    found = np.stack(list(mapping(lambda pair: _same_edges(*pair), pairs)))
+    label = np.zeros(field.shape, np.bool_)
+    for agreeing, least_share in zip(found.mean(axis=0) >= AGREEING, (0.0, STROKE_SHARE), strict=True):
+        edges = agreeing & within
+        closed = cv2.morphologyEx(edges.astype(np.uint8), cv2.MORPH_CLOSE, _disc(LABEL_SHARE * width))
+        _, part, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+        area = stats[:, cv2.CC_STAT_AREA]
+        large = (area >= MIN_LABEL * closed.size) & (np.bincount(part[edges], minlength=len(area)) > least_share * area)
+        large[0] = False
+        label |= large[part]
+    return np.asarray(cv2.dilate(label.astype(np.uint8), _disc(RIM_SHARE * width)) > 0)
 
 
-def _gradient(rgb: RgbFrame) -> NDArray[np.float32]:
+def _same_edges(left: RgbFrame, right: RgbFrame) -> Mask:
+    """[2, H, W] edges that both pictures [H, W, 3] show at the same pixels: with their surroundings, and alone."""
+    around = cv2.blur(cv2.absdiff(left, right).max(axis=2), (BLUR_PX, BLUR_PX)) <= SAME_LEVELS
+    softened = (cv2.GaussianBlur(eye, (3, 3), 0) for eye in (left, right))
+    alone = cv2.absdiff(*softened).max(axis=2) <= STROKE_LEVELS
+    slopes = np.minimum(_slope(left), _slope(right))
+    wide = np.minimum(*(cv2.dilate(_slope(eye), np.ones((3, 3), np.uint8)) for eye in (left, right)))
+    return np.stack([around & (wide > EDGE_LEVELS), alone & (slopes > STROKE_EDGE_LEVELS)])
+
+
+def _slope(rgb: RgbFrame) -> NDArray[np.float32]:
+    """[H, W] gradient of the brightness (Sobel, 3 x 3), levels."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    slope = cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
-    return np.asarray(cv2.dilate(slope, np.ones((3, 3), np.uint8)), np.float32)
+    return np.asarray(cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)), np.float32)
 
 
 def _touching_border(pixels: Mask) -> Mask:

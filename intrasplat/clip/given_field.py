@@ -1,4 +1,4 @@
-"""A field of view that the caller gives: a picture of one eye or of both, not black where it shows the scene.
+"""A field of view that the caller gives: a picture of one eye or of both, white where it shows the scene.
 
 Symbols: H W pixels of one eye, as recorded.
 """
@@ -28,7 +28,7 @@ _REMEDY = "Give a PNG that is white where the picture shows the scene, and black
 
 
 def read_field(path: Path, limits: ClipLimits) -> Mask:
-    """The pixels of a PNG that are not black, as a bool array of the picture's size; alpha does not count.
+    """The pixels of a PNG that are brighter than half of its brightest, as a bool array; alpha does not count.
 
     Raises:
         InputError: there is no such file, or it is no PNG or damaged.
@@ -47,7 +47,8 @@ def read_field(path: Path, limits: ClipLimits) -> Mask:
     limits.check_frame(FIELD, path.name, *size)
     image = decode_image(data, FIELD, path.name)
     limits.on_picture()
-    return np.asarray(image > 0 if image.ndim == 2 else (image[:, :, :3] > 0).any(axis=2))
+    levels = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
+    return np.asarray(levels > levels.max() / 2)
 
 
 @overload

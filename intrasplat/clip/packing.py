@@ -108,7 +108,7 @@ def pair_sequences(left: FrameSequence, right: FrameSequence) -> TwoSequences:
         raise InputError(
             "right",
             f"the right eye has {right.frame_count} frames, the left {left.frame_count}.",
-            "Cut both to the same frames.",
+            "Give both the same number of frames; frames that are missing within one of them are found.",
         )
     rates_hz = [_rate_hz(each) for each in (left, right)]
     if 0 < min(rates_hz) * MAX_RATE_RATIO < max(rates_hz):

@@ -20,7 +20,8 @@ def add_command(
     commands: Commands, name: str, summary: str, command: Callable[[argparse.Namespace], int]
 ) -> argparse.ArgumentParser:
     """A parser for one command. It stores `command` in the namespace and lists the exit codes in its help."""
-    parser = commands.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
+    description = f"{summary[0].upper()}{summary[1:]}."
+    parser = commands.add_parser(name, help=summary, description=description, allow_abbrev=False)
     parser.epilog = EXIT_CODES_HELP
     parser.set_defaults(command=command)
     return parser

@@ -15,6 +15,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 
 OPTIONS = (
+    "fov",
     "layout",
     "mask_polarity",
     "mask_source",

@@ -162,7 +162,7 @@ def _posed_or_fixed(clip: DepthClip, found: FoundPath, options: ReconstructionOp
         warnings.append(Notice.warning(NoticeCode.POSES_UNSURE, text))
     text = (
         f"poses: the camera moved by {found.extent_mm:.1f} mm and {found.extent_deg:.1f} degrees; its path fits the "
-        f"rigid parts within {found.rigid_fit_mm:.2f} mm, and is good to {found.sigma_mm:.1f} mm and "
+        f"rigid parts within {found.rigid_fit_mm:.2f} mm, and is good to about {found.sigma_mm:.1f} mm and "
         f"{found.sigma_deg:.1f} degrees"
     )
     entry = _report_entry(clip, "estimated", found)

@@ -142,7 +142,7 @@ def estimate_depth(
             hooks.on_progress(Progress(STAGE, 1 - share * (len(wanted) - done) / len(wanted)))
     pixels, valid, sure = (int(each) for each in work.counts.sum(axis=0))
     valid_share, sure_share = valid / max(pixels, 1), sure / max(pixels, 1)
-    _check_depth(sure_share)
+    _check_depth(sure_share, has_given_field=bool(clip.given_fields))
     share = 1 - pixels / (len(wanted) * work.matched.field_pixels)
     masks, assumptions = Masks(source="given", share=share), clip.assumptions
     mask_warnings: tuple[Notice, ...] = ()
@@ -316,13 +316,14 @@ def _match_on_device(work: FrameWork, order: Sequence[int], pool: ThreadPoolExec
         yield from [(i, pool.submit(work.finish, i)) for i in batch]
 
 
-def _check_depth(sure_share: float) -> None:
+def _check_depth(sure_share: float, *, has_given_field: bool) -> None:
     """Refuse a clip whose share of tissue with sure depth is below MIN_SURE_SHARE."""
     if sure_share < MIN_SURE_SHARE:
+        masks = "masks fit the frames, and that fov_mask is white inside" if has_given_field else "masks fit the frames"
         raise InputError(
             "clip",
             f"{sure_share:.1%} of tissue pixels have a depth to rely on, as good as none.",
-            "Check focus, that left and right belong together, and that the calibration and masks fit the frames.",
+            f"Check focus, that left and right belong together, that the calibration and {masks}.",
         )
 
 

@@ -43,6 +43,9 @@ sides that the clip never saw."""
 LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
 """A frame warns when more than MAX_LOW_SHARE of its pixels show Gaussians of less trust than LOW_TRUST."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
+MIN_FOLLOWED = 0.75
+"""A frame warns if its confidence is multiplied by less than this, because the motion was not followed."""
+GUESSED = "This moment lies between training frames that are too far apart to follow the tissue: its place is a guess."
 MAX_UNSEEN_SHARE = 0.05
 """A frame warns when more than this share of its pixels is unseen."""
 HIGHLIGHTS_STAY = "This scene was taught by one eye, so its highlights are not known apart: they stay."
@@ -221,6 +224,8 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     unseen = unseen_pixels(picture.missing)
     yield
     outside = clamped_to_clip(scene, view.t)[1]
+    if followed(scene, view.shown_t) < MIN_FOLLOWED:
+        outside = (*outside, Notice.warning(NoticeCode.MOTION_GUESSED, GUESSED))
     warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(view, picture.trust, unseen))
     if not view.highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))

@@ -132,7 +132,7 @@ def test_a_label_that_both_eyes_show_at_the_same_place_is_outside_and_textured_t
     label = np.zeros((14, 40, 3), np.uint8)
     cv2.putText(label, "12:34", (1, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255))
     left, right = eyes_with(label)
-    found = find_labels(left[0], right[0], np.ones((H, W), np.bool_))
+    found = find_labels([(left[0], right[0])], np.ones((H, W), np.bool_))
     assert found[6:14, 6:40].mean() > 0.9
     assert found[30:].sum() == 0
     fields = find_fields(eyes_with(label), range(10), "auto")
@@ -141,6 +141,19 @@ def test_a_label_that_both_eyes_show_at_the_same_place_is_outside_and_textured_t
     assert fields.entry.label_share > 0.01
     assert find_fields(eyes_with(None), range(10), "auto").left is None
     assert find_fields(eyes_with(label), range(10), "auto", may_coincide=True).left is None
+
+
+def test_text_over_the_tissue_is_outside_and_its_changing_digits_do_not_hide_it() -> None:
+    eyes = [np.stack([cv2.resize(each, (3 * W, 3 * H)) for each in eye]) for eye in eyes_with(None)]
+    for eye in eyes:
+        for index, picture in enumerate(eye):
+            cv2.putText(picture, f"REC 12:3{index % 10}", (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255))
+    field = find_fields(eyes, range(10), "auto").left
+    assert field is not None
+    strokes = (np.stack(eyes).min(axis=(0, 1, 4)) == 255) & (np.arange(3 * W) < 60)
+    assert strokes.sum() > 100
+    assert field[strokes].mean() < 0.1
+    assert field[30:].all()
 
 
 def test_each_eye_has_its_own_field_and_the_report_says_so() -> None:
