@@ -51,6 +51,9 @@ Eye = Literal["left", "right"]
 Keep = Literal["on", "off"]
 """Whether something is stored with a scene."""
 
+Light = Literal["steady", "recorded"]
+"""The light of a render's colours: that of one frame at all times, or that in which the moment was recorded."""
+
 UsedFrames = Literal["new", "all"]
 """The frames of a clip that a model may be trained on."""
 

@@ -49,6 +49,7 @@ class NoticeCode(StrEnum):
     # choices of the training
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
+    EXPOSURE = "exposure"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
     # warnings about the clip

@@ -58,6 +58,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
             "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_WARNINGS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
             **({} if run.motion_error is None else {"motion_error": run.motion_error}),
+            **({} if run.exposure is None else {"log_gains": run.exposure.log_gains.tolist()}),
         },
     )
 
@@ -85,7 +86,12 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
-        assumptions=(*run.chosen, *run.schedule.notices, *(quantized.notices if quantized else (_floats(scene),))),
+        assumptions=(
+            *(() if run.exposure is None else (run.exposure.notice,)),
+            *run.chosen,
+            *run.schedule.notices,
+            *(quantized.notices if quantized else (_floats(scene),)),
+        ),
         measurements=quantized.measurements if quantized else {},
         warnings=_warnings(run),
         versions={"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},

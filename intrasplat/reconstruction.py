@@ -25,7 +25,7 @@ from intrasplat.errors import InputError
 from intrasplat.export import export_parts
 from intrasplat.formats import EXPORT_FORMATS, check_export
 from intrasplat.machine.hooks import Progress, ignore, never
-from intrasplat.names import MANIFEST, REPORT, RESUME_STATE
+from intrasplat.names import MANIFEST, REPORT, RESUME_STATE, Light
 from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
 from intrasplat.picture import MAX_RENDER_PIXELS, IntrinsicsOverride
 from intrasplat.pipeline import reconstruct as run_pipeline
@@ -102,6 +102,7 @@ class Scene:
         height: int | None = None,
         intrinsics: Intrinsics | None = None,
         highlights: bool = True,
+        light: Light = "steady",
     ) -> View:
         """The scene at model time t from a pose, instruments removed.
 
@@ -111,6 +112,8 @@ class Scene:
             width, height: size of the picture in pixels; one alone keeps the aspect ratio. Default: the clip's size.
             intrinsics: another camera, instead of width and height.
             highlights: whether to show the highlights that were separated by means of the two eyes of a stereo clip.
+            light: "steady": where exposure or white balance change in the clip, that of one frame at all times;
+                "recorded": that in which the moment was recorded.
 
         Returns:
             A View with rgb [H, W, 3] uint8, depth_mm [H, W] float32 (0: nothing solid), confidence [H, W] float32 in
@@ -138,7 +141,8 @@ class Scene:
                 raise InputError(field, problem, "Give 8 to 8192 pixels.") from error
             camera = camera_of(self.intrinsics, wanted, MAX_RENDER_PIXELS)
         device = choose_device(self._device)
-        return render_frame(self.trained, t, self._world_from_camera(pose), camera, device, highlights=highlights)
+        world_from_camera = self._world_from_camera(pose)
+        return render_frame(self.trained, t, world_from_camera, camera, device, highlights=highlights, light=light)
 
     def _world_from_camera(self, pose: Any) -> NDArray[np.float64] | None:
         if isinstance(pose, np.ndarray):

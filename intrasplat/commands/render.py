@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import get_args
 
 from pydantic import ValidationError
 
@@ -12,6 +13,7 @@ from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
+from intrasplat.names import Light
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 SUFFIX_FORMATS = {
@@ -51,6 +53,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         default=Unseen.MARK.value,
         help="what to show where no frame of the clip saw anything: mark: a hatch, transparent in PNG and WebP, and "
         "depth and confidence 0; guess: what the model draws there (default: mark)",
+    )
+    parser.add_argument(
+        "--light",
+        choices=get_args(Light),
+        default="steady",
+        help="where exposure or white balance change: steady: colours in the light of one frame; recorded: in that of "
+        "the moment (default: steady)",
     )
     parser.add_argument(
         "--highlights",
@@ -101,7 +110,7 @@ def run_cli(options: argparse.Namespace) -> int:
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
-        frame = render_frame(scene, t, pose, camera, device, highlights=highlights)
+        frame = render_frame(scene, t, pose, camera, device, highlights=highlights, light=options.light)
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +48,13 @@ def take_scene(
     on_step(0.3)
     try:
         scene = load_scene(folder)
-        warnings, motion_error = scene.pose_warnings, scene.motion_error
+        settings = _settings(scene)
     except SceneError as error:
         words = str(error).replace(f"{folder}/", "").replace(str(folder), archive.name)
         raise InputError(FIELD, words, AGAIN) from error
     except MISFITS as error:
         raise InputError(FIELD, f"The scene's settings cannot be read ({type(error).__name__}).", AGAIN) from error
-    check_words(MANIFEST, " ".join(each.text for each in warnings))  # every view repeats them in a header
+    check_words(MANIFEST, " ".join(each.text for each in scene.pose_warnings))  # every view repeats them in a header
     on_step(0.6)
     _check_recording(scene, limits)
     _check_report(scene, read.report)
@@ -61,7 +62,7 @@ def take_scene(
     for name in kept:
         check_file(folder / name, FIELD, limits)
     (folder / THUMBNAIL).unlink(missing_ok=True)  # a new one is rendered, so that it shows this scene
-    save_scene(folder, _known(scene, warnings, motion_error), {name: (folder / name).read_bytes() for name in kept})
+    save_scene(folder, replace(scene, settings=settings), {name: (folder / name).read_bytes() for name in kept})
     report = _from_elsewhere(read.report, imported)
     if RECORDED not in kept:
         report = report.model_copy(update={"recorded": None})
@@ -70,10 +71,11 @@ def take_scene(
     return report
 
 
-def _known(scene: TrainedScene, warnings: tuple[Notice, ...], motion_error: float) -> TrainedScene:
-    """The scene with only the settings that views need: its report says how it was trained."""
-    settings = {"pose_warnings": [each.model_dump(mode="json") for each in warnings], "motion_error": motion_error}
-    return replace(scene, settings=settings)
+def _settings(scene: TrainedScene) -> dict[str, Any]:
+    """The settings that views need, checked: the scene's report says how it was trained."""
+    light = {} if scene.log_gains is None else {"log_gains": scene.log_gains.tolist()}
+    warnings = [each.model_dump(mode="json") for each in scene.pose_warnings]
+    return {"pose_warnings": warnings, "motion_error": scene.motion_error, **light}
 
 
 def _check_recording(scene: TrainedScene, limits: ClipLimits) -> None:

@@ -35,6 +35,10 @@ POSE_WARNINGS = frozenset(
 """Warnings of a clip that every view of its scene repeats: a view is only as right as the poses of its training."""
 
 
+MAX_LOG_GAIN = 5.0
+"""Seven octaves of recorded values, more than a camera's range."""
+
+
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
     """A trained model, and everything that rendering it needs.
@@ -94,6 +98,29 @@ class TrainedScene:
         if not 0 <= error < math.inf:
             raise ValueError(f"motion_error is {error}")
         return error
+
+    @cached_property
+    def log_gains(self) -> NDArray[np.float64] | None:
+        """[T, 3] logarithms of the recorded frames' gains of R G B against the model's light; None: they are equal.
+
+        Raises:
+            ValueError: the stored numbers are not those.
+        """
+        stored = self.settings.get("log_gains")
+        if stored is None:
+            return None
+        found = np.array(stored, np.float64)
+        if found.shape != (self.frame_count, 3) or not (np.abs(found) <= MAX_LOG_GAIN).all():
+            raise ValueError(f"log_gains are not {self.frame_count} x 3 numbers up to {MAX_LOG_GAIN:g}")
+        return found
+
+    def gains(self, t: float) -> NDArray[np.float32] | None:
+        """[3] gains of R G B of the light in which model time t was recorded, against the model's; None: all are 1."""
+        if self.log_gains is None:
+            return None
+        frame = t * self.frame_count
+        logs = [np.interp(frame, np.arange(self.frame_count), each) for each in self.log_gains.T]
+        return np.exp(logs).astype(np.float32)
 
     def without_motion(self) -> TrainedScene:
         """The scene without the weights of its motion, for a caller that has them elsewhere."""

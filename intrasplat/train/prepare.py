@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from intrasplat.fusion import fuse
 from intrasplat.machine.memory import LITTLE_BYTES, keep_free_memory
 from intrasplat.methods.method import Preset
+from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.tracks import Tracks, moved_along
 from intrasplat.notices import Notice
@@ -30,16 +32,21 @@ def prepare(setup: Setup) -> Run:
         InputError: no training frame has valid depth.
         Cancelled: hooks.should_stop() returned True.
     """
-    clip, train, timings = setup.clip, setup.split.train, setup.timings
-    scale = units_per_mm(clip, train)
+    train, timings = setup.split.train, setup.timings
+    scale = units_per_mm(setup.clip, train)
     examine_device(setup)
     tracks = _tracks(setup)
+    exposure = find_exposure(setup.clip, train, tracks)
+    steady = in_light_of(setup, exposure)
+    if exposure is not None:
+        tracks = _tracks(steady)  # flow follows tissue better in steady light
+    clip = steady.clip
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
         preset, chosen, motion_error = resolve_preset(setup.preset, tracks, clip, train)
     with timings.measure("fusion_s"):
         moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
-        right = setup.teaching_eyes[1] if len(setup.teaching_eyes) > 1 else None
+        right = steady.teaching_eyes[1] if len(steady.teaching_eyes) > 1 else None
         fusion = fusion_for(preset, clip.intrinsics)
         cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
     preset, fewer = bounded(preset, len(cloud.points_mm))
@@ -48,11 +55,17 @@ def prepare(setup: Setup) -> Run:
         model = start_model(
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
-    run = new_run(setup, frames_of(setup, scale), model, preset, (*chosen, *fewer), box_of(model))
+    run = new_run(setup, frames_of(steady, scale), model, preset, (*chosen, *fewer), box_of(model))
+    run.exposure = exposure
     keep_free_memory(LITTLE_BYTES)
     run.motion_error = motion_error
     run.schedule = _schedule(run)
     return run
+
+
+def in_light_of(setup: Setup, exposure: Exposure | None) -> Setup:
+    """The setup with the clip to train on: in steady light if its exposure changes, else as it is."""
+    return setup if exposure is None else replace(setup, clip=in_steady_light(setup.clip, exposure))
 
 
 def examine_device(setup: Setup) -> None:

@@ -47,7 +47,7 @@ def sample_frames(frames: Sequence[int], count: int = SAMPLED_FRAMES) -> list[in
 
 
 def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None) -> FrameRenderer:
-    """A function that renders frames of the run, depth in mm, from the left eye or from `eye`, the clip's right one.
+    """A function that renders frames of the run as recorded, depth in mm, from the left eye or `eye`, the right.
     `model` renders instead of the run's."""
     seen_by, scale = eye or run.setup.clip, run.frames.scale
     side = run.setup.sides[0 if eye is None else 1]
@@ -56,7 +56,10 @@ def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None)
         camera = camera_vector(camera_in_units(seen_by.intrinsics, seen_by.world_from_camera[index], scale, side))
         image = (model or run.model).render(camera, float(run.frames.t[index])).copy()
         depth_mm = solid_depth_mm(image[3], image[4], scale)
-        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+        rgb = image[:3].transpose(1, 2, 0)
+        if run.exposure is not None:
+            rgb = rgb * np.exp(run.exposure.log_gains[index]).astype(np.float32)
+        return RenderedFrame(rgb, depth_mm, image[4])
 
     return render
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
 from intrasplat.machine.parts import Parts, whole
+from intrasplat.names import Light
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MAX_JUDGED_PIXELS
 from intrasplat.scene.model import model_of
@@ -106,10 +107,11 @@ class SceneRenderer:
                 picture.close()
 
     def seen_from(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
-        """The scene's colour, depth in mm and alpha at model time t."""
+        """The scene's colour in the light of the recording, depth in mm and alpha at model time t."""
         image, _ = self.layers(t, world_from_camera, intrinsics)
         depth_mm = solid_depth_mm(image[3], image[4], self.scene.units_per_mm)
-        return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
+        rgb, gains = image[:3].transpose(1, 2, 0), self.scene.gains(t)
+        return RenderedFrame(rgb if gains is None else rgb * gains, depth_mm, image[4])
 
     def values(self, t: float) -> NDArray[np.float32] | None:
         """blended_values [N] at model time t: trust where positive. None: not known."""
@@ -158,6 +160,7 @@ class ViewRequest:
     intrinsics         None: the recording's
     device             device that renders
     highlights         True: as the endoscope's eyes saw them, and their mean away from both; False: without highlights
+    light              "steady": that of one frame, at all times; "recorded": that of the time
     is_coarse          draw and judge no more pixels than asked for, because time is short
     max_pixels         limit of the pixels in which a smaller picture is drawn and judged
     """
@@ -168,6 +171,7 @@ class ViewRequest:
     intrinsics: Intrinsics | None = None
     device: Device = CPU
     highlights: bool = True
+    light: Light = "steady"
     is_coarse: bool = False
     max_pixels: int = MAX_JUDGED_PIXELS
 
@@ -207,9 +211,10 @@ def render_frame(
     device: Device = CPU,
     *,
     highlights: bool = True,
+    light: Light = "steady",
 ) -> View:
     """Render the scene at model time t from a pose through a camera. The arguments are those of ViewRequest."""
-    return whole(frame_in_parts(ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights)))
+    return whole(frame_in_parts(ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights, light)))
 
 
 def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts[View]:
@@ -265,8 +270,13 @@ class _Picture:
         colours = np.empty((3, *size), np.float32) if with_colours else None
         return cls(rgb, depth_mm, missing, np.zeros(size, np.float32), colours)
 
-    def fill(self, rows: slice, band: NDArray[np.float32], units_per_mm: float) -> None:
-        """Set these rows from the blended planes R G B Z A and, if known, blended_values: [5 or 6, h, W]."""
+    def fill(
+        self, rows: slice, band: NDArray[np.float32], units_per_mm: float, gains: NDArray[np.float32] | None
+    ) -> None:
+        """Set these rows from the blended planes R G B Z A and, if known, blended_values: [5 or 6, h, W].
+
+        gains: [3], of rgb alone.
+        """
         alpha, blended = band[4], band[5] if len(band) > 5 else None
         solid = alpha >= COVERED_ALPHA
         self.missing[rows] = missing_pixels(solid, blended)
@@ -274,7 +284,8 @@ class _Picture:
             self.trust[rows] = np.clip(blended / np.where(solid, alpha, 1), 0, 1) * solid
         if self.colours is not None:
             self.colours[:, rows] = band[:3]
-        self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255)
+        levels = np.float32(255) if gains is None else 255 * gains
+        self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * levels + 0.5, 0, 255)
         self.depth_mm[rows] = solid_depth_mm(band[3], alpha, units_per_mm)
 
 
@@ -285,8 +296,9 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Par
         projected.sort()
         yield
         picture = _Picture.empty(lens.height, lens.width, with_colours=with_colours)
+        gains = view.scene.gains(view.shown_t) if view.light == "recorded" else None
         for rows in projected.bands:
-            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm)
+            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm, gains)
             yield
     return picture
 

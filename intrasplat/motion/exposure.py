@@ -1,0 +1,114 @@
+"""The camera's exposure and white balance in every frame, measured along tracks, and frames in steady light.
+
+A gain of light acts before the camera's tone curve. That curve is about a power, so the gain multiplies the recorded
+values of a channel, too. Each measurement is a median over tissue of log(colour there / colour in the keyframe).
+
+Symbols: T frames, H W pixels, K training frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip, Eye
+from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.motion.lifted import cell_means
+from intrasplat.motion.tracks import Tracks
+from intrasplat.notices import Notice, NoticeCode
+
+Reals = NDArray[np.float64]
+EyeOrClip = TypeVar("EyeOrClip", Eye, DepthClip)
+
+MIN_CONFIDENCE, MIN_CELLS = 0.3, 30
+"""Of a track that is measured; fewest tracks of a frame."""
+MIN_LEVEL, MAX_LEVEL = 0.08, 0.95
+"""Colours in [0, 1] that are measured: noise and the tone curve's foot spoil darker ones, clipping brighter ones."""
+MIN_CHANGE, MIN_TINT = 0.3, 0.12
+"""Least range of the log gains' mean (one stop is 0.32), and of red or blue against green, that is corrected. The bases
+follow smaller changes as well, and lamps change with the place, which one gain cannot follow."""
+TONE_POWER = 2.2
+"""Light is about this power of recorded values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Natural logarithms [T, 3] of each frame's gains of R G B against those of the frame `reference`."""
+
+    log_gains: Reals
+    reference: int
+
+    @property
+    def notice(self) -> Notice:
+        """The report's sentence on the light."""
+        stops = np.ptp(self.log_gains.mean(axis=1)) * TONE_POWER / np.log(2)
+        tint = np.exp(np.ptp(self.log_gains - self.log_gains[:, 1:2], axis=0).max())
+        text = (
+            f"light: exposure changes by {stops:.1f} stops and white balance by {tint:.2f} times; the model has the "
+            f"light of frame {self.reference}"
+        )
+        return Notice.info(NoticeCode.EXPOSURE, text)
+
+
+def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks]) -> Exposure | None:
+    """The exposure of every frame; None: it hardly changes, or too few tracks show it.
+
+    Only training frames are measured. The gains of other frames are interpolated in time.
+    """
+    rows, values = list[Reals](), list[Reals]()
+    for key, place, log_gain, share in _measurements(clip, train, tracks):
+        row = np.zeros(len(train))
+        row[place], row[key] = share, -share
+        rows.append(row)
+        values.append(share * log_gain)
+    if not rows:
+        return None
+    system, known = np.array(rows), np.any(np.array(rows) != 0, axis=0)
+    found, *_ = np.linalg.lstsq(system[:, known], np.array(values), rcond=None)
+    if np.ptp(found.mean(axis=1)) < MIN_CHANGE and np.ptp(found - found[:, 1:2], axis=0).max() < MIN_TINT:
+        return None
+    measured = np.asarray(train)[known]
+    usual = int(np.abs(found - np.median(found, axis=0)).sum(axis=1).argmin())
+    found -= found[usual]
+    times_s = clip.frame_times_s
+    log_gains = np.stack([np.interp(times_s, times_s[measured], channel) for channel in found.T], axis=1)
+    return Exposure(log_gains, int(measured[usual]))
+
+
+def _measurements(
+    clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks]
+) -> Iterator[tuple[int, int, Reals, float]]:
+    """A keyframe, a frame (indices into train), log gains [3] of the one against the other, share of cells measured."""
+    for each in tracks:
+        start = cell_means(clip.rgb[train[each.reference]], each.step_px).astype(np.float32) / np.float32(255)
+        for row, place in enumerate(each.followed.tolist()):
+            if place == each.reference:
+                continue
+            there = start + each.colour[row]
+            low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
+            good = (each.confidence[row] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
+            each.let_go(row)
+            if good.sum() >= MIN_CELLS:
+                log_gain = np.median(np.log(there[good] / start[good]), axis=0).astype(np.float64)
+                yield each.reference, place, log_gain, float(good.mean())
+
+
+def in_steady_light(clip: DepthClip, exposure: Exposure) -> DepthClip:
+    """The clip as if every frame had the reference's light."""
+    right = None if clip.right is None else _steady(clip.right, exposure)
+    return replace(_steady(clip, exposure), right=right)
+
+
+def _steady(eye: EyeOrClip, exposure: Exposure) -> EyeOrClip:
+    rgb, levels = mapped_zeros(eye.rgb.shape, np.uint8), np.arange(256)[:, None]
+    for index, log_gain in enumerate(exposure.log_gains):
+        table = np.clip(levels / np.exp(log_gain) + 0.5, 0, 255).astype(np.uint8)
+        cv2.LUT(eye.rgb[index], table.reshape(1, 256, 3), dst=rgb[index])
+        eye.let_go(index)
+        let_go(rgb[index])
+    return replace(eye, rgb=rgb)
