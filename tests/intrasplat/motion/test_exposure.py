@@ -1,0 +1,106 @@
+"""Exposure and white balance that change are measured along tracks, trained without, and shown on request."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip, split_frames
+from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
+from intrasplat.motion.keyframes import track_keyframes
+from intrasplat.notices import NoticeCode
+from intrasplat.outcome import snapshot_of, training_of
+from intrasplat.train.scoring import frame_renderer
+from intrasplat.view.render import render_frame
+from tests.intrasplat.phantoms import FRAMES, keep, kept, phantom_clip, prepared, trained
+
+STOPS, TINT = 1.5, 1.3
+
+
+def drifting(stops: float, tint: float = 1.0) -> tuple[DepthClip, NDArray[np.float64]]:
+    """A clip whose exposure and white balance change, and its log gains [T, 3]."""
+    clip, share = phantom_clip(tools=False), np.arange(FRAMES) / FRAMES
+    stop = stops / 2 * np.sin(2 * np.pi * share) * np.log(2) / 2.2
+    red = np.log(tint) * share
+    logs = stop[:, None] + red[:, None] * np.array([1.0, 0.0, -1.0])
+    rgb = np.clip(clip.rgb * np.exp(logs)[:, None, None] + 0.5, 0, 255).astype(np.uint8)
+    return dataclasses.replace(clip, rgb=rgb), logs
+
+
+@cache
+def found(stops: float, tint: float = 1.0) -> tuple[DepthClip, Exposure | None, NDArray[np.float64]]:
+    clip, logs = drifting(stops, tint)
+    train = split_frames(clip).train
+    return clip, find_exposure(clip, train, track_keyframes(clip, train)), logs
+
+
+@pytest.mark.parametrize(("stops", "tint"), [(STOPS, 1.0), (0.0, TINT), (STOPS, TINT)])
+def test_gains_that_change_are_measured_to_a_few_per_cent(stops: float, tint: float) -> None:
+    clip, exposure, logs = found(stops, tint)
+    assert exposure is not None
+    train = split_frames(clip).train
+    true = (logs - logs[exposure.reference])[train]
+    assert np.abs(exposure.log_gains[train] - true).max() < 0.08
+    assert not exposure.log_gains[exposure.reference].any()
+
+
+def test_light_that_hardly_changes_is_left_alone() -> None:
+    assert found(0.0)[1] is None
+    assert found(0.3)[1] is None
+    assert "log_gains" not in snapshot_of(prepared(phantom_clip())[0]).settings
+
+
+def test_held_out_frames_are_not_read() -> None:
+    clip, exposure, _ = found(STOPS)
+    split = split_frames(clip)
+    poisoned = dataclasses.replace(clip, rgb=clip.rgb.copy())
+    poisoned.rgb[split.held_out] = 255
+    again = find_exposure(poisoned, split.train, track_keyframes(poisoned, split.train))
+    assert exposure is not None
+    assert again is not None
+    np.testing.assert_array_equal(again.log_gains, exposure.log_gains)
+
+
+def test_a_clip_in_steady_light_has_the_light_of_the_reference() -> None:
+    clip, exposure, _ = found(STOPS, TINT)
+    assert exposure is not None
+    steady = in_steady_light(clip, exposure)
+    np.testing.assert_array_equal(steady.rgb[exposure.reference], clip.rgb[exposure.reference])
+    before, after = (each.rgb[split_frames(clip).train].mean(axis=(1, 2)).std(axis=0) for each in (clip, steady))
+    assert (after < 0.4 * before)[[0, 2]].all()
+
+
+def test_a_scene_shows_steady_light_or_the_recorded_one_and_resumes_with_its_gains(tmp_path: Path) -> None:
+    clip, _ = drifting(STOPS)
+    run = prepared(clip)[0]
+    assert run.exposure is not None
+    keep(tmp_path, run)
+    again = kept(tmp_path, prepared(clip)[0])
+    assert again.exposure is not None
+    np.testing.assert_array_equal(again.exposure.log_gains, run.exposure.log_gains)
+    trained(run)
+    scene = snapshot_of(run)
+    frame = int(np.abs(run.exposure.log_gains.mean(axis=1)).argmax())
+    t = frame / FRAMES
+    steady, recorded = (render_frame(scene, t, light=light).rgb for light in ("steady", "recorded"))
+    gains = np.exp(run.exposure.log_gains[frame])
+    inner = (steady > 40) & (steady < 180)
+    assert np.median((recorded / np.maximum(steady, 1) / gains)[inner]) == pytest.approx(1, abs=0.02)
+    np.testing.assert_allclose(
+        np.clip(frame_renderer(run)(frame).rgb, 0, 1) * 255, recorded, atol=1.1
+    )  # held-out scores are in the recorded light
+    assert NoticeCode.EXPOSURE in {each.code for each in training_of(run, scene, None).assumptions}
+
+
+@pytest.mark.parametrize(
+    "wrong", [[[0.0] * 3], [[0.0] * 2] * FRAMES, [[9.0] * 3] * FRAMES, [[float("nan")] * 3] * FRAMES]
+)
+def test_gains_that_are_none_are_refused(wrong: list[list[float]]) -> None:
+    scene = snapshot_of(prepared(phantom_clip())[0])
+    with pytest.raises(ValueError, match="log_gains"):
+        _ = dataclasses.replace(scene, settings={"log_gains": wrong}).log_gains
