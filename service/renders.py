@@ -19,7 +19,7 @@ from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
-from intrasplat.names import Eye
+from intrasplat.names import Eye, Light
 from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 from intrasplat.pose import Pose, parse_pose
@@ -146,6 +146,11 @@ class RenderQuery(ViewQuery):
         default=Highlights.ON,
         description="off: colours without the highlights that the eyes of a stereo clip saw differently. A scene that "
         "one eye taught knows none: it is shown as it is, with the notice highlights_unknown. Changes layer rgb alone",
+    )
+    light: Light = Field(
+        default="steady",
+        description="the light of layer rgb where exposure or white balance change in the clip. steady: that of one "
+        "frame at all times; recorded: that in which the moment was recorded",
     )
 
 
@@ -295,6 +300,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         quality=query.quality,
         unseen=query.unseen,
         highlights=query.highlights,
+        light=query.light,
         max_pixels=settings.max_render_pixels,
     )
 

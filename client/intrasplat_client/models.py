@@ -79,6 +79,7 @@ class NoticeCode(StrEnum):
     SYNTHETIC = "synthetic"
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
+    EXPOSURE = "exposure"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
     ALIGNMENT_UNKNOWN = "alignment_unknown"

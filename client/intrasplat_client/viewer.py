@@ -42,11 +42,12 @@ class StreamMessages:
         quality: int | None,
         unseen: str | None,
         highlights: str | None,
+        light: str | None,
         camera: dict[str, float],
     ) -> str:
         """The message that asks for a view."""
         self._last_id += 1
-        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, camera)
+        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, light, camera)
         return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
@@ -98,11 +99,13 @@ class Viewer:
         quality: int | None = None,
         unseen: str | None = None,
         highlights: str | None = None,
+        light: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, highlights, camera))
+            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, camera)
+            self._socket.send(message)
             while True:
                 image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
                 if image is not None:
@@ -141,13 +144,15 @@ class AsyncViewer:
         quality: int | None = None,
         unseen: str | None = None,
         highlights: str | None = None,
+        light: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         import asyncio
 
         try:
-            await self._socket.send(self._messages.request(t, pose, layer, format, quality, unseen, highlights, camera))
+            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, camera)
+            await self._socket.send(message)
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:
                     image = self._messages.answer(await self._socket.recv())

@@ -152,6 +152,18 @@ def test_a_page_from_elsewhere_may_read_what_a_render_says_of_itself(tmp_path: P
         assert {each for each in headers if each.startswith("x-intrasplat-")} <= exposed
 
 
+def test_the_caller_chooses_the_light_and_workers_of_older_versions_understand_the_default(
+    service: ServiceUnderTest,
+) -> None:
+    scene = service.finished_scene()
+    for chosen in ({}, {"light": "recorded"}):
+        assert service.http.get("/render", params={"scene": scene} | chosen).status_code == 200
+    steady, recorded = (each for each in service.painter.requests if isinstance(each, RenderRequest))
+    assert (steady.light, recorded.light) == ("steady", "recorded")
+    assert "light" not in steady.model_dump_json()
+    assert_problem(service.http.get("/render", params={"scene": scene, "light": "dim"}), 422, "light")
+
+
 def test_the_caller_chooses_whether_highlights_are_shown(service: ServiceUnderTest) -> None:
     query = {"scene": service.finished_scene()}
     answers = [service.http.get("/render", params=query | each) for each in ({}, {"highlights": "off"})]
