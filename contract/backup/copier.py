@@ -92,7 +92,7 @@ class Copier:
         """The present state of a folder, without temporary files that are about to be renamed."""
         found: State = {}
         with _reading(self._source / name):
-            for path in sorted((self._source / name).rglob("[!.]*")):
+            for path in _paths_below(self._source / name):
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
                     if path.is_file():
@@ -140,6 +140,16 @@ def write_hashed(target: Path, pieces: Iterator[bytes]) -> tuple[int, str]:
             digest.update(piece)
             size += file.write(piece)
     return size, digest.hexdigest()
+
+
+def _paths_below(folder: Path) -> list[Path]:
+    """Everything below a folder but hidden names; nothing if the folder is removed meanwhile."""
+    while True:
+        try:
+            return sorted(folder.rglob("[!.]*"))
+        except FileNotFoundError:  # a folder below it, or it itself, was removed while it was read
+            if not folder.exists():
+                return []
 
 
 def _pieces(read: Callable[[int], bytes], path: Path) -> Iterator[bytes]:
