@@ -31,9 +31,8 @@ def recorded_errors() -> Iterator[tuple[str, str, PixelErrors]]:
         for views, eye in zip(("held-out left", "held-out right"), matched.eyes, strict=True):
             found = []
             for index in frames:
-                view = scene.render(
-                    index / matched.frame_count, eye.world_from_camera[index], intrinsics=eye.intrinsics
-                )
+                t, pose = index / matched.frame_count, eye.world_from_camera[index]
+                view = scene.render(t, pose, intrinsics=eye.intrinsics, light="recorded")
                 shown, true = (np.asarray(each, np.float32) / np.float32(255) for each in (view.rgb, eye.rgb[index]))
                 judged = eye.tissue[index] & (eye.depth_confidence[index] >= MIN_CONFIDENCE)
                 depths_mm = (view.depth_mm, eye.depth_mm[index])

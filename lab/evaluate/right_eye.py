@@ -28,7 +28,8 @@ def _errors(scene: TrainedScene, clip: DepthClip, frame: int) -> PixelErrors:
     """Errors of the right eye's tissue that the left eye sees too. True depth is unknown, so rendered depth is used."""
     assert clip.right is not None
     right = clip.right
-    shown = render_frame(scene, frame / scene.frame_count, right.world_from_camera[frame], right.intrinsics)
+    t, pose = frame / scene.frame_count, right.world_from_camera[frame]
+    shown = render_frame(scene, t, pose, right.intrinsics, light="recorded")
     rgb, true = (each.astype(np.float32) / np.float32(255) for each in (shown.rgb, right.rgb[frame]))
     confidence = shown.confidence * ~shown.unseen
     return pixel_errors(confidence, (rgb, true), (shown.depth_mm, shown.depth_mm), judged_pixels(right, frame))

@@ -22,7 +22,7 @@ Pixels by the confidence that the model reports: `right` is the share of them th
 (chart) and at held-out frames of recordings (table, against the recorded picture and stereo depth). On the
 diagonal, confidence is a probability ([rank
 correlations](../decisions/views.md#confidence-is-the-probability-that-a-pixel-is-right)); between stills
-(`hamlyn20`) it is not.
+(`hamlyn20`) views are trusted too much.
 
 ![Share of right pixels against confidence](confidence.png)
 """
