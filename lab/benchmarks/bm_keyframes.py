@@ -22,7 +22,6 @@ from statistics import mean
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from intrasplat.camera import unproject
 from intrasplat.fusion.points import cells_of
@@ -30,6 +29,8 @@ from intrasplat.machine.hooks import Hooks
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
 from intrasplat.poses import placed
+from intrasplat.poses.rigid import inverse
+from intrasplat.poses.trajectory import write_tum
 from intrasplat.report import CameraPoses, Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
@@ -84,7 +85,9 @@ def measured(opened: OpenClip, poses: str, iterations: int) -> dict[str, object]
     if poses == "true":
         clip = replace(placed(clip, true), poses=CameraPoses(source="given"))
     with tempfile.TemporaryDirectory() as folder:
-        file = write_tum(Path(folder) / "poses.tum", clip.frame_times_s, true) if poses == "file" else None
+        file = Path(folder) / "poses.tum" if poses == "file" else None
+        if file is not None:
+            write_tum(file, clip.frame_times_s, inverse(true))
         options = ReconstructionOptions(preset="fast", iterations=iterations, holdout=HOLDOUT)
         report = reconstruct(ReconstructionRequest(clip, options, poses=file), Path(folder), TrainingHooks())
         scene = load_scene(Path(folder))
@@ -99,14 +102,6 @@ def measured(opened: OpenClip, poses: str, iterations: int) -> dict[str, object]
         "bases": report.bases,
         **seconds(report),
     }
-
-
-def write_tum(path: Path, times_s: NDArray[np.float64], world_from_camera: NDArray[np.float64]) -> Path:
-    """The path, to which poses [T, 4, 4] in mm are written as camera_from_world in metres, in TUM's format."""
-    inverse = np.linalg.inv(world_from_camera)
-    turns = Rotation.from_matrix(inverse[:, :3, :3]).as_quat()
-    np.savetxt(path, np.column_stack([times_s, inverse[:, :3, 3] / 1000, turns]), fmt="%.7f")
-    return path
 
 
 def seconds(report: Report) -> dict[str, str]:

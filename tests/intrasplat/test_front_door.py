@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import intrasplat as isp
 from intrasplat.clip.types import DepthClip
 from intrasplat.poses import StoredPoses
+from intrasplat.poses.trajectory import write_tum
 from lab.phantom import PhantomSettings, make_phantom, write_stereo_video
 from tests.intrasplat.phantoms import phantom_clip
 
@@ -194,15 +195,8 @@ def test_poses_of_frames_of_both_eyes_are_given_as_array_or_file(tmp_path: Path)
     with pytest.raises(isp.InputError) as refused:
         isp.read_clip(left, right, calibration=calibration, poses=2 * poses)
     assert refused.value.field == "poses"
-    tum = write_tum_lines(tmp_path / "robot.tum", poses)
+    tum, moments_s = tmp_path / "robot.tum", np.append(0.03 * np.arange(14), 0.59)
+    write_tum(tum, moments_s, np.concatenate([poses, poses[-1:]]))
     with pytest.raises(isp.InputError, match="times are not known"):  # 30 frames a second are assumed
         isp.read_clip(left, right, calibration=calibration, poses=tum).with_depth()
     isp.read_clip(left, right, calibration=calibration, poses=tum, frame_times_s=np.arange(14) / 30).with_depth()
-
-
-def write_tum_lines(path: Path, poses: NDArray[np.float64]) -> Path:
-    """The path, to which poses without rotation are written 0.03 s apart, in metres, and the last one again later."""
-    turns = np.tile([0.0, 0, 0, 1], (len(poses), 1))
-    rows = np.column_stack([0.03 * np.arange(len(poses)), poses[:, :3, 3] / 1000, turns])
-    np.savetxt(path, np.vstack([rows, rows[-1] + 0.2 * np.eye(8)[0]]))
-    return path
