@@ -8,6 +8,7 @@ Symbols: T frames, H W pixels, K training frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -25,8 +26,8 @@ from intrasplat.notices import Notice, NoticeCode
 Reals = NDArray[np.float64]
 EyeOrClip = TypeVar("EyeOrClip", Eye, DepthClip)
 
-MIN_CONFIDENCE, MIN_CELLS = 0.3, 30
-"""Of a track that is measured; fewest tracks of a frame."""
+MIN_CONFIDENCE, MIN_CELLS, MAX_CELLS = 0.3, 30, 5000
+"""Of a track that is measured; fewest and most tracks of a frame, the most about."""
 MIN_LEVEL, MAX_LEVEL = 0.08, 0.95
 """Colours in [0, 1] that are measured: noise and the tone curve's foot spoil darker ones, clipping brighter ones."""
 MIN_CHANGE, MIN_TINT = 0.3, 0.12
@@ -68,7 +69,8 @@ def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks
         values.append(share * log_gain)
     if not rows:
         return None
-    system, known = np.array(rows), np.any(np.array(rows) != 0, axis=0)
+    system = np.array(rows)
+    known = system.any(axis=0)
     found, *_ = np.linalg.lstsq(system[:, known], np.array(values), rcond=None)
     if np.ptp(found.mean(axis=1)) < MIN_CHANGE and np.ptp(found - found[:, 1:2], axis=0).max() < MIN_TINT:
         return None
@@ -86,12 +88,15 @@ def _measurements(
     """A keyframe, a frame (indices into train), log gains [3] of the one against the other, share of cells measured."""
     for each in tracks:
         start = cell_means(clip.rgb[train[each.reference]], each.step_px).astype(np.float32) / np.float32(255)
+        step = max(1, round(math.sqrt(start[..., 0].size / MAX_CELLS)))
+        some = np.s_[::step, ::step]
+        start = start[some]
         for row, place in enumerate(each.followed.tolist()):
             if place == each.reference:
                 continue
-            there = start + each.colour[row]
+            there = start + each.colour[row][some]
             low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
-            good = (each.confidence[row] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
+            good = (each.confidence[row][some] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
             each.let_go(row)
             if good.sum() >= MIN_CELLS:
                 log_gain = np.median(np.log(there[good] / start[good]), axis=0).astype(np.float64)

@@ -36,7 +36,8 @@ def prepare(setup: Setup) -> Run:
     scale = units_per_mm(setup.clip, train)
     examine_device(setup)
     tracks = _tracks(setup)
-    exposure = find_exposure(setup.clip, train, tracks)
+    with timings.measure("motion_s"):
+        exposure = find_exposure(setup.clip, train, tracks)
     steady = in_light_of(setup, exposure)
     if exposure is not None:
         tracks = _tracks(steady)  # flow follows tissue better in steady light
