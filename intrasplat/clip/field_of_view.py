@@ -229,9 +229,9 @@ def _same_edges(left: RgbFrame, right: RgbFrame) -> Mask:
     around = cv2.blur(cv2.absdiff(left, right).max(axis=2), (BLUR_PX, BLUR_PX)) <= SAME_LEVELS
     softened = (cv2.GaussianBlur(eye, (3, 3), 0) for eye in (left, right))
     alone = cv2.absdiff(*softened).max(axis=2) <= STROKE_LEVELS
-    slopes = np.minimum(_slope(left), _slope(right))
-    wide = np.minimum(*(cv2.dilate(_slope(eye), np.ones((3, 3), np.uint8)) for eye in (left, right)))
-    return np.stack([around & (wide > EDGE_LEVELS), alone & (slopes > STROKE_EDGE_LEVELS)])
+    slopes = [_slope(eye) for eye in (left, right)]
+    wide = np.minimum(*(cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in slopes))
+    return np.stack([around & (wide > EDGE_LEVELS), alone & (np.minimum(*slopes) > STROKE_EDGE_LEVELS)])
 
 
 def _slope(rgb: RgbFrame) -> NDArray[np.float32]:

@@ -79,7 +79,7 @@ def find_shown(
     fields = find_fields(eyes, _some(train, empty), fov, mapping, given, may_coincide=may_coincide)
     found = () if fov == "all" else [fields.left, fields.right][: len(eyes)]
     empty = find_empty(thumbnails, train, found, _shares(tissue, fields.left, mapping))
-    _some(train, empty, " within the field of view" if given else "")
+    _some(train, empty, is_given=bool(given))
     return fields, empty
 
 
@@ -93,13 +93,17 @@ def _shares(tissue: Iterable[Mask], field: Mask | None, mapping: Mapping) -> lis
     return [each / size for each in mapping(share, tissue)]
 
 
-def _some(train: Sequence[int], empty: EmptyFrames, where: str = "") -> list[int]:
-    """The training frames that are not empty. Raises InputError if there are none."""
+def _some(train: Sequence[int], empty: EmptyFrames, *, is_given: bool = False) -> list[int]:
+    """The training frames that are not empty. Raises InputError if there are none.
+
+    is_given: whether the caller gave the field of view in which they are empty.
+    """
     shown = sorted(set(train) - set(empty.frames))
     if not shown:
         raise InputError(
-            FIELD if where else "clip",
-            f"no frame that may be trained on shows the scene{where}: all are of one colour, or covered by masks.",
+            FIELD if is_given else "clip",
+            f"no frame that may be trained on shows the scene{' within the field of view' if is_given else ''}: "
+            "all are of one colour, or covered by masks.",
             "Give the recording of the operation, and masks of its instruments alone.",
         )
     return shown

@@ -109,7 +109,8 @@ def tied(frames: Sequence[int], links: Sequence[FrameLink]) -> list[int]:
     ends = np.array([(places[link.a], places[link.b]) for link in links], np.intp).reshape(-1, 2)
     graph = coo_array((np.ones(len(ends)), ends.T), shape=(len(frames), len(frames)))
     _, part = connected_components(graph, directed=False)
-    return [frame for frame, each in zip(frames, part, strict=True) if each == np.bincount(part).argmax()]
+    largest = np.bincount(part).argmax()
+    return [frame for frame, each in zip(frames, part, strict=True) if each == largest]
 
 
 def _joined(frames: Frames, parts: list[list[int]], poses: dict[int, Reals]) -> list[FrameLink]:
