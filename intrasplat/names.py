@@ -54,6 +54,9 @@ Keep = Literal["on", "off"]
 Light = Literal["steady", "recorded"]
 """The light of a render's colours: that of one frame at all times, or that in which the moment was recorded."""
 
+Smoke = Literal["remove", "show"]
+"""Whether a render shows the smoke that lay before the tissue when it was recorded."""
+
 UsedFrames = Literal["new", "all"]
 """The frames of a clip that a model may be trained on."""
 

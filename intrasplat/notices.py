@@ -50,6 +50,7 @@ class NoticeCode(StrEnum):
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
     EXPOSURE = "exposure"
+    SMOKE = "smoke"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
     # warnings about the clip

@@ -58,7 +58,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
             "pose_warnings": [each.model_dump(mode="json") for each in clip.warnings if each.code in POSE_WARNINGS],
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
             **({} if run.motion_error is None else {"motion_error": run.motion_error}),
-            **({} if run.exposure is None else {"log_gains": run.exposure.log_gains.tolist()}),
+            **run.light.settings(),
         },
     )
 
@@ -87,7 +87,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
         assumptions=(
-            *(() if run.exposure is None else (run.exposure.notice,)),
+            *run.light.notices,
             *run.chosen,
             *run.schedule.notices,
             *(quantized.notices if quantized else (_floats(scene),)),
@@ -106,7 +106,7 @@ def _floats(scene: TrainedScene) -> Notice:
 
 def _warnings(run: Run) -> tuple[Notice, ...]:
     """The warnings of the run itself."""
-    found = []
+    found = list(run.light.warnings)
     least = max(run.schedule.epoch, run.schedule.opening)
     if run.setup.fixed_iterations is None and run.schedule.planned == least:
         text = (

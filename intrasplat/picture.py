@@ -13,11 +13,12 @@ MAX_JUDGED_PIXELS = 1 << 21
 
 
 class Layer(StrEnum):
-    """rgb; depth along the camera's z; confidence in [0, 1]."""
+    """rgb; depth along the camera's z; confidence in [0, 1]; smoke, the share of light that it takes, in [0, 1]."""
 
     RGB = "rgb"
     DEPTH = "depth"
     CONFIDENCE = "confidence"
+    SMOKE = "smoke"
 
 
 class ImageFormat(StrEnum):

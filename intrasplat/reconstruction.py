@@ -25,7 +25,7 @@ from intrasplat.errors import InputError
 from intrasplat.export import export_parts
 from intrasplat.formats import EXPORT_FORMATS, check_export
 from intrasplat.machine.hooks import Progress, ignore, never
-from intrasplat.names import MANIFEST, REPORT, RESUME_STATE, Light
+from intrasplat.names import MANIFEST, REPORT, RESUME_STATE, Light, Smoke
 from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
 from intrasplat.picture import MAX_RENDER_PIXELS, IntrinsicsOverride
 from intrasplat.pipeline import reconstruct as run_pipeline
@@ -103,6 +103,7 @@ class Scene:
         intrinsics: Intrinsics | None = None,
         highlights: bool = True,
         light: Light = "steady",
+        smoke: Smoke = "remove",
     ) -> View:
         """The scene at model time t from a pose, instruments removed.
 
@@ -114,6 +115,7 @@ class Scene:
             highlights: whether to show the highlights that were separated by means of the two eyes of a stereo clip.
             light: "steady": where exposure or white balance change in the clip, that of one frame at all times;
                 "recorded": that in which the moment was recorded.
+            smoke: "show": behind the smoke that was found before the tissue; "remove": without it.
 
         Returns:
             A View with rgb [H, W, 3] uint8, depth_mm [H, W] float32 (0: nothing solid), confidence [H, W] float32 in
@@ -142,7 +144,8 @@ class Scene:
             camera = camera_of(self.intrinsics, wanted, MAX_RENDER_PIXELS)
         device = choose_device(self._device)
         world_from_camera = self._world_from_camera(pose)
-        return render_frame(self.trained, t, world_from_camera, camera, device, highlights=highlights, light=light)
+        own = self.trained
+        return render_frame(own, t, world_from_camera, camera, device, highlights=highlights, light=light, smoke=smoke)
 
     def _world_from_camera(self, pose: Any) -> NDArray[np.float64] | None:
         if isinstance(pose, np.ndarray):

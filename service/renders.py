@@ -19,7 +19,7 @@ from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
-from intrasplat.names import Eye, Light
+from intrasplat.names import Eye, Light, Smoke
 from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 from intrasplat.pose import Pose, parse_pose
@@ -151,6 +151,10 @@ class RenderQuery(ViewQuery):
         default="steady",
         description="the light of layer rgb where exposure or white balance change in the clip. steady: that of one "
         "frame at all times; recorded: that in which the moment was recorded",
+    )
+    smoke: Smoke = Field(
+        default="remove",
+        description="show: layer rgb is drawn behind the smoke that was found before the tissue; remove: without it",
     )
 
 
@@ -301,6 +305,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         unseen=query.unseen,
         highlights=query.highlights,
         light=query.light,
+        smoke=query.smoke,
         max_pixels=settings.max_render_pixels,
     )
 

@@ -239,7 +239,8 @@ class Views:
         attributes = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
         view = ViewRequest(
             drawn, request.t, pose, camera, self._device,
-            highlights=highlights, light=request.light, is_coarse=level > 0, max_pixels=request.max_pixels,
+            highlights=highlights, light=request.light, smoke=request.smoke,
+            is_coarse=level > 0, max_pixels=request.max_pixels,
         )  # fmt: skip
         with traces.span("draw", **attributes):
             frame = yield from frame_in_parts(view, with_confidence=request.layer is Layer.CONFIDENCE)

@@ -80,6 +80,7 @@ class NoticeCode(StrEnum):
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"
     EXPOSURE = "exposure"
+    SMOKE = "smoke"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
     ALIGNMENT_UNKNOWN = "alignment_unknown"

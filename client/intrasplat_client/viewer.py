@@ -43,11 +43,12 @@ class StreamMessages:
         unseen: str | None,
         highlights: str | None,
         light: str | None,
+        smoke: str | None,
         camera: dict[str, float],
     ) -> str:
         """The message that asks for a view."""
         self._last_id += 1
-        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, light, camera)
+        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
         return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
@@ -100,11 +101,12 @@ class Viewer:
         unseen: str | None = None,
         highlights: str | None = None,
         light: str | None = None,
+        smoke: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, camera)
+            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
             self._socket.send(message)
             while True:
                 image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
@@ -145,13 +147,14 @@ class AsyncViewer:
         unseen: str | None = None,
         highlights: str | None = None,
         light: str | None = None,
+        smoke: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         import asyncio
 
         try:
-            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, camera)
+            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
             await self._socket.send(message)
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:

@@ -97,11 +97,12 @@ def view_query(
     unseen: str | None,
     highlights: str | None,
     light: str | None,
+    smoke: str | None,
     camera: Mapping[str, float],
 ) -> dict[str, Any]:
     """The parameters of a view for GET /render and for messages of the stream."""
     values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
-    shown = {"unseen": unseen, "highlights": highlights, "light": light}
+    shown = {"unseen": unseen, "highlights": highlights, "light": light, "smoke": smoke}
     return {name: value for name, value in {**values, **shown, **camera}.items() if value is not None}
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from contract.wire.cameras import CamerasRequest, ClipCamera
 from intrasplat.formats import ExportOptions
 from intrasplat.measuring import MAX_POINTS, Point
-from intrasplat.names import JOB_ID_PATTERN, Eye, Light
+from intrasplat.names import JOB_ID_PATTERN, Eye, Light, Smoke
 from intrasplat.notices import Notice
 from intrasplat.picture import (
     MAX_JUDGED_PIXELS,
@@ -63,7 +63,8 @@ class RenderRequest(BaseModel):
     unseen: Unseen = Unseen.MARK
     highlights: Highlights = Highlights.ON
     light: Light = Field(default="steady", exclude_if=lambda light: light == "steady")
-    """Left out of JSON if it is the default, because workers of older versions do not know it."""
+    smoke: Smoke = Field(default="remove", exclude_if=lambda smoke: smoke == "remove")
+    """light and smoke are left out of JSON if they are the default: workers of older versions do not know them."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
     """The most that may be drawn for it."""
 

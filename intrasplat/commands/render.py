@@ -13,7 +13,7 @@ from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
-from intrasplat.names import Light
+from intrasplat.names import Light, Smoke
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 SUFFIX_FORMATS = {
@@ -60,6 +60,12 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         default="steady",
         help="where exposure or white balance change: steady: colours in the light of one frame; recorded: in that of "
         "the moment (default: steady)",
+    )
+    parser.add_argument(
+        "--smoke",
+        choices=get_args(Smoke),
+        default="remove",
+        help="show: behind the smoke that was found before the tissue; remove: without it (default: remove)",
     )
     parser.add_argument(
         "--highlights",
@@ -110,7 +116,9 @@ def run_cli(options: argparse.Namespace) -> int:
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
-        frame = render_frame(scene, t, pose, camera, device, highlights=highlights, light=options.light)
+        frame = render_frame(
+            scene, t, pose, camera, device, highlights=highlights, light=options.light, smoke=options.smoke
+        )
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(

@@ -137,9 +137,18 @@ def measure(
     )
 
 
+REMOVED: dict[NoticeCode, frozenset[NoticeCode]] = {
+    NoticeCode.EXPOSURE: frozenset({NoticeCode.BRIGHTNESS_CHANGES, NoticeCode.COLOUR_CHANGES}),
+    NoticeCode.SMOKE: frozenset({NoticeCode.VEILED, NoticeCode.BRIGHTNESS_CHANGES, NoticeCode.COLOUR_CHANGES}),
+}
+"""Warnings about a clip's pictures that do not hold once training has removed their cause, by its notice."""
+
+
 def first_report(clip: DepthClip, split: FrameSplit, training: Training, warnings: Sequence[Notice] = ()) -> Report:
     """The report of a finished scene before it is scored. warnings: the result of clip_warnings()."""
-    found = [*clip.warnings, *split.warnings, *training.warnings, *warnings, SCORES_PENDING]
+    removed = {code for notice in training.assumptions for code in REMOVED.get(notice.code, ())}
+    of_clip = (each for each in warnings if each.code not in removed)
+    found = [*clip.warnings, *split.warnings, *training.warnings, *of_clip, SCORES_PENDING]
     return Report(
         scored=False,
         psnr_tissue_db=None,

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from intrasplat.camera import Intrinsics
 from intrasplat.errors import SceneError
+from intrasplat.motion.veil import Veil
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.scene.files import dtype_name
 from intrasplat.splat.deformation import Deformation
@@ -121,6 +122,16 @@ class TrainedScene:
         frame = t * self.frame_count
         logs = [np.interp(frame, np.arange(self.frame_count), each) for each in self.log_gains.T]
         return np.exp(logs).astype(np.float32)
+
+    @cached_property
+    def veil(self) -> Veil | None:
+        """The smoke before the left eye, which the model does not have; None: none was found.
+
+        Raises:
+            ValueError: the stored values are not those of a veil.
+        """
+        stored = self.settings.get("veil")
+        return None if stored is None else Veil.read(stored, self.frame_count)
 
     def without_motion(self) -> TrainedScene:
         """The scene without the weights of its motion, for a caller that has them elsewhere."""

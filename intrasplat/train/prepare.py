@@ -9,8 +9,10 @@ from functools import partial
 from intrasplat.fusion import fuse
 from intrasplat.machine.memory import LITTLE_BYTES, keep_free_memory
 from intrasplat.methods.method import Preset
-from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
+from intrasplat.motion.exposure import find_exposure
 from intrasplat.motion.keyframes import track_keyframes
+from intrasplat.motion.light import RecordedLight
+from intrasplat.motion.smoke import find_veils
 from intrasplat.motion.tracks import Tracks, moved_along
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import CPU, examine
@@ -24,6 +26,9 @@ from intrasplat.train.setup import Setup
 from intrasplat.train.start import bounded, box_of, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import TrainingFrames, units_per_mm
 
+SMOKE_PASSES = 2
+"""How often smoke is measured: tracks through frames without it are better, and show it better."""
+
 
 def prepare(setup: Setup) -> Run:
     """The run before its first step or, with a budget in seconds, after the first steps, which are timed.
@@ -35,12 +40,7 @@ def prepare(setup: Setup) -> Run:
     train, timings = setup.split.train, setup.timings
     scale = units_per_mm(setup.clip, train)
     examine_device(setup)
-    tracks = _tracks(setup)
-    with timings.measure("motion_s"):
-        exposure = find_exposure(setup.clip, train, tracks)
-    steady = in_light_of(setup, exposure)
-    if exposure is not None:
-        tracks = _tracks(steady)  # flow follows tissue better in steady light
+    light, steady, tracks = _followed(setup)
     clip = steady.clip
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
@@ -57,16 +57,16 @@ def prepare(setup: Setup) -> Run:
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
     run = new_run(setup, frames_of(steady, scale), model, preset, (*chosen, *fewer), box_of(model))
-    run.exposure = exposure
+    run.light = light
     keep_free_memory(LITTLE_BYTES)
     run.motion_error = motion_error
     run.schedule = _schedule(run)
     return run
 
 
-def in_light_of(setup: Setup, exposure: Exposure | None) -> Setup:
-    """The setup with the clip to train on: in steady light if its exposure changes, else as it is."""
-    return setup if exposure is None else replace(setup, clip=in_steady_light(setup.clip, exposure))
+def in_light_of(setup: Setup, light: RecordedLight) -> Setup:
+    """The setup with the clip to train on: without smoke and in steady light."""
+    return replace(setup, clip=light.removed(setup.clip))
 
 
 def examine_device(setup: Setup) -> None:
@@ -100,6 +100,27 @@ def new_run(
         with setup.clock.paused():
             setup.timings.add("compile_s", warm_up(run, partial(setup.hooks.report_stage, "compile")))
     return run
+
+
+def _followed(setup: Setup) -> tuple[RecordedLight, Setup, list[Tracks]]:
+    """The light of the recording, the setup without it, and its tracks: flow follows tissue better in steady light."""
+    train, tracks = setup.split.train, _tracks(setup)
+    light, steady = RecordedLight(), setup
+    for _ in range(SMOKE_PASSES):
+        with setup.timings.measure("motion_s"):
+            veils = find_veils(setup.clip, train, tracks, steady.clip)
+        if not veils:
+            break
+        light = RecordedLight(veils=veils)
+        steady = in_light_of(setup, light)
+        tracks = _tracks(steady)
+    with setup.timings.measure("motion_s"):
+        exposure = find_exposure(steady.clip, train, tracks)
+    if exposure is not None:
+        light = replace(light, exposure=exposure)
+        steady = in_light_of(setup, light)
+        tracks = _tracks(steady)
+    return light, steady, tracks
 
 
 def _tracks(setup: Setup) -> list[Tracks]:

@@ -12,12 +12,11 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from intrasplat.errors import ResumeMismatch, SceneError
 from intrasplat.methods.method import Preset
-from intrasplat.motion.exposure import Exposure
+from intrasplat.motion.light import RecordedLight
 from intrasplat.notices import Notice
 from intrasplat.scene.resume_file import RESUME_FILE, begin_resume, load_resume
 from intrasplat.splat.model import Model, state_of
@@ -47,8 +46,8 @@ def resume(directory: Path, setup: Setup) -> Run | None:
     try:
         tensors, state = load_resume(directory)
         preset = _resolved_preset(setup.preset, state["start"])
-        exposure = _exposure(state["start"]["exposure"])
-        frames = frames_of(in_light_of(setup, exposure), float(state["start"]["units_per_mm"]))
+        light = RecordedLight.read(state["start"]["light"], setup.clip.frame_count)
+        frames = frames_of(in_light_of(setup, light), float(state["start"]["units_per_mm"]))
         _check(state, setup, preset, frames)
         examine_device(setup)
         low, high = state["start"]["box"]
@@ -56,7 +55,7 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         _load_parameters(model, tensors)  # a GPU warms up on them
         chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
         run = new_run(setup, frames, model, preset, chosen, (low, high))
-        run.exposure = exposure
+        run.light = light
         _put(run, tensors, state)
     except MISFITS as error:
         problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
@@ -88,7 +87,7 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
             "units_per_mm": run.frames.scale,
             "box": run.box,
             "motion_error": run.motion_error,
-            "exposure": None if run.exposure is None else [run.exposure.log_gains.tolist(), run.exposure.reference],
+            "light": run.light.stored(),
             "chosen": [notice.model_dump() for notice in run.chosen],
         },
         "iteration": run.iteration,
@@ -106,10 +105,6 @@ def _resolved_preset(preset: Preset, start: Mapping[str, Any]) -> Preset:
     """The preset with the bases and the stride that were chosen for the scene when the run started."""
     fusion = dataclasses.replace(preset.fusion, stride=start["stride"])
     return dataclasses.replace(preset.with_bases(start["bases"]), fusion=fusion)
-
-
-def _exposure(stored: tuple[list[list[float]], int] | None) -> Exposure | None:
-    return None if stored is None else Exposure(np.array(stored[0], np.float64), int(stored[1]))
 
 
 def _load_parameters(model: Model, tensors: dict[str, Tensor]) -> None:

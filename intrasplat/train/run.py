@@ -10,7 +10,7 @@ import numpy as np
 
 from intrasplat.machine.hooks import Progress
 from intrasplat.methods.method import Preset
-from intrasplat.motion.exposure import Exposure
+from intrasplat.motion.light import RecordedLight
 from intrasplat.names import Eyes
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import Device
@@ -53,7 +53,7 @@ class Run:
     densifier     splits and prunes Gaussians; None where the preset has no densification
     chosen        what the preset left to the scene: the value chosen and the reason
     motion_error  error of the motion between training frames, squared grey levels, where no motion model follows it
-    exposure      of every frame, if it changes: targets are in steady light; None: they are as recorded
+    light         of the recording, where it differs from that of the targets
     curve         scores of held-out frames so far
     """
 
@@ -69,7 +69,7 @@ class Run:
     densifier: Densifier | None = None
     chosen: tuple[Notice, ...] = ()
     motion_error: float | None = None
-    exposure: Exposure | None = None
+    light: RecordedLight = field(default_factory=RecordedLight)
     curve: list[CurvePoint] = field(default_factory=list)
 
     @property

@@ -57,8 +57,7 @@ def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None)
         image = (model or run.model).render(camera, float(run.frames.t[index])).copy()
         depth_mm = solid_depth_mm(image[3], image[4], scale)
         rgb = image[:3].transpose(1, 2, 0)
-        if run.exposure is not None:
-            rgb = rgb * np.exp(run.exposure.log_gains[index]).astype(np.float32)
+        rgb = run.light.added(rgb, index, depth_mm, right=eye is not None)
         return RenderedFrame(rgb, depth_mm, image[4])
 
     return render

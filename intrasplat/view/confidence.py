@@ -88,6 +88,19 @@ def seen_from_endoscope(
         depth_mm: [H, W] depth of the view, above 0.
         camera, endoscope: intrinsics and world_from_camera [4, 4], mm, of the view and of the endoscope.
     """
+    column, row = places_in_endoscope(depth_mm, camera, endoscope)
+    picture = np.ascontiguousarray(endoscope_rgb.transpose(1, 2, 0))
+    moved = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(moved.transpose(2, 0, 1), np.float32)
+
+
+def places_in_endoscope(
+    depth_mm: Image, camera: tuple[Intrinsics, NDArray[np.float64]], endoscope: tuple[Intrinsics, NDArray[np.float64]]
+) -> tuple[Image, Image]:
+    """Column and row [H, W], pixel (i, j) at (j, i), where the endoscope sees the points that a view's pixels show.
+
+    The arguments are those of seen_from_endoscope.
+    """
     (k, pose), (own_k, own_pose) = camera, endoscope
     height, width = depth_mm.shape
     own_from_view = (np.linalg.inv(own_pose) @ pose).astype(np.float32)
@@ -97,9 +110,7 @@ def seen_from_endoscope(
     ahead = np.maximum(points[2], np.float32(1e-3))
     column = np.float32(own_k.fx) * points[0] / ahead + np.float32(own_k.cx - 0.5)
     row = np.float32(own_k.fy) * points[1] / ahead + np.float32(own_k.cy - 0.5)
-    picture = np.ascontiguousarray(endoscope_rgb.transpose(1, 2, 0))
-    moved = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(moved.transpose(2, 0, 1), np.float32)
+    return column, row
 
 
 def _texture(brightness: Image) -> Image:

@@ -4,10 +4,11 @@
 rgb         8 bit                       uint8 [H, W, 3]       8 bit
 depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
 confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high bright
+smoke       8 bit, 255 = 1              float32 [H, W]        false colour, thick bright
 
 False colours are those of intrasplat/colours.py.
 
-If unseen pixels are marked, their depth and confidence are 0, and rgb shows a hatch. Then png and webp of rgb have an
+If unseen pixels are marked, their other layers are 0, and rgb shows a hatch. Then png and webp of rgb have an
 alpha channel, UNSEEN_ALPHA (practically transparent) there and 255 elsewhere. Programs without alpha show the hatch.
 """
 
@@ -50,6 +51,9 @@ class Layers(Protocol):
     def confidence(self) -> NDArray[np.float32]: ...
 
     @property
+    def smoke(self) -> NDArray[np.float32]: ...
+
+    @property
     def unseen(self) -> NDArray[np.bool_]: ...
 
 
@@ -71,7 +75,7 @@ def encode_layer(
     marked = frame.unseen if unseen is Unseen.MARK else None
     if layer is Layer.RGB:
         return _encode_colour(frame.rgb, marked, image_format, quality)
-    values = frame.depth_mm if layer is Layer.DEPTH else frame.confidence
+    values = _values(frame, layer)
     if marked is not None:
         values = np.where(marked, np.float32(0), values)
     if image_format is ImageFormat.NPY:
@@ -82,6 +86,13 @@ def encode_layer(
         steps = np.clip(np.rint(values * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
         return _image(steps.astype(np.uint16), image_format, quality)
     return _image(np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8), image_format, quality)
+
+
+def _values(frame: Layers, layer: Layer) -> NDArray[np.float32]:
+    """[H, W] of a layer of one channel."""
+    if layer is Layer.DEPTH:
+        return frame.depth_mm
+    return frame.smoke if layer is Layer.SMOKE else frame.confidence
 
 
 def _encode_colour(
@@ -103,7 +114,7 @@ def _in_false_colours(
     values: NDArray[np.float32], layer: Layer, depth_range_mm: tuple[float, float] | None
 ) -> NDArray[np.uint8]:
     """BGR uint8 [H, W, 3]."""
-    if layer is Layer.CONFIDENCE:
+    if layer is not Layer.DEPTH:
         return _coloured(values)
     if depth_range_mm is None:
         raise ValueError("depth in false colours needs depth_range_mm")

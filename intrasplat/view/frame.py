@@ -40,6 +40,7 @@ class View:
     unseen_share: float
     warnings: tuple[Notice, ...]
     _confidence: Callable[[], NDArray[np.float32]]
+    _smoke: Callable[[], NDArray[np.float32]]
 
     @cached_property
     def confidence(self) -> NDArray[np.float32]:
@@ -48,19 +49,26 @@ class View:
         """
         return self._confidence()
 
+    @cached_property
+    def smoke(self) -> NDArray[np.float32]:
+        """[H, W] float32 in [0, 1]: the share of the light that smoke took when the moment was recorded; 0 without
+        any, and where nothing is solid.
+        """
+        return self._smoke()
+
     def enlarged(self, width: int, height: int) -> View:
         """The frame in more pixels, with a notice that says so."""
         size = (width, height)
         rgb = np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_LINEAR), np.uint8)
         depth_mm = np.asarray(cv2.resize(self.depth_mm, size, interpolation=cv2.INTER_NEAREST), np.float32)
         unseen = cv2.resize(self.unseen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
-        likely = self._confidence
 
-        def confidence() -> NDArray[np.float32]:
-            return np.asarray(cv2.resize(likely(), size, interpolation=cv2.INTER_LINEAR), np.float32)
+        def grown(layer: Callable[[], NDArray[np.float32]]) -> Callable[[], NDArray[np.float32]]:
+            return lambda: np.asarray(cv2.resize(layer(), size, interpolation=cv2.INTER_LINEAR), np.float32)
 
         warnings = (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE))
-        return View(rgb, depth_mm, unseen, self.unseen_share, warnings, confidence)
+        likely, smoke = grown(self._confidence), grown(self._smoke)
+        return View(rgb, depth_mm, unseen, self.unseen_share, warnings, likely, smoke)
 
     def reduced(self, width: int, height: int) -> View:
         """The frame in fewer pixels: each is the mean of those it covers; the majority decides on solid and unseen."""
@@ -71,10 +79,11 @@ class View:
         solid = mean((self.depth_mm > 0).astype(np.float32))
         covered, safe = solid >= MOST, np.maximum(solid, MOST)
         depth_mm = np.where(covered, mean(self.depth_mm) / safe, 0).astype(np.float32)
-        unseen, likely = mean(self.unseen.astype(np.float32)) > MOST, self._confidence
+        unseen = mean(self.unseen.astype(np.float32)) > MOST
 
-        def confidence() -> NDArray[np.float32]:
-            return np.where(covered, mean(likely()), 0).astype(np.float32)
+        def shrunk(layer: Callable[[], NDArray[np.float32]]) -> Callable[[], NDArray[np.float32]]:
+            return lambda: np.where(covered, mean(layer()), 0).astype(np.float32)
 
         rgb = np.asarray(mean(self.rgb), np.uint8)
-        return View(rgb, depth_mm, unseen, self.unseen_share, self.warnings, confidence)
+        likely, smoke = shrunk(self._confidence), shrunk(self._smoke)
+        return View(rgb, depth_mm, unseen, self.unseen_share, self.warnings, likely, smoke)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
 from intrasplat.machine.parts import Parts, whole
-from intrasplat.names import Light
+from intrasplat.names import Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MAX_JUDGED_PIXELS
 from intrasplat.scene.model import model_of
@@ -36,6 +36,7 @@ from intrasplat.view.depth_range import DepthRange
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses, pixel_count
 from intrasplat.view.out_of_view import OutOfView
+from intrasplat.view.smoky import smoke_share, with_smoke
 from intrasplat.view.unseen import blended_values, missing_pixels, unseen_pixels
 
 FAR_POSE = 0.35
@@ -111,7 +112,10 @@ class SceneRenderer:
         image, _ = self.layers(t, world_from_camera, intrinsics)
         depth_mm = solid_depth_mm(image[3], image[4], self.scene.units_per_mm)
         rgb, gains = image[:3].transpose(1, 2, 0), self.scene.gains(t)
-        return RenderedFrame(rgb if gains is None else rgb * gains, depth_mm, image[4])
+        rgb = rgb if gains is None else rgb * gains
+        return RenderedFrame(
+            with_smoke(self.scene, t, rgb, depth_mm, (intrinsics, world_from_camera)), depth_mm, image[4]
+        )
 
     def values(self, t: float) -> NDArray[np.float32] | None:
         """blended_values [N] at model time t: trust where positive. None: not known."""
@@ -161,6 +165,7 @@ class ViewRequest:
     device             device that renders
     highlights         True: as the endoscope's eyes saw them, and their mean away from both; False: without highlights
     light              "steady": that of one frame, at all times; "recorded": that of the time
+    smoke              whether to draw the smoke of the recording
     is_coarse          draw and judge no more pixels than asked for, because time is short
     max_pixels         limit of the pixels in which a smaller picture is drawn and judged
     """
@@ -172,6 +177,7 @@ class ViewRequest:
     device: Device = CPU
     highlights: bool = True
     light: Light = "steady"
+    smoke: Smoke = "remove"
     is_coarse: bool = False
     max_pixels: int = MAX_JUDGED_PIXELS
 
@@ -212,9 +218,11 @@ def render_frame(
     *,
     highlights: bool = True,
     light: Light = "steady",
+    smoke: Smoke = "remove",
 ) -> View:
     """Render the scene at model time t from a pose through a camera. The arguments are those of ViewRequest."""
-    return whole(frame_in_parts(ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights, light)))
+    view = ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights, light, smoke)
+    return whole(frame_in_parts(view))
 
 
 def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts[View]:
@@ -227,6 +235,11 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     yield
     picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
     unseen = unseen_pixels(picture.missing)
+    rgb, drawn = picture.rgb, (lenses.drawn, view.pose)
+    if view.smoke == "show":
+        colours = np.asarray(rgb / np.float32(255), np.float32)
+        coloured = with_smoke(scene, view.shown_t, colours, picture.depth_mm, drawn)
+        rgb = np.asarray(np.clip(coloured * 255 + np.float32(0.5), 0, 255), np.uint8)
     yield
     outside = clamped_to_clip(scene, view.t)[1]
     if followed(scene, view.shown_t) < MIN_FOLLOWED:
@@ -240,7 +253,10 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     def likely() -> NDArray[np.float32]:
         return whole(_confidence(view, picture)) if known is None else known
 
-    frame = View(picture.rgb, picture.depth_mm, unseen, _share(unseen), warnings, likely)
+    def smoke() -> NDArray[np.float32]:
+        return smoke_share(scene, view.shown_t, picture.depth_mm, drawn)
+
+    frame = View(rgb, picture.depth_mm, unseen, _share(unseen), warnings, likely, smoke)
     is_as_asked = pixel_count(lenses.drawn) == pixel_count(lenses.asked)
     return frame if is_as_asked else frame.reduced(lenses.asked.width, lenses.asked.height)
 

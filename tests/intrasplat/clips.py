@@ -29,8 +29,8 @@ def plane_clip(frames: int = 12, *, seed: int = 0, step_mm: float = 0.0) -> Dept
         left = 4 + 4 * index
         tissue[index, 10:30, left : left + 12] = False
     texture = random.integers(60, 200, (HEIGHT, WIDTH, 3))
-    glow = np.linspace(0, 40, frames)[:, None, None, None] * (np.arange(WIDTH) > WIDTH // 2)[None, None, :, None]
-    rgb = (texture + glow).astype(np.uint8)
+    glow = np.linspace(0, 0.3, frames)[:, None, None, None] * (np.arange(WIDTH) > WIDTH // 2)[None, None, :, None]
+    rgb = np.minimum(texture * (1 + glow), 255).astype(np.uint8)
     rgb[~tissue] = 230
     return DepthClip(
         rgb=rgb,

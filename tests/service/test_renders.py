@@ -156,12 +156,15 @@ def test_the_caller_chooses_the_light_and_workers_of_older_versions_understand_t
     service: ServiceUnderTest,
 ) -> None:
     scene = service.finished_scene()
-    for chosen in ({}, {"light": "recorded"}):
+    for chosen in ({}, {"light": "recorded", "smoke": "show"}):
         assert service.http.get("/render", params={"scene": scene} | chosen).status_code == 200
     steady, recorded = (each for each in service.painter.requests if isinstance(each, RenderRequest))
     assert (steady.light, recorded.light) == ("steady", "recorded")
+    assert (steady.smoke, recorded.smoke) == ("remove", "show")
     assert '"light"' not in steady.model_dump_json()
-    assert_problem(service.http.get("/render", params={"scene": scene, "light": "dim"}), 422, "light")
+    assert '"smoke"' not in steady.model_dump_json()
+    for name in ("light", "smoke"):
+        assert_problem(service.http.get("/render", params={"scene": scene, name: "dim"}), 422, name)
 
 
 def test_the_caller_chooses_whether_highlights_are_shown(service: ServiceUnderTest) -> None:

@@ -78,17 +78,17 @@ def test_a_clip_in_steady_light_has_the_light_of_the_reference() -> None:
 def test_a_scene_shows_steady_light_or_the_recorded_one_and_resumes_with_its_gains(tmp_path: Path) -> None:
     clip, _ = drifting(STOPS)
     run = prepared(clip)[0]
-    assert run.exposure is not None
+    assert run.light.exposure is not None
     keep(tmp_path, run)
     again = kept(tmp_path, prepared(clip)[0])
-    assert again.exposure is not None
-    np.testing.assert_array_equal(again.exposure.log_gains, run.exposure.log_gains)
+    assert again.light.exposure is not None
+    np.testing.assert_array_equal(again.light.exposure.log_gains, run.light.exposure.log_gains)
     trained(run)
     scene = snapshot_of(run)
-    frame = int(np.abs(run.exposure.log_gains.mean(axis=1)).argmax())
+    frame = int(np.abs(run.light.exposure.log_gains.mean(axis=1)).argmax())
     t = frame / FRAMES
     steady, recorded = (render_frame(scene, t, light=light).rgb for light in ("steady", "recorded"))
-    gains = np.exp(run.exposure.log_gains[frame])
+    gains = np.exp(run.light.exposure.log_gains[frame])
     inner = (steady > 40) & (steady < 180)
     assert np.median((recorded / np.maximum(steady, 1) / gains)[inner]) == pytest.approx(1, abs=0.02)
     np.testing.assert_allclose(

@@ -25,6 +25,7 @@ class Images:
     rgb: NDArray[np.uint8]
     depth_mm: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    smoke: NDArray[np.float32]
     unseen: NDArray[np.bool_]
 
 
@@ -36,7 +37,8 @@ def images() -> Images:
     rgb = random.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     unseen = np.zeros((HEIGHT, WIDTH), np.bool_)
     unseen[4:, 5:] = True
-    return Images(rgb, depth_mm, random.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32), unseen)
+    confidence, smoke = random.uniform(0, 1, (2, HEIGHT, WIDTH)).astype(np.float32)
+    return Images(rgb, depth_mm, confidence, smoke, unseen)
 
 
 def guessed(images: Images, layer: Layer, image_format: ImageFormat = ImageFormat.PNG) -> bytes:
@@ -68,7 +70,8 @@ def test_a_png_of_confidence_is_in_255ths(images: Images) -> None:
 
 
 @pytest.mark.parametrize(
-    ("layer", "name"), [(Layer.RGB, "rgb"), (Layer.DEPTH, "depth_mm"), (Layer.CONFIDENCE, "confidence")]
+    ("layer", "name"),
+    [(Layer.RGB, "rgb"), (Layer.DEPTH, "depth_mm"), (Layer.CONFIDENCE, "confidence"), (Layer.SMOKE, "smoke")],
 )
 def test_npy_is_the_array_itself(images: Images, layer: Layer, name: str) -> None:
     values = np.load(io.BytesIO(guessed(images, layer, ImageFormat.NPY)), allow_pickle=False)
@@ -107,7 +110,7 @@ def test_the_hatch_outlives_the_encoder(image_format: ImageFormat, quality: int)
     unseen = np.zeros((height, width), np.bool_)
     unseen[40:200, 60:260] = True
     rgb = np.random.default_rng(0).normal((170, 80, 70), 8, (height, width, 3)).clip(0, 255).astype(np.uint8)
-    image = Images(rgb, np.ones((height, width), np.float32), np.ones((height, width), np.float32), unseen)
+    image = Images(rgb, *(np.ones((height, width), np.float32) for _ in range(3)), unseen)
     shown = decoded(encode_layer(image, Layer.RGB, image_format, quality))[..., :3].mean(axis=-1)
     inner = cv2.erode(unseen.astype(np.uint8), np.ones((17, 17), np.uint8)) > 0  # the encoder mixes neighbours
     light = decoded(encode_layer(image, Layer.RGB, ImageFormat.PNG))[..., 0] == LIGHT_GREY
@@ -123,8 +126,10 @@ def test_a_jpeg_of_what_was_not_seen_is_dark_and_without_colour(images: Images) 
     assert 30 < inside.mean() < 80
 
 
-@pytest.mark.parametrize(("layer", "name"), [(Layer.DEPTH, "depth_mm"), (Layer.CONFIDENCE, "confidence")])
-def test_depth_and_confidence_are_0_where_nothing_was_seen(images: Images, layer: Layer, name: str) -> None:
+@pytest.mark.parametrize(
+    ("layer", "name"), [(Layer.DEPTH, "depth_mm"), (Layer.CONFIDENCE, "confidence"), (Layer.SMOKE, "smoke")]
+)
+def test_all_layers_but_colours_are_0_where_nothing_was_seen(images: Images, layer: Layer, name: str) -> None:
     values = np.load(io.BytesIO(encode_layer(images, layer, ImageFormat.NPY)), allow_pickle=False)
     np.testing.assert_array_equal(values, np.where(images.unseen, 0, getattr(images, name)))
     assert not decoded(encode_layer(images, layer, ImageFormat.PNG))[images.unseen].any()
@@ -142,19 +147,19 @@ def test_a_webp_begins_as_one(images: Images) -> None:
 
 
 def test_depth_beyond_the_range_of_a_png_is_held_at_its_end(images: Images) -> None:
-    far = Images(images.rgb, np.full_like(images.depth_mm, 1000.0), images.confidence, images.unseen)
+    far = Images(images.rgb, np.full_like(images.depth_mm, 1000.0), images.confidence, images.smoke, images.unseen)
     assert (decoded(guessed(far, Layer.DEPTH)) == 65535).all()
 
 
 def test_depth_that_is_invalid_everywhere_is_a_black_picture(images: Images) -> None:
-    blind = Images(images.rgb, np.zeros_like(images.depth_mm), images.confidence, images.unseen)
+    blind = Images(images.rgb, np.zeros_like(images.depth_mm), images.confidence, images.smoke, images.unseen)
     assert not decoded(encode_layer(blind, Layer.DEPTH, ImageFormat.JPEG, depth_range_mm=RANGE_MM)).any()
 
 
 def in_false_colours(layer: Layer, value: float, depth_range_mm: tuple[float, float] | None = RANGE_MM) -> list[int]:
     """R G B of the first pixel of a picture of this value alone."""
     values = np.full((16, 16), value, np.float32)
-    image = Images(np.zeros((16, 16, 3), np.uint8), values, values, np.zeros((16, 16), np.bool_))
+    image = Images(np.zeros((16, 16, 3), np.uint8), values, values, values, np.zeros((16, 16), np.bool_))
     content = encode_layer(image, layer, ImageFormat.JPEG, 100, depth_range_mm=depth_range_mm)
     return [int(each) for each in decoded(content)[0, 0, ::-1]]
 
@@ -177,7 +182,7 @@ def test_false_colours_are_those_of_the_table_with_near_and_high_bright(
 
 
 def test_one_depth_has_one_colour_whatever_else_the_picture_shows(images: Images) -> None:
-    near = Images(images.rgb, np.full_like(images.depth_mm, 60.0), images.confidence, images.unseen)
+    near = Images(images.rgb, np.full_like(images.depth_mm, 60.0), images.confidence, images.smoke, images.unseen)
     near.depth_mm[:, 8:] = 45.0
     shown = decoded(encode_layer(near, Layer.DEPTH, ImageFormat.WEBP, 100, Unseen.GUESS, depth_range_mm=RANGE_MM))
     np.testing.assert_allclose(shown[0, 0, 2::-1], in_false_colours(Layer.DEPTH, 60.0), atol=3)

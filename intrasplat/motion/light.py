@@ -1,0 +1,76 @@
+"""The light of a recording: what camera and smoke did to the tissue's colours in every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip import DepthClip
+from intrasplat.motion.exposure import Exposure, in_steady_light
+from intrasplat.motion.veil import Veil, behind, notice_of, warnings_of
+from intrasplat.notices import Notice
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLight:
+    """The light in which a clip was recorded, against the light that its model has.
+
+    exposure  gains of every frame; None: they hardly change
+    veils     smoke before the left eye and, if there is one, the right eye; empty: none was found
+    """
+
+    exposure: Exposure | None = None
+    veils: tuple[Veil, ...] = ()
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What the report says about it."""
+        smoke = (notice_of(self.veils[0]),) if self.veils else ()
+        return (*smoke, *(() if self.exposure is None else (self.exposure.notice,)))
+
+    @property
+    def warnings(self) -> tuple[Notice, ...]:
+        """What makes the result less right."""
+        return warnings_of(self.veils[0]) if self.veils else ()
+
+    def removed(self, clip: DepthClip) -> DepthClip:
+        """The clip to train on: without smoke, in steady light. The clip itself where neither was found."""
+        clear = behind(clip, self.veils) if self.veils else clip
+        return clear if self.exposure is None else in_steady_light(clear, self.exposure)
+
+    def added(self, rgb: Floats, index: int, depth_mm: Floats, *, right: bool = False) -> Floats:
+        """Colours [H, W, 3] of the model in a frame as that eye recorded it; depth_mm [H, W] is the render's."""
+        if self.exposure is not None:
+            rgb = rgb * np.exp(self.exposure.log_gains[index]).astype(np.float32)
+        if self.veils:
+            veil = self.veils[1 if right and len(self.veils) > 1 else 0]
+            rgb = veil.before(rgb, veil.transmission(index, depth_mm))
+        return rgb
+
+    def settings(self) -> dict[str, Any]:
+        """What a scene stores to show a moment as the left eye recorded it; JSON."""
+        gains = {} if self.exposure is None else {"log_gains": self.exposure.log_gains.tolist()}
+        return gains | ({"veil": self.veils[0].stored()} if self.veils else {})
+
+    def stored(self) -> dict[str, Any]:
+        """All of it as JSON, for read()."""
+        exposure = self.exposure
+        gains = None if exposure is None else [exposure.log_gains.tolist(), exposure.reference]
+        return {"exposure": gains, "veils": [veil.stored() for veil in self.veils]}
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any], frames: int) -> RecordedLight:
+        """The light of a clip of `frames` frames that stored() wrote.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is not one.
+        """
+        gains = stored["exposure"]
+        exposure = None if gains is None else Exposure(np.array(gains[0], np.float64), int(gains[1]))
+        return cls(exposure, tuple(Veil.read(veil, frames) for veil in stored["veils"]))
