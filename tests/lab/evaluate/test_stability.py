@@ -253,7 +253,7 @@ def test_the_page_of_results_counts_how_the_places_of_severities_3_and_5_ended(t
     scored = [placed(CLEAN, 0, "held", "0.00", seed=seed) | {"psnr_db": db} for seed, db in enumerate(("29.0", "30.0"))]
     write_rows(tmp_path / STABILITY, FIELDS, [*scored, *ROWS[1:]])
     page = "".join(stability_sections(tmp_path, tmp_path))
-    assert "| fast | 29.5 | 3 of 66 | 0 | 0 | 1 | 0 | 1 | 1 | 0 |" in page  # severities 3 and 5
+    assert "| fast | 29.5 | 3 of 76 | 0 | 0 | 1 | 0 | 1 | 1 | 0 |" in page  # severities 3 and 5
     assert "stability-fast.png" not in page
 
 
