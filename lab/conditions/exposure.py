@@ -1,6 +1,7 @@
 """Light of the picture as a whole: exposure, white balance, and a lamp that comes nearer. Symbols: T frames.
 
-A gain of light acts before the camera's tone curve, which is about the power 1 / TONE_POWER.
+A gain of light acts before the camera's tone curve, which is about the power 1 / TONE_POWER. with_drift() and
+with_tint() take any clip, of one eye or two.
 """
 
 from __future__ import annotations
@@ -28,33 +29,27 @@ Gains = NDArray[np.float64]
 """[T, 3] factors of the recorded R G B of each frame."""
 
 
-def drift_gains(frames: int, stops: float, random: np.random.Generator) -> Gains:
-    """Exposure that oscillates over so many stops (a factor of two each), one and a half times in the clip."""
-    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * DRIFT_PERIODS * np.arange(frames) / frames
-    return _gains(stops / 2 * np.sin(phase))
+def with_drift(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
+    """Any clip whose exposure oscillates over `level` stops (a factor of two each), one and a half times."""
+    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * DRIFT_PERIODS * np.arange(clip.frame_count) / clip.frame_count
+    return _with_gains(clip, _gains(level / 2 * np.sin(phase)))
 
 
-def white_balance_gains(frames: int, times: float) -> Gains:
-    """By the end of the clip red is so many times as strong and blue as weak; green stays."""
-    red = times ** np.linspace(0, 1, frames)
-    return np.stack([red, np.ones_like(red), 1 / red], axis=-1)
-
-
-def with_gains(clip: DepthClip, gains: Gains) -> DepthClip:
-    """Any clip as recorded with these gains, both eyes if it has them."""
-    right = None if clip.right is None else dataclasses.replace(clip.right, rgb=_with_gains(clip.right, gains))
-    return dataclasses.replace(clip, rgb=_with_gains(clip, gains), right=right)
+def with_tint(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
+    """Any clip by whose end red is `level` times as strong and blue as weak; green stays."""
+    del random
+    red = level ** np.linspace(0, 1, clip.frame_count)
+    return _with_gains(clip, np.stack([red, np.ones_like(red), 1 / red], axis=-1))
 
 
 def exposure_drift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Exposure oscillates over `level` stops, as drift_gains() has it."""
-    return given(clean, with_gains(clean.clip, drift_gains(clean.clip.frame_count, level, random)))
+    """Exposure oscillates over `level` stops."""
+    return given(clean, with_drift(clean.clip, level, random))
 
 
 def white_balance_drift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """White balance drifts by `level` times, as white_balance_gains() has it."""
-    del random
-    return given(clean, with_gains(clean.clip, white_balance_gains(clean.clip.frame_count, level)))
+    """White balance drifts by `level` times."""
+    return given(clean, with_tint(clean.clip, level, random))
 
 
 def auto_exposure(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -74,7 +69,7 @@ def auto_exposure(clean: CleanClip, level: float, random: np.random.Generator) -
     light = ((clip.rgb / np.float32(255)) ** TONE_POWER).mean(axis=(1, 2, 3), dtype=np.float64)
     stops = lagging(-np.log2(light / light[0]))
     gains = _gains(level * stops / max(float(np.ptp(stops)), 1e-9))
-    return given(clean, with_gains(clip, gains), scored=clean.seen & ~covered)
+    return given(clean, _with_gains(clip, gains), scored=clean.seen & ~covered)
 
 
 def advancing_lamp(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -126,5 +121,11 @@ def _gains(stops: NDArray[np.float64]) -> Gains:
     return np.repeat((2**stops) ** (1 / TONE_POWER), 3).reshape(-1, 3)
 
 
-def _with_gains(eye: Eye, gains: Gains) -> NDArray[np.uint8]:
+def _with_gains(clip: DepthClip, gains: Gains) -> DepthClip:
+    """The clip as recorded with these gains, both eyes if it has them."""
+    right = None if clip.right is None else dataclasses.replace(clip.right, rgb=_times(clip.right, gains))
+    return dataclasses.replace(clip, rgb=_times(clip, gains), right=right)
+
+
+def _times(eye: Eye, gains: Gains) -> NDArray[np.uint8]:
     return np.stack([to_bytes(rgb * gain) for rgb, gain in zip(eye.rgb, gains, strict=True)])

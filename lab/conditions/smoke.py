@@ -1,7 +1,8 @@
 """Smoke between the endoscope and the tissue: a cloud that takes light from the tissue and adds its own grey.
 
 recorded = passes * tissue + (1 - passes) * AIRLIGHT, where passes = exp(-density * depth) is the share of light that
-reaches the eye. The density is smooth over the picture and drifts. Both eyes look through the same cloud.
+reaches the eye. The density is smooth over the picture and drifts. Both eyes look through the same cloud. with_smoke()
+takes any clip, of one eye or two.
 
 Symbols: T frames, H W pixels. Lengths in pixels refer to a picture 640 wide.
 """
@@ -79,7 +80,7 @@ def smoke_before(
     return dataclasses.replace(smoke, density=smoke.density * np.float32(middle))
 
 
-def smoked(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
+def with_smoke(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
     """Any clip with depth, through smoke that takes `level` of the light; both eyes if it has them. Depth stays."""
     right, focal_baseline = clip.right, 0.0
     if right is not None:
@@ -92,7 +93,7 @@ def smoked(clip: DepthClip, level: float, random: np.random.Generator) -> DepthC
 
 def smoke(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """Smoke takes `level` of the light."""
-    return given(clean, smoked(clean.clip, level, random))
+    return given(clean, with_smoke(clean.clip, level, random))
 
 
 def smoke_stereo(clean: CleanClip, level: float, random: np.random.Generator) -> Given:

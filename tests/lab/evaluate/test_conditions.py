@@ -14,7 +14,7 @@ from intrasplat.clip.types import Eye
 from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
 from lab.conditions.exposure import TONE_POWER
 from lab.conditions.lens import BLOOD_FROM
-from lab.conditions.smoke import AIRLIGHT, CLOUD_AT, smoke_before, smoked
+from lab.conditions.smoke import AIRLIGHT, CLOUD_AT, smoke_before, with_smoke
 from lab.phantom import PhantomSettings
 
 pytestmark = pytest.mark.usefixtures("each_phantom_once")
@@ -215,7 +215,7 @@ def test_smoke_takes_its_share_of_the_light_and_grows_with_depth(severity: int) 
 
 def test_both_eyes_of_any_clip_see_one_cloud() -> None:
     clip = on_a_wall()
-    veiled = smoked(clip, 0.4, np.random.default_rng(0))
+    veiled = with_smoke(clip, 0.4, np.random.default_rng(0))
     assert veiled.right is not None
     nearer_px = round(clip.intrinsics.fx * 4.0 / (CLOUD_AT * 80.0))
     np.testing.assert_array_equal(veiled.right.rgb[:, :, :-nearer_px], veiled.rgb[:, :, nearer_px:])
