@@ -1,8 +1,8 @@
 """The stability atlas, drawn from rows alone: one heat map a method, and a table of what the user is told.
 
 A cell of the map is a condition at a severity. It shows the loss in dB against the clean clip, mean over seeds, behind
-a stroke the loss after a fit of gain and offset where that differs, and a mark for the worst outcome of any seed.
-Unmeasured cells are hatched.
+a stroke the loss after a fit of gain and offset where that differs, and a mark for the worst outcome of any seed. Its
+colour is the loss that decides. Unmeasured cells are hatched.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from lab.conditions import CONDITIONS, SEVERITIES
 from lab.evaluate.rows import Row
 from lab.evaluate.style import GREY, SETTINGS, save
-from lab.evaluate.verdict import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, SEPARATOR
+from lab.evaluate.verdict import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, SEPARATOR, judged_by
 
 WORST_FIRST = ("silent", "crashed", "unknown", "diverged", "told", "refused", "held")
 MARKS = {"silent": "X", "told": "^", "refused": "s", "diverged": "D", "crashed": "P", "unknown": "$?$"}
@@ -37,7 +37,7 @@ FIT_MATTERS_DB = 0.5
 """Smaller differences between the losses with and without a fit are not shown."""
 COLOURS = "Blues"  # one hue, light to dark: read in print and by the colour-blind
 DARK_FROM = 0.6  # of the scale, from where white writing is read better
-ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.0, 3.6
+ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.35, 3.6
 MAX_TOLD_CHARACTERS = 150
 
 
@@ -45,13 +45,14 @@ MAX_TOLD_CHARACTERS = 150
 class MapCell:
     """All seeds of a condition at a severity by one method; losses are means, NaN if unknown.
 
-    fitted_loss_db is the loss after a fit of gain and offset; spread_db is the largest loss less the smallest, 0 for
-    one seed.
+    fitted_loss_db is the loss after a fit of gain and offset, judged_db the one of both that decides; spread_db is the
+    largest loss less the smallest, 0 for one seed.
     """
 
     outcome: str
     loss_db: float
     fitted_loss_db: float
+    judged_db: float
     spread_db: float
     depth_loss_mm: float
     told: str
@@ -139,6 +140,7 @@ def _place(rows: Sequence[Row]) -> MapCell:
         outcome=worst["outcome"],
         loss_db=_mean(losses_db),
         fitted_loss_db=_mean(_known(rows, "fitted_loss_db")),
+        judged_db=_mean(_known(rows, judged_by(rows[0]["condition"]))),
         spread_db=max(losses_db) - min(losses_db) if losses_db else 0.0,
         depth_loss_mm=_mean(_known(rows, "depth_loss_mm")),
         told=told.replace("|", "/"),
@@ -154,7 +156,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _loss(place: MapCell | None) -> float:
-    return math.nan if place is None else place.loss_db
+    return math.nan if place is None else place.judged_db
 
 
 def _write(axis: Any, column: int, row: int, place: MapCell | None, level: float) -> None:
@@ -165,7 +167,7 @@ def _write(axis: Any, column: int, row: int, place: MapCell | None, level: float
     if place is None:
         axis.add_patch(Rectangle(corner, 1, 1, fill=False, hatch="////", edgecolor="#d0d0d0", linewidth=0))
         return
-    dark = not math.isnan(place.loss_db) and place.loss_db / FULL_COLOUR_DB > DARK_FROM
+    dark = not math.isnan(place.judged_db) and place.judged_db / FULL_COLOUR_DB > DARK_FROM
     ink = "white" if dark else "black"
     axis.text(column - 0.46, row, f"{level:g}", ha="left", va="center", fontsize=6, color=ink, alpha=0.75)
     axis.text(column + 0.06, row, _figures(place), ha="center", va="center", fontsize=7.5, color=ink)

@@ -29,6 +29,12 @@ MAX_DEPTH_LOSS_MM = 2.0
 SEPARATOR = " | "
 
 
+def judged_by(condition: str) -> str:
+    """The column with the loss that decides whether cells of a condition are harmed."""
+    known = CONDITIONS.get(condition)
+    return "fitted_loss_db" if known is not None and known.any_light else "loss_db"
+
+
 def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     """outcome, loss_db, depth_loss_mm and fitted_loss_db of a row, compared with its clean cell's.
 
@@ -39,8 +45,7 @@ def verdict(row: Row, clean: Row | None) -> dict[str, str]:
     if clean is None or clean["error"] or (clean["warnings"] and not clean.get("codes")):
         return _without_figures("unknown")
     loss_db, fitted_loss_db = (_less(clean[name], row[name]) for name in ("psnr_db", "fitted_db"))
-    condition = CONDITIONS.get(row["condition"])
-    judged_db = fitted_loss_db if condition is not None and condition.any_light else loss_db
+    judged_db = fitted_loss_db if judged_by(row["condition"]) == "fitted_loss_db" else loss_db
     if math.isnan(judged_db):
         return _without_figures("unknown")
     depth_loss_mm = math.inf  # no depth where there was some

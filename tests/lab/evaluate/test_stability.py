@@ -259,6 +259,9 @@ def test_the_loss_after_a_fit_stands_beside_the_plain_one_where_it_differs() -> 
     rows = [placed("smoke", severity, "silent", "5.00") for severity in (1, 2)]
     places = places_of([rows[0] | {"fitted_loss_db": "2.30"}, rows[1] | {"fitted_loss_db": "4.80"}], "fast")
     assert "| **silent** 5.0 / 2.3 | **silent** 5.0 |" in told_table(places, "fast")
+    assert places["smoke", 1].judged_db == 5.0
+    drift = placed("exposure_drift", 1, "held", "5.00") | {"fitted_loss_db": "2.30"}
+    assert places_of([drift], "fast")["exposure_drift", 1].judged_db == 2.3
 
 
 def test_the_page_shows_plain_and_fitted_scores_of_spoilt_light(tmp_path: Path) -> None:
