@@ -157,6 +157,9 @@ class Frames:
         one, two = self.frame(a), self.frame(b)
         flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
         columns, rows = self._matched(one)
+        if not columns.size:  # OpenCV refuses to move no points
+            nowhere = np.empty((0, 3))
+            return FrameLink(a, b, np.empty(0, np.intp), nowhere, nowhere, np.empty(0), 0.0, flow)
         places = np.stack([columns, rows], axis=1).astype(np.float32)
         height, width = one.grey.shape
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)

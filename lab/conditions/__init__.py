@@ -1,8 +1,8 @@
 """What goes wrong in an operating theatre, each as a function of the clean clip, a severity and a seed.
 
 CONDITIONS is the table: the five severities of each in its own unit. The functions lie in hiding (instruments and
-masks), light (the picture), depth, timing (frames) and scenes (motion, camera, size, stereo); clean.py has what they
-take and give, recording.py what is written as files.
+masks), light (the picture), exposure (its light as a whole), smoke, lens (drops), depth, timing (frames) and scenes
+(motion, camera, size, stereo); clean.py has what they take and give, recording.py what is written as files.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.conditions import depth, hiding, light, scenes, timing
+from lab.conditions import depth, exposure, hiding, lens, light, scenes, smoke, timing
 from lab.conditions.clean import CleanClip, Given, clean_clip, given
 from lab.conditions.recording import Recording, recording_of, write_recording
 
@@ -27,11 +27,12 @@ Spoiler = Callable[[CleanClip, float, np.random.Generator], Given]
 class Condition:
     """One adverse condition.
 
-    title   its name, with the unit of its levels
-    levels  the levels of severity 1 to 5
-    stereo  whether it is written as stereo files and read, rectified and matched; so is its clean cell then
-    calm    for a condition with its own tissue motion: the harmless level of severity 0, because scores of different
-            motions cannot be compared. Else None: severity 0 is the clean clip
+    title      its name, with the unit of its levels
+    levels     the levels of severity 1 to 5
+    stereo     whether it is written as stereo files and read, rectified and matched; so is its clean cell then
+    any_light  whether the clip does not tell which of its frames has the truth's light
+    calm       for a condition with its own tissue motion: the harmless level of severity 0, because scores of different
+               motions cannot be compared. Else None: severity 0 is the clean clip
     """
 
     name: str
@@ -39,6 +40,7 @@ class Condition:
     spoil: Spoiler
     levels: tuple[float, ...]
     stereo: bool = False
+    any_light: bool = False
     calm: float | None = None
 
     @property
@@ -76,12 +78,34 @@ def _conditions() -> dict[str, Condition]:
         Condition("tools", "instruments, share of picture", hiding.tools_over_frame, (0.1, 0.25, 0.4, 0.55, 0.7)),
         Condition("hidden_at_start", "hidden in frame 0, share", hiding.hidden_at_start, (0.1, 0.2, 0.3, 0.45, 0.6)),
         Condition("highlights", "moving highlights, number", light.highlights, (4, 8, 16, 32, 64)),
-        Condition("smoke", "smoke, share of light", light.smoke, (0.1, 0.25, 0.4, 0.6, 0.8)),
+        Condition("smoke", "smoke, share of light", smoke.smoke, (0.1, 0.25, 0.4, 0.6, 0.8)),
+        Condition(
+            "smoke_stereo", "smoke before both eyes, share of light", smoke.smoke_stereo, (0.1, 0.25, 0.4, 0.6, 0.8),
+            True,
+        ),
+        Condition("splash", "drops on the lens, share of picture", lens.splash, (0.02, 0.05, 0.1, 0.2, 0.35)),
+        Condition(
+            "splash_stereo", "drops on both lenses, share of picture", lens.splash_stereo, (0.02, 0.05, 0.1, 0.2, 0.35),
+            True,
+        ),
         Condition("blood", "flooded by blood, share", light.blood, (0.1, 0.25, 0.4, 0.6, 0.8)),
         Condition("motion_blur", "motion blur in half the frames, px", light.motion_blur, (8, 16, 24, 32, 48)),
         Condition("defocus", "defocus, sigma px", light.defocus, (2, 4, 6, 8, 12)),
-        Condition("exposure_drift", "exposure drift, stops", light.exposure_drift, (0.25, 0.5, 1, 1.5, 2)),
-        Condition("white_balance", "white balance drift, times", light.white_balance_drift, (1.05, 1.1, 1.2, 1.4, 1.8)),
+        Condition(
+            "exposure_drift", "exposure drift, stops", exposure.exposure_drift, (0.25, 0.5, 1, 1.5, 2), any_light=True
+        ),
+        Condition(
+            "auto_exposure", "exposure follows instruments, stops", exposure.auto_exposure, (0.25, 0.5, 1, 1.5, 2),
+            any_light=True,
+        ),
+        Condition(
+            "white_balance", "white balance drift, times", exposure.white_balance_drift, (1.05, 1.1, 1.2, 1.4, 1.8),
+            any_light=True,
+        ),
+        Condition(
+            "advancing_lamp", "lamp comes nearer, stops", exposure.advancing_lamp, (0.25, 0.5, 1, 1.5, 2),
+            any_light=True,
+        ),
         Condition("black_border", "black border, share", light.black_border, (0.05, 0.1, 0.2, 0.3, 0.4)),
         Condition("grey_scale", "colour lost, share", light.grey_scale, (0.2, 0.4, 0.6, 0.8, 1)),
         Condition("depth_noise", "depth noise, share of depth", depth.depth_noise, (0.01, 0.02, 0.05, 0.1, 0.2)),

@@ -85,3 +85,8 @@ def given(clean: CleanClip, clip: DepthClip | Recording | None = None, **truth: 
     """
     parts = {"rgb": clean.rgb, "depth_mm": clean.depth_mm, "scored": clean.seen, **truth}
     return Given(clip or clean.clip, source=tuple(range(clean.clip.frame_count)), **parts)  # type: ignore[arg-type]
+
+
+def to_bytes(levels: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Levels of 0 to 255, rounded, and clipped as a camera does."""
+    return np.asarray(np.clip(np.rint(levels), 0, 255), dtype=np.uint8)

@@ -37,8 +37,8 @@ def tools_over_frame(clean: CleanClip, level: float, random: np.random.Generator
     clip = clean.clip
     frames, height, width = clip.tissue.shape
     start = random.uniform(0, 2 * np.pi)
-    covered = np.stack([_beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
-    spoilt = _with_steel(clean, covered, random)
+    covered = np.stack([beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
+    spoilt = with_instrument(clip, covered, STEEL, random)
     return given(clean, spoilt, scored=clean.seen & ~covered)
 
 
@@ -52,7 +52,8 @@ def hidden_at_start(clean: CleanClip, level: float, random: np.random.Generator)
     away = np.hypot(*(np.indices((height, width)) - np.array([row, column])[:, None, None]))
     share_left = np.clip(1 - np.arange(frames) / max(frames / 2, 1), 0, 1)
     radius = np.quantile(away, level) * np.sqrt(share_left)
-    return given(clean, _with_steel(clean, away[None] < radius[:, None, None], random))
+    covered = away[None] < radius[:, None, None]
+    return given(clean, with_instrument(clean.clip, covered, STEEL, random))
 
 
 def mask_shift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -79,7 +80,7 @@ def inverted_masks(clean: CleanClip, level: float, random: np.random.Generator) 
     """Stereo files whose masks have tissue and instrument exchanged, where instruments cover `level` of the picture."""
     frames, height, width = clean.clip.tissue.shape
     start = random.uniform(0, 2 * np.pi)
-    covered = np.stack([_beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
+    covered = np.stack([beyond(start + _wag(index, frames), level, height, width) for index in range(frames)])
 
     def spoil(frame: PhantomFrame, index: int) -> PhantomFrame:
         steel = covered[index][..., None]
@@ -116,21 +117,22 @@ def _wag(index: int, frames: int) -> float:
     return float(np.deg2rad(WAG_DEG) * np.sin(2 * np.pi * WAG_PERIODS * index / frames))
 
 
-def _beyond(angle: float, share: float, height: int, width: int) -> NDArray[np.bool_]:
+def beyond(angle: float, share: float, height: int, width: int) -> NDArray[np.bool_]:
     """The `share` of the picture [H, W] that lies farthest in the direction `angle`."""
     rows, columns = np.indices((height, width))
     along = np.cos(angle) * (columns - width / 2) + np.sin(angle) * (rows - height / 2)
     return np.asarray(along > np.quantile(along, 1 - share))
 
 
-def _with_steel(clean: CleanClip, covered: NDArray[np.bool_], random: np.random.Generator) -> DepthClip:
-    """Steel with its own depth and mask where covered [T, H, W]."""
-    clip = clean.clip
+def with_instrument(
+    clip: DepthClip, covered: NDArray[np.bool_], colour: tuple[int, int, int], random: np.random.Generator
+) -> DepthClip:
+    """The clip with brushed metal of its own depth and mask where covered [T, H, W]."""
     grain = random.normal(0, BRUSHED_LEVELS, clip.rgb.shape)
-    steel = np.clip(np.array(STEEL) + grain, 0, 255).astype(np.uint8)
+    metal = np.clip(np.array(colour) + grain, 0, 255).astype(np.uint8)
     return dataclasses.replace(
         clip,
-        rgb=np.where(covered[..., None], steel, clip.rgb),
+        rgb=np.where(covered[..., None], metal, clip.rgb),
         tissue=clip.tissue & ~covered,
         depth_mm=np.where(covered, np.float32(TOOL_DEPTH_MM), clip.depth_mm),
         depth_confidence=np.where(covered, np.uint8(255), clip.depth_confidence),

@@ -1,4 +1,4 @@
-"""Degraded pictures: highlights, smoke, blood, blur, exposure, colour, borders.
+"""Degraded pictures: highlights, blood, blur, borders, lost colour.
 
 Symbols: T frames, H W pixels.
 
@@ -14,15 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.conditions.clean import CleanClip, Given, given
+from lab.conditions.clean import CleanClip, Given, given, to_bytes
 
 HIGHLIGHT_PX, HIGHLIGHT_STEP_PX = 10.0, 8.0  # radius, and standard deviation of the step per frame
-SMOKE_GREY = 205.0
-CLOUD_PX, CLOUD_DRIFT_PX, CLOUD_DEPTH = 160.0, 12.0, 0.35  # size, drift per frame, share by which its density varies
 BLOOD = (104.0, 14.0, 12.0)
 BLOOD_OPACITY, BLOOD_FROM = 0.92, 0.25  # blood appears after this share of the clip
 BLURRED_SHARE = 0.5  # share of blurred frames
-DRIFT_PERIODS = 1.5
 
 
 def highlights(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -37,18 +34,6 @@ def highlights(clean: CleanClip, level: float, random: np.random.Generator) -> G
     return given(clean, dataclasses.replace(clean.clip, rgb=rgb))
 
 
-def smoke(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """A drifting grey veil that absorbs `level` of the tissue's light on average."""
-    frames, height, width = clean.clip.tissue.shape
-    drift_px = CLOUD_DRIFT_PX * clean.px
-    wide = width + int(drift_px * frames) + 1
-    cloud = cv2.GaussianBlur(random.standard_normal((height, wide)), (0, 0), CLOUD_PX * clean.px / 4)
-    density = np.clip(level * (1 + CLOUD_DEPTH * cloud / cloud.std()), 0, 1)
-    veil = np.stack([density[:, int(i * drift_px) : int(i * drift_px) + width] for i in range(frames)])[..., None]
-    rgb = (1 - veil) * clean.clip.rgb + veil * SMOKE_GREY
-    return given(clean, dataclasses.replace(clean.clip, rgb=_bytes(rgb)))
-
-
 def blood(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """Blood rises from below and in the end covers `level` of the picture. Scored against the covered tissue."""
     frames, height, width = clean.clip.tissue.shape
@@ -60,7 +45,7 @@ def blood(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     tissue = clean.clip.tissue[..., None]
     flooded = np.where(tissue, (1 - opacity) * clean.clip.rgb + opacity * np.array(BLOOD), clean.clip.rgb)
     truth = (1 - opacity) * clean.rgb + opacity * np.array(BLOOD) / 255
-    return given(clean, dataclasses.replace(clean.clip, rgb=_bytes(flooded)), rgb=truth.astype(np.float32))
+    return given(clean, dataclasses.replace(clean.clip, rgb=to_bytes(flooded)), rgb=truth.astype(np.float32))
 
 
 def motion_blur(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -76,24 +61,6 @@ def defocus(clean: CleanClip, level: float, random: np.random.Generator) -> Give
     del random
     rgb = np.stack([cv2.GaussianBlur(picture, (0, 0), level * clean.px) for picture in clean.clip.rgb])
     return given(clean, dataclasses.replace(clean.clip, rgb=rgb))
-
-
-def exposure_drift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """Exposure oscillates over `level` stops (a factor of two each), one and a half times in the clip."""
-    share = np.arange(clean.clip.frame_count) / clean.clip.frame_count
-    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * DRIFT_PERIODS * share
-    gain = 2 ** (level / 2 * np.sin(phase))
-    # a gain of light acts before the camera's tone curve, usually modelled as the power 1 / 2.2
-    rgb = _bytes(clean.clip.rgb * (gain ** (1 / 2.2))[:, None, None, None])
-    return given(clean, dataclasses.replace(clean.clip, rgb=rgb))
-
-
-def white_balance_drift(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
-    """By the end of the clip red is `level` times as strong and blue as weak; green stays."""
-    del random
-    red = level ** np.linspace(0, 1, clean.clip.frame_count)
-    gains = np.stack([red, np.ones_like(red), 1 / red], axis=-1)
-    return given(clean, dataclasses.replace(clean.clip, rgb=_bytes(clean.clip.rgb * gains[:, None, None])))
 
 
 def black_border(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
@@ -119,7 +86,7 @@ def grey_scale(clean: CleanClip, level: float, random: np.random.Generator) -> G
     grey = clean.rgb.mean(axis=-1, keepdims=True)
     recorded = clean.clip.rgb.mean(axis=-1, keepdims=True)
     truth = (1 - level) * clean.rgb + level * grey
-    rgb = _bytes((1 - level) * clean.clip.rgb + level * recorded)
+    rgb = to_bytes((1 - level) * clean.clip.rgb + level * recorded)
     return given(clean, dataclasses.replace(clean.clip, rgb=rgb), rgb=truth.astype(np.float32))
 
 
@@ -132,7 +99,3 @@ def _line(length_px: float, angle: float) -> NDArray[np.float32]:
         row, column = (np.maximum(0, 1 - np.abs(offset - along * way)) for way in (np.sin(angle), np.cos(angle)))
         kernel += np.outer(row, column)
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
-
-
-def _bytes(rgb: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.asarray(np.clip(np.rint(rgb), 0, 255), dtype=np.uint8)

@@ -1,7 +1,8 @@
 """The stability atlas, drawn from rows alone: one heat map a method, and a table of what the user is told.
 
-A cell of the map is a condition at a severity. It shows the loss in dB against the clean clip, mean over seeds, and a
-mark for the worst outcome of any seed. Unmeasured cells are hatched.
+A cell of the map is a condition at a severity. It shows the loss in dB against the clean clip, mean over seeds, behind
+a stroke the loss after a fit of gain and offset where that differs, and a mark for the worst outcome of any seed. Its
+colour is the loss that decides. Unmeasured cells are hatched.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import numpy as np
 
 from lab.conditions import CONDITIONS, SEVERITIES
 from lab.evaluate.rows import Row
-from lab.evaluate.stability import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, SEPARATOR
 from lab.evaluate.style import GREY, SETTINGS, save
+from lab.evaluate.verdict import MAX_DEPTH_LOSS_MM, MAX_LOSS_DB, SEPARATOR, judged_by
 
 WORST_FIRST = ("silent", "crashed", "unknown", "diverged", "told", "refused", "held")
 MARKS = {"silent": "X", "told": "^", "refused": "s", "diverged": "D", "crashed": "P", "unknown": "$?$"}
@@ -32,21 +33,26 @@ MEANINGS = {
 }
 FULL_COLOUR_DB = 10.0
 """Losses above this have the same colour: none of these results is usable."""
+FIT_MATTERS_DB = 0.5
+"""Smaller differences between the losses with and without a fit are not shown."""
 COLOURS = "Blues"  # one hue, light to dark: read in print and by the colour-blind
 DARK_FROM = 0.6  # of the scale, from where white writing is read better
-ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.0, 3.6
+ROW_INCHES, COLUMN_INCHES, LABEL_INCHES = 0.3, 1.35, 3.6
 MAX_TOLD_CHARACTERS = 150
 
 
 @dataclass(frozen=True)
 class MapCell:
-    """All seeds of a condition at a severity by one method; depth_loss_mm and loss_db are means, NaN if unknown.
+    """All seeds of a condition at a severity by one method; losses are means, NaN if unknown.
 
-    spread_db is the largest loss less the smallest; 0 for one seed.
+    fitted_loss_db is the loss after a fit of gain and offset, judged_db the one of both that decides; spread_db is the
+    largest loss less the smallest, 0 for one seed.
     """
 
     outcome: str
     loss_db: float
+    fitted_loss_db: float
+    judged_db: float
     spread_db: float
     depth_loss_mm: float
     told: str
@@ -90,7 +96,9 @@ def draw_map(places: MapCells, series: str, folder: Path) -> str:
         axis.set_yticks(range(len(shown)), [CONDITIONS[each].title for each in shown])
         axis.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
         axis.set_title(_title(places, series))
-        figure.colorbar(image, label="dB lost against the clean clip", extend="max", shrink=0.6)
+        figure.colorbar(
+            image, label="dB lost against the clean clip (/ after a fit of gain and offset)", extend="max", shrink=0.6
+        )
         figure.legend(handles=_handles(places), loc="outside lower center", ncols=2, fontsize=8.5)
         save(figure, folder, name)
     return name
@@ -127,12 +135,14 @@ def _place(rows: Sequence[Row]) -> MapCell:
     told = worst["error"].partition(": ")[2] or worst["new_warnings"].split(SEPARATOR)[0]
     if len(told) > MAX_TOLD_CHARACTERS:
         told = told[:MAX_TOLD_CHARACTERS].rpartition(" ")[0] + " ..."
-    losses_db, depth_losses_mm = _known(rows, "loss_db"), _known(rows, "depth_loss_mm")
+    losses_db = _known(rows, "loss_db")
     return MapCell(
         outcome=worst["outcome"],
-        loss_db=float(np.mean(losses_db)) if losses_db else math.nan,
+        loss_db=_mean(losses_db),
+        fitted_loss_db=_mean(_known(rows, "fitted_loss_db")),
+        judged_db=_mean(_known(rows, judged_by(rows[0]["condition"]))),
         spread_db=max(losses_db) - min(losses_db) if losses_db else 0.0,
-        depth_loss_mm=float(np.mean(depth_losses_mm)) if depth_losses_mm else math.nan,
+        depth_loss_mm=_mean(_known(rows, "depth_loss_mm")),
         told=told.replace("|", "/"),
     )
 
@@ -141,8 +151,12 @@ def _known(rows: Sequence[Row], name: str) -> list[float]:
     return [float(row[name]) for row in rows if row[name]]
 
 
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else math.nan
+
+
 def _loss(place: MapCell | None) -> float:
-    return math.nan if place is None else place.loss_db
+    return math.nan if place is None else place.judged_db
 
 
 def _write(axis: Any, column: int, row: int, place: MapCell | None, level: float) -> None:
@@ -153,7 +167,7 @@ def _write(axis: Any, column: int, row: int, place: MapCell | None, level: float
     if place is None:
         axis.add_patch(Rectangle(corner, 1, 1, fill=False, hatch="////", edgecolor="#d0d0d0", linewidth=0))
         return
-    dark = not math.isnan(place.loss_db) and place.loss_db / FULL_COLOUR_DB > DARK_FROM
+    dark = not math.isnan(place.judged_db) and place.judged_db / FULL_COLOUR_DB > DARK_FROM
     ink = "white" if dark else "black"
     axis.text(column - 0.46, row, f"{level:g}", ha="left", va="center", fontsize=6, color=ink, alpha=0.75)
     axis.text(column + 0.06, row, _figures(place), ha="center", va="center", fontsize=7.5, color=ink)
@@ -171,7 +185,9 @@ def _figures(place: MapCell) -> str:
     if math.isnan(place.loss_db):
         return place.outcome
     harmed_in_depth = place.depth_loss_mm > MAX_DEPTH_LOSS_MM
-    return f"{place.loss_db:z.1f}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
+    fit_matters = abs(place.loss_db - place.fitted_loss_db) >= FIT_MATTERS_DB  # not where it is NaN
+    fitted = f" / {place.fitted_loss_db:z.1f}" if fit_matters else ""
+    return f"{place.loss_db:z.1f}{fitted}" + (f", {place.depth_loss_mm:.0f} mm" if harmed_in_depth else "")
 
 
 def _in_words(place: MapCell | None) -> str:

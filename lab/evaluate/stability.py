@@ -1,12 +1,6 @@
-"""Where a method fails, and whether it warns: a cell is a clip degraded by one condition, trained and scored by truth.
+"""The stability atlas: a cell is a clip degraded by one condition, trained, scored by truth, and judged by verdict.py.
 
 Symbols: T frames of the clean clip, S frames of the given one, H W pixels.
-
-A cell is harmed when it scores more than MAX_LOSS_DB below the clean cell of the same series and seed, or its
-depth errs by MAX_DEPTH_LOSS_MM more. The clean cell has severity 0: the clean clip, or the condition's own motion
-where that is calm. A harmed cell is `told` if its report has a kind of warning that the clean cell's has not, else
-`silent`: that is the defect. The kind of a warning is its code. `refused` and `diverged` end in an error that says why,
-`crashed` in one that nobody foresaw.
 """
 
 from __future__ import annotations
@@ -24,17 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip import split_frames
-from intrasplat.errors import InputError, TrainingDiverged
+from intrasplat.errors import InputError
 from intrasplat.machine.timing import Timings
-from intrasplat.notices import Severity
 from intrasplat.pipeline import open_with_poses, reconstruct
 from intrasplat.poses.trajectory import trajectory_error
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
-from intrasplat.scene.scene import POSE_WARNINGS
 from intrasplat.splat.backend import choose_device
-from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import RenderedFrame, TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.targets import solid_depth_mm
@@ -51,29 +42,23 @@ from lab.conditions import (
     write_recording,
 )
 from lab.evaluate.cells import eyes_of, is_rival_system, preset_of
-from lab.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, write_rows
+from lab.evaluate.fitted import fitted_db, plain_db
+from lab.evaluate.rows import NO_RESULT, Row, commit, machine, read_rows, texts_of, write_rows
 from lab.evaluate.thinned import lattice, thinned_camera
+from lab.evaluate.verdict import PATH, SEPARATOR, VERDICT, failure, verdict
 from lab.phantom import PhantomSettings
 from lab.rivals import RIVAL_SYSTEMS, scored_step_px
 from lab.rivals.run import Length, every_core, run_rival
 
 STABILITY = "stability.csv"
 KEY = ("condition", "severity", "series", "seed", "iterations", "width", "height", "frames")
-VERDICT = ("outcome", "loss_db", "depth_loss_mm")
-PATH = ("path_error_mm", "path_error_deg")
 FIELDS = (
-    *KEY, "level", *VERDICT, "psnr_db", "depth_error_mm", "reported_db", "seconds", "new_warnings", "warnings",
-    "codes", "error", "machine", "commit", *PATH,
+    *KEY, "level", *VERDICT, "psnr_db", "fitted_db", "depth_error_mm", "reported_db", "seconds", "new_warnings",
+    "warnings", "codes", "error", "machine", "commit", *PATH,
 )  # fmt: skip
-"""psnr_db and depth_error_mm (mean) are against the truth, reported_db is what the report says of itself; codes
-has SEVERITY:CODE of each of the warnings."""
-MAX_LOSS_DB = 3.0
-"""Twice the squared error: nobody would call that the same quality."""
-MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG = 1.5, 1.0
-"""Error of an estimated camera path above which a cell is harmed and must have a warning in POSE_WARNINGS."""
-MAX_DEPTH_LOSS_MM = 2.0
-"""About the width of a grasper's jaw."""
-SEPARATOR = " | "
+"""psnr_db and depth_error_mm (mean) are against the truth; fitted_db is psnr_db after one fit of gain and offset by
+channel over all that is judged, empty in rows from before it was measured. reported_db is what the report says of
+itself; codes has SEVERITY:CODE of each of the warnings."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +137,7 @@ class StabilityBench:
     _commit: str = field(default_factory=commit)  # of the code as it was loaded; the tree may go on while this runs
 
     def __post_init__(self) -> None:
-        self.rows = read_rows(self.folder / STABILITY)
+        self.rows = stability_rows(self.folder)
 
     def missing(self, cells: Sequence[StabilityCell]) -> list[StabilityCell]:
         """The cells without a row."""
@@ -180,6 +165,11 @@ class StabilityBench:
         return row
 
 
+def stability_rows(folder: Path) -> list[Row]:
+    """The rows in a folder; columns that an older file lacks are empty."""
+    return [texts_of(row, FIELDS) for row in read_rows(folder / STABILITY)]
+
+
 def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingHooks) -> Row:
     """The row of a cell, without its verdict and origin; a failure's row says why in `error`.
 
@@ -203,55 +193,6 @@ def measured(cell: StabilityCell, clean: CleanClip, grid: Grid, hooks: TrainingH
     except Exception as error:
         row |= {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "outcome": failure(error)}
     return row | {"seconds": f"{time.perf_counter() - start:.2f}"}
-
-
-def verdict(row: Row, clean: Row | None) -> dict[str, str]:
-    """outcome, loss_db and depth_loss_mm of a row, compared with its clean cell's.
-
-    The outcome is unknown where the clean cell failed, or was measured before warnings had codes.
-    """
-    if row["error"]:
-        return {"outcome": row["outcome"], "loss_db": "", "depth_loss_mm": ""}
-    if clean is None or clean["error"] or (clean["warnings"] and not clean.get("codes")):
-        return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
-    if not (row["psnr_db"] and clean["psnr_db"]):
-        return {"outcome": "unknown", "loss_db": "", "depth_loss_mm": ""}
-    loss_db = float(clean["psnr_db"]) - float(row["psnr_db"])
-    depth_loss_mm = math.inf  # no depth where there was some
-    if row["depth_error_mm"] and clean["depth_error_mm"]:
-        depth_loss_mm = float(row["depth_error_mm"]) - float(clean["depth_error_mm"])
-    new = new_warnings(row, clean)
-    harmed = loss_db > MAX_LOSS_DB or depth_loss_mm > MAX_DEPTH_LOSS_MM
-    outcome = "held" if not harmed else "told" if new else "silent"
-    if _lost_its_way(row):
-        doubts = {f"{Severity.WARNING}:{each}" for each in POSE_WARNINGS}
-        outcome = "told" if doubts & {*row["codes"].split()} else "silent"
-    return {
-        "outcome": outcome,
-        "loss_db": f"{loss_db:.2f}",
-        "depth_loss_mm": f"{depth_loss_mm:.2f}",
-        "new_warnings": SEPARATOR.join(new),
-    }
-
-
-def _lost_its_way(row: Row) -> bool:
-    """Whether an estimated camera path exceeds the maximum error."""
-    limits = zip(PATH, (MAX_PATH_ERROR_MM, MAX_PATH_ERROR_DEG), strict=True)
-    return any(float(row.get(name) or 0) > limit for name, limit in limits)
-
-
-def failure(error: Exception) -> str:
-    """The outcome of a cell that ended with this error."""
-    if isinstance(error, InputError):
-        return "refused"
-    return "diverged" if isinstance(error, TrainingDiverged) else "crashed"
-
-
-def new_warnings(row: Row, clean: Row) -> list[str]:
-    """Texts of the row's warnings whose code the clean row has not; notices of severity info do not count."""
-    known = set(clean["codes"].split())
-    pairs = zip(row["codes"].split(), row["warnings"].split(SEPARATOR), strict=True) if row["codes"] else ()
-    return [text for code, text in pairs if code not in known and code.partition(":")[0] == Severity.WARNING]
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +236,7 @@ def _made(request: ReconstructionRequest, cell: StabilityCell, out: Path, hooks:
 
     def show(moment: Moment) -> RenderedFrame:
         camera = view_camera(scene, moment.t, scene.world_from_camera[moment.frame], scene.intrinsics)
-        image = model.render(camera, moment.t)
+        image = model.render(camera, moment.t).copy()  # the model renders into the same array again
         depth_mm = solid_depth_mm(image[3], image[4], scene.units_per_mm)
         return RenderedFrame(image[:3].transpose(1, 2, 0), depth_mm, image[4])
 
@@ -338,12 +279,13 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
         options = asked.options.model_copy(update=chosen)
         made = _made(dataclasses.replace(asked, options=options), cell, Path(folder, "scene"), hooks)
     report = made.report
-    psnr_db, depth_error_mm = _judged(given, made, moments_of(given, report.held_out, report.frame_count))
+    psnr_db, after_fit_db, depth_error_mm = _judged(given, made, moments_of(given, report.held_out, report.frame_count))
     off = None if given.path is None else trajectory_error(made.world_from_camera, given.path)
     return {
         "path_error_mm": _text(None if off is None else off.mm),
         "path_error_deg": _text(None if off is None else off.deg),
         "psnr_db": _text(psnr_db),
+        "fitted_db": _text(after_fit_db),
         "depth_error_mm": _text(depth_error_mm),
         "reported_db": _text(report.psnr_tissue_db),
         "machine": machine(report.device),
@@ -352,17 +294,18 @@ def _reconstructed(given: Given, cell: StabilityCell, grid: Grid, hooks: Trainin
     }
 
 
-def _judged(given: Given, made: _Made, moments: Sequence[Moment]) -> tuple[float, float]:
-    """Mean psnr in dB and mean |z - truth| in mm over the moments' scored pixels; NaN where there is none."""
-    scores, errors_mm, drawn = [], [], lattice(made.step_px)
+def _judged(given: Given, made: _Made, moments: Sequence[Moment]) -> tuple[float, float, float]:
+    """Mean psnr in dB, the same after a fit of gain and offset, and mean |z - truth| in mm over the moments' scored
+    pixels; NaN where there is none."""
+    views, errors_mm, drawn = [], [], lattice(made.step_px)
     for moment in moments:
         shown = made.show(moment)
         depth_mm = shown.depth_mm
         rgb, truth, scored = (each[moment.truth][drawn] for each in (given.rgb, given.depth_mm, given.scored))
-        scores.append(psnr_tissue(shown.rgb, rgb, scored))
+        views.append((shown.rgb, rgb, scored))
         both = scored & (truth > 0) & (depth_mm > 0)
         errors_mm.append(np.abs(depth_mm[both] - truth[both]))
-    return _mean(scores), _mean(np.concatenate(errors_mm))
+    return plain_db(views), fitted_db(views), _mean(np.concatenate(errors_mm))
 
 
 def _clean_name(condition: str) -> str:
@@ -377,9 +320,8 @@ def _one_line(report: Report) -> Iterator[str]:
     return (" ".join(each.text.replace(SEPARATOR, " ").split()) for each in report.warnings)
 
 
-def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
-    known = [float(each) for each in values if not math.isnan(each)]
-    return float(np.mean(known)) if known else math.nan
+def _mean(values: NDArray[np.floating]) -> float:
+    return float(values.mean()) if values.size else math.nan
 
 
 def _text(value: float | None) -> str:

@@ -16,8 +16,8 @@ from intrasplat.machine.processes import heeding_signals
 from intrasplat.train.hooks import TrainingHooks
 from lab.conditions import CONDITIONS, SEVERITIES
 from lab.evaluate.atlas import count_outcomes, draw_map, places_of, series_in, told_table
-from lab.evaluate.rows import Row, adding_alone, read_rows
-from lab.evaluate.stability import STABILITY, Grid, StabilityBench, StabilityCell, plan
+from lab.evaluate.rows import Row, adding_alone
+from lab.evaluate.stability import Grid, StabilityBench, StabilityCell, plan, stability_rows
 from lab.evaluate.variants import register_variants
 from lab.rivals import RIVAL_SYSTEMS
 
@@ -25,10 +25,11 @@ DEFAULT_SERIES = ("fast", "paper", "pfs", "hexplane", "without_mapf")
 TABLE = "stability.md"
 TABLE_TITLE = """# What the user is told
 
-Decibels lost against the clean clip (over several seeds their mean, and the spread), millimetres of depth where those
-are the harm. In bold what is a defect; what was not measured is empty. Where the tissue or the picture is another
-(texture, size) that is in the loss, too: below zero it is easier to reproduce than the clean clip. Each method is
-compared with itself, so that one that has learnt little loses little.
+Decibels lost against the clean clip (over several seeds their mean, and the spread); behind a stroke those that are
+lost after one fit of gain and offset by channel to all that is judged, where they differ by half a decibel or more;
+millimetres of depth where those are the harm. In bold what is a defect; what was not measured is empty. Where the
+tissue or the picture is another (texture, size) that is in the loss, too: below zero it is easier to reproduce than the
+clean clip. Each method is compared with itself, so that one that has learnt little loses little.
 
 All clips: {grid}, but for where size or length is what is spoilt.
 """
@@ -77,7 +78,7 @@ def run_cli(options: argparse.Namespace) -> int:
             waiting = atlas.missing(cells)
             print(f"{len(cells)} cells, {len(cells) - len(waiting)} of them have their rows already")
             measure_all(atlas, waiting)
-    draw_all(read_rows(out / STABILITY), out)
+    draw_all(stability_rows(out), out)
     return ExitCode.OK
 
 
@@ -107,7 +108,8 @@ def _line(row: Row) -> str:
     name = f"{row['condition']} {row['severity']} ({row['level'] or 'clean'}), {row['series']}, seed {row['seed']}"
     if row["error"]:
         return f"{name}: {row['outcome']}: {row['error']}"
-    return f"{name}: {row['outcome']}, {row['psnr_db']} dB, {row['loss_db'] or '?'} lost, {row['seconds']} s"
+    lost = f"{row['loss_db'] or '?'} lost, {row['fitted_loss_db'] or '?'} after a fit"
+    return f"{name}: {row['outcome']}, {row['psnr_db']} dB, {lost}, {row['seconds']} s"
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -33,10 +33,11 @@ NOISE_FLOOR, NOISE_GAIN = 0.003, 0.00004  # deviation of sRGB in the dark; varia
 
 @dataclass(frozen=True)
 class Lamp:
-    """place_mm [3], axis [3] (unit) in the world."""
+    """place_mm [3], axis [3] (unit) in the world; strength of its light times the camera's exposure, usually 1."""
 
     place_mm: NDArray[np.float64]
     axis: NDArray[np.float64]
+    strength: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,10 @@ def shade(
     """
     light = np.empty_like(points_mm)
     lobe = np.array([finish.matte, finish.sheen, finish.tint, finish.power])
-    _shade_points(points_mm, normals, albedo, glint, lobe, finish.wrap, lamp.place_mm, lamp.axis, eye_mm, light)
+    exposure = EXPOSURE * lamp.strength
+    _shade_points(
+        points_mm, normals, albedo, glint, lobe, finish.wrap, lamp.place_mm, lamp.axis, exposure, eye_mm, light
+    )
     return light
 
 
@@ -104,6 +108,7 @@ def _shade_points(
     wrap: NDArray[np.float64],
     lamp_mm: NDArray[np.float64],
     axis: NDArray[np.float64],
+    exposure: float,
     eye_mm: NDArray[np.float64],
     light: Image32,
 ) -> None:
@@ -126,7 +131,7 @@ def _shade_points(
         if facing > MIN_GLINT_COSINE:
             gloss = glint[p] * (GLINT * half**GLINT_POWER + sheen * shine)
         beam = max(-(lx * axis[0] + ly * axis[1] + lz * axis[2]), 0.0) ** BEAM_POWER
-        strength = EXPOSURE * beam * (REFERENCE_MM / distance) ** 2
+        strength = exposure * beam * (REFERENCE_MM / distance) ** 2
         for c in range(3):
             diffuse = max((facing + wrap[c]) / (1.0 + wrap[c]), 0.0)
             light[p, c] = strength * (albedo[p, c] * (matte * (AMBIENT + diffuse) + tint * shine) + gloss)

@@ -16,6 +16,7 @@ from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.poses import camera_rests, with_poses
 from intrasplat.poses.estimate import FoundPath, find_path
+from intrasplat.poses.links import Frames
 from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import trajectory_error
 from lab.phantom import CameraPath, Motion, PhantomSettings, make_phantom
@@ -167,3 +168,12 @@ def test_a_clip_with_poses_keeps_them_unless_others_are_asked_for() -> None:
     assert posed(given, "fixed") is given
     fixed = posed(clip, "fixed")
     assert (fixed.world_from_camera == np.eye(4)).all()
+
+
+def test_a_frame_without_depth_matches_no_other() -> None:
+    clip, _ = clip_of("still", "turn")
+    blind = replace(clip, depth_mm=clip.depth_mm.copy(), depth_confidence=clip.depth_confidence.copy())
+    blind.depth_mm[3], blind.depth_confidence[3] = 0, 0
+    link = Frames(blind).link(3, 4)
+    assert (len(link.cells), link.overlap) == (0, 0.0)
+    assert find_path(blind, TRAIN).world_from_camera.shape == (FRAMES, 4, 4)

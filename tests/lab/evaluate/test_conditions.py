@@ -10,7 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
+from intrasplat.clip.types import Eye
 from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
+from lab.conditions.exposure import TONE_POWER
+from lab.conditions.lens import BLOOD_FROM
+from lab.conditions.smoke import AIRLIGHT, CLOUD_AT, smoke_before, with_smoke
 from lab.phantom import PhantomSettings
 
 pytestmark = pytest.mark.usefixtures("each_phantom_once")
@@ -82,7 +86,9 @@ def test_every_condition_has_five_levels_that_grow_worse_in_order() -> None:
         assert list(condition.levels) in (sorted(condition.levels), sorted(condition.levels, reverse=True))
 
 
-@pytest.mark.parametrize("name", ["smoke", "blood", "defocus", "motion_blur", "exposure_drift", "white_balance"])
+@pytest.mark.parametrize(
+    "name", ["smoke", "splash", "blood", "defocus", "motion_blur", "exposure_drift", "auto_exposure", "white_balance"]
+)
 def test_a_higher_severity_is_farther_from_the_clean_pictures(name: str) -> None:
     distances = [
         float(np.abs(clip_of(spoilt(name, severity)).rgb.astype(float) - clean().clip.rgb).mean())
@@ -183,3 +189,74 @@ def test_misrectified_and_inverted_recordings_are_just_that() -> None:
 def test_other_sizes_show_the_same_tissue() -> None:
     given = spoilt("tiny", 5)
     assert clip_of(given).rgb.shape == (CLEAN_FRAMES, 51, 64, 3)
+
+
+def on_a_wall(depth_mm: float = 80.0) -> DepthClip:
+    """Three black frames of both eyes, 4 mm apart, before a wall; a corner has no depth."""
+    depths = np.full((3, 64, 160), depth_mm, np.float32)
+    depths[:, :8, :8] = 0
+    poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    black, tissue = np.zeros((3, 64, 160, 3), np.uint8), np.ones((3, 64, 160), np.bool_)
+    camera = clean().clip.intrinsics
+    right = Eye(black, tissue, depths, np.full_like(tissue, 255, np.uint8), camera, poses + 4.0 * np.eye(4, k=3))
+    left = (black, tissue, depths, right.depth_confidence, camera, poses)
+    return DepthClip(*left, frame_times_s=np.arange(3) / 25, right=right)
+
+
+@pytest.mark.parametrize("severity", SEVERITIES)
+def test_smoke_takes_its_share_of_the_light_and_grows_with_depth(severity: int) -> None:
+    level, depth_mm = CONDITIONS["smoke"].level(severity), clean().clip.depth_mm
+    smoke = smoke_before(depth_mm, level, np.random.default_rng(0))
+    passing = np.stack([smoke.passes(index, each) for index, each in enumerate(depth_mm)])
+    assert 1 - passing.mean() == pytest.approx(level, abs=0.005)
+    np.testing.assert_allclose(smoke.passes(0, 2 * depth_mm[0]), passing[0] ** 2, rtol=1e-4)
+    assert np.abs(passing[0] - passing[-1]).max() > 0.02  # it drifts
+
+
+def test_both_eyes_of_any_clip_see_one_cloud() -> None:
+    clip = on_a_wall()
+    veiled = with_smoke(clip, 0.4, np.random.default_rng(0))
+    assert veiled.right is not None
+    nearer_px = round(clip.intrinsics.fx * 4.0 / (CLOUD_AT * 80.0))
+    np.testing.assert_array_equal(veiled.right.rgb[:, :, :-nearer_px], veiled.rgb[:, :, nearer_px:])
+    assert veiled.rgb.mean() == pytest.approx(0.4 * AIRLIGHT, rel=0.02)
+    assert veiled.rgb[:, :8, :8].min() > 0  # also where depth is not known
+    np.testing.assert_array_equal(veiled.depth_mm, clip.depth_mm)
+
+
+def test_exposure_follows_a_bright_and_a_dark_instrument_by_the_stops_of_the_level() -> None:
+    given = spoilt("auto_exposure", 3)
+    both = clip_of(given).tissue & (clean().clip.rgb.min(axis=-1) > 40) & (clean().clip.rgb.max(axis=-1) < 200)
+    ratios = clip_of(given).rgb[..., 0] / np.maximum(clean().clip.rgb[..., 0], 1)
+    stops = np.array([TONE_POWER * np.log2(np.median(each[here])) for each, here in zip(ratios, both, strict=True)])
+    assert np.ptp(stops) == pytest.approx(CONDITIONS["auto_exposure"].level(3), abs=0.1)
+    most_covered = int(clip_of(given).tissue[: CLEAN_FRAMES // 2].mean(axis=(1, 2)).argmin())
+    assert stops[0] == 0
+    assert (
+        most_covered < stops.argmin() < CLEAN_FRAMES - 1
+    )  # it lags behind the bright one, and rises with the dark one
+
+
+def test_exposure_follows_an_advancing_lamp_with_a_lag_and_the_truth_is_without() -> None:
+    given = spoilt("advancing_lamp", 5)
+    nearest_mm = clip_of(given).world_from_camera[:, 2, 3]
+    assert 0.95 * 40 < nearest_mm.max() <= 40  # where light is two stops stronger
+    steady, recorded = given.rgb.mean(axis=(1, 2, 3)), clip_of(given).rgb.mean(axis=(1, 2, 3)) / 255
+    assert recorded[0] == pytest.approx(steady[0], rel=0.1)
+    assert recorded[CLEAN_FRAMES // 2] > 1.2 * steady[CLEAN_FRAMES // 2]
+    assert recorded[-1] < 0.95 * steady[-1]
+
+
+@pytest.mark.parametrize("severity", SEVERITIES)
+def test_drops_appear_at_some_moment_and_stay_where_they_are(severity: int) -> None:
+    changes = np.abs(clip_of(spoilt("splash", severity)).rgb.astype(int) - clean().clip.rgb).max(axis=-1)
+    assert not changes[: int(BLOOD_FROM * CLEAN_FRAMES)].any()
+    share = (changes[-2:].max(axis=0) > 30).mean()
+    assert share == pytest.approx(CONDITIONS["splash"].level(severity), rel=0.5)
+    assert not changes[-1][changes[-2:].max(axis=0) == 0].any()
+    files = spoilt("splash_stereo", severity).clip
+    assert isinstance(files, Recording)
+    frame, before = files.frame(CLEAN_FRAMES - 1), clean().phantom.frame(CLEAN_FRAMES - 1)
+    left, right = (np.abs(a.astype(int) - b) for a, b in ((frame.left, before.left), (frame.right, before.right)))
+    assert left.max() > 30 < right.max()
+    assert ((left > 0).any(axis=-1) != (right > 0).any(axis=-1)).any()

@@ -19,17 +19,15 @@ from lab.evaluate.rows import Row, read_rows, write_rows
 from lab.evaluate.stability import (
     FIELDS,
     KEY,
-    SEPARATOR,
     STABILITY,
     Grid,
     StabilityBench,
     StabilityCell,
-    failure,
     measured,
-    new_warnings,
     plan,
-    verdict,
+    stability_rows,
 )
+from lab.evaluate.verdict import SEPARATOR, failure, new_warnings, verdict
 from lab.pages.stability import stability_sections
 from tests.test_repository import REPOSITORY
 
@@ -90,6 +88,29 @@ def test_silent_is_harm_without_a_warning_that_the_clean_clip_has_not(measured_r
 )
 def test_the_type_of_an_error_decides_how_a_cell_failed(error: Exception, outcome: str) -> None:
     assert failure(error) == outcome
+
+
+def lit(condition: str, psnr_db: float, fitted: float | None) -> Row:
+    return row(psnr_db) | {"condition": condition, "fitted_db": "" if fitted is None else f"{fitted:.3f}"}
+
+
+def test_where_light_is_ambiguous_the_score_after_a_fit_decides_and_elsewhere_the_plain_one() -> None:
+    clean = lit(CLEAN, 30.0, 30.5)
+    drifted = verdict(lit("exposure_drift", 20.0, 29.0), clean)
+    assert (drifted["outcome"], drifted["loss_db"], drifted["fitted_loss_db"]) == ("held", "10.00", "1.50")
+    assert verdict(lit("exposure_drift", 20.0, 26.0), clean)["outcome"] == "silent"
+    assert verdict(lit("smoke", 20.0, 29.0), clean)["outcome"] == "silent"
+    assert verdict(lit("exposure_drift", 20.0, 29.0), lit(CLEAN, 30.0, None))["outcome"] == "unknown"
+    before = verdict(lit("smoke", 29.0, 29.0), lit(CLEAN, 30.0, None))
+    assert (before["outcome"], before["fitted_loss_db"]) == ("held", "")
+
+
+def test_rows_from_before_a_fit_was_measured_have_no_figure_of_it(tmp_path: Path) -> None:
+    older = [name for name in FIELDS if not name.startswith("fitted")]
+    write_rows(tmp_path / STABILITY, older, ROWS)
+    assert {each["fitted_db"] for each in StabilityBench(tmp_path, SMALL).rows} == {""}
+    assert "/" not in told_table(places_of(stability_rows(tmp_path), "fast"), "fast").replace("| /", "")
+    assert "after one fit" not in "".join(stability_sections(tmp_path, tmp_path))
 
 
 def test_without_a_clean_score_nothing_is_known() -> None:
@@ -234,6 +255,23 @@ def test_the_table_says_what_the_user_is_told() -> None:
     assert inverted.endswith("| masks: they look inverted. |")
 
 
+def test_the_loss_after_a_fit_stands_beside_the_plain_one_where_it_differs() -> None:
+    rows = [placed("smoke", severity, "silent", "5.00") for severity in (1, 2)]
+    places = places_of([rows[0] | {"fitted_loss_db": "2.30"}, rows[1] | {"fitted_loss_db": "4.80"}], "fast")
+    assert "| **silent** 5.0 / 2.3 | **silent** 5.0 |" in told_table(places, "fast")
+    assert places["smoke", 1].judged_db == 5.0
+    drift = placed("exposure_drift", 1, "held", "5.00") | {"fitted_loss_db": "2.30"}
+    assert places_of([drift], "fast")["exposure_drift", 1].judged_db == 2.3
+
+
+def test_the_page_shows_plain_and_fitted_scores_of_spoilt_light(tmp_path: Path) -> None:
+    scores = {"psnr_db": "20.0", "fitted_db": "24.5"}
+    clean = placed(CLEAN, 0, "held", "0.00") | {"psnr_db": "29.0", "fitted_db": "29.1"}
+    write_rows(tmp_path / STABILITY, FIELDS, [clean, placed("smoke", 3, "told", "9.00") | scores])
+    page = "".join(stability_sections(tmp_path, tmp_path))
+    assert f"| {CONDITIONS['smoke'].title} | 29.0 / 29.1 | 20.0 / 24.5 | – |" in page
+
+
 def test_the_command_draws_what_is_there_and_refuses_what_is_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -253,7 +291,7 @@ def test_the_page_of_results_counts_how_the_places_of_severities_3_and_5_ended(t
     scored = [placed(CLEAN, 0, "held", "0.00", seed=seed) | {"psnr_db": db} for seed, db in enumerate(("29.0", "30.0"))]
     write_rows(tmp_path / STABILITY, FIELDS, [*scored, *ROWS[1:]])
     page = "".join(stability_sections(tmp_path, tmp_path))
-    assert "| fast | 29.5 | 3 of 66 | 0 | 0 | 1 | 0 | 1 | 1 | 0 |" in page  # severities 3 and 5
+    assert "| fast | 29.5 | 3 of 76 | 0 | 0 | 1 | 0 | 1 | 1 | 0 |" in page  # severities 3 and 5
     assert "stability-fast.png" not in page
 
 
