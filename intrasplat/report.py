@@ -249,7 +249,7 @@ class Report(BaseModel):
     train_count: int = Field(ge=0)
     held_out: tuple[int, ...]
     repeated: tuple[int, ...] = Field(
-        description="frames in neither set: they repeat a held-out one, show nothing new, or there is no time for them"
+        description="frames in neither set: blurred held-out ones, repeats of one, nothing new, or no time for them"
     )
     frame_times_s: tuple[float, ...]
 

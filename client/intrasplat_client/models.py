@@ -570,7 +570,7 @@ class Report(Model):
     train_count: int
     held_out: tuple[int, ...]
     repeated: tuple[int, ...]
-    """frames in neither set: they repeat a held-out one, show nothing new, or there is no time for them"""
+    """frames in neither set: blurred held-out ones, repeats of one, nothing new, or no time for them"""
     frame_times_s: tuple[float, ...]
 
 

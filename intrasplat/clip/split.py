@@ -6,17 +6,18 @@ Symbols: T frames, H W pixels.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.clip.sharpness import frame_weights
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import InputError
 from intrasplat.machine.mapped import let_go
-from intrasplat.notices import Notice, NoticeCode
+from intrasplat.notices import Notice, NoticeCode, named_frames
 
 MIN_FRAMES = 9  # shorter clips have no held-out frames
 REPEAT_LEVELS = 0.2  # mean |difference| in 8-bit levels; two frames below it are the same picture
@@ -32,13 +33,25 @@ class FrameSplit:
     """The training and held-out frames, as rising lists of indices. No part of training reads held-out frames.
 
     repeated lists frames in neither set: training frames that repeat a held-out frame, held-out frames that repeat
-    training frames in a pause, and frames that the clip skips (skipped).
+    training frames in a pause, held-out frames that are blurred, and frames that the clip skips (skipped). weights has
+    the shares below 1 of the epochs in which blurred training frames are drawn (sharpness.py).
     """
 
     train: list[int]
     held_out: list[int]
     repeated: list[int]
     warnings: tuple[Notice, ...] = ()
+    weights: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def sharp(self) -> list[int]:
+        """The training frames that are not blurred beside those around them, rising."""
+        return [index for index in self.train if index not in self.weights]
+
+    @property
+    def sharp_first(self) -> list[int]:
+        """The training frames: the sharp ones, then those that are blurred."""
+        return [*self.sharp, *(index for index in self.train if index in self.weights)]
 
 
 def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
@@ -52,7 +65,8 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     held_out = [index for index in held_out_frames(count, holdout) if index not in clip.skipped]
     train = sorted(set(range(count)) - set(held_out) - set(clip.skipped))
     if holdout == "none":
-        return FrameSplit(train, [], list(clip.skipped))
+        weights = frame_weights(clip, train, train)
+        return FrameSplit(train, [], list(clip.skipped), _blur_warnings(weights, (), count), weights)
     if count < MIN_FRAMES:
         return _nothing_held_out(clip, f"the clip has {count} frames, fewer than {MIN_FRAMES}")
     if not held_out:
@@ -64,12 +78,16 @@ def split_frames(clip: DepthClip, holdout: str = "every8") -> FrameSplit:
     repeated = find_repeats(clip.rgb, train, judged)
     if len(repeated) == len(train):
         return _nothing_held_out(clip, "every training frame repeats a held-out one: the picture does not change")
-    unused = {*repeated, *paused, *clip.skipped}
+    train = [index for index in train if index not in repeated]
+    weights = frame_weights(clip, sorted({*train, *judged}), train)
+    sharp = [index for index in judged if index not in weights] or judged
+    unscored = sorted(set(judged) - set(sharp))
     return FrameSplit(
-        train=[index for index in train if index not in unused],
-        held_out=judged,
-        repeated=sorted(unused),
-        warnings=_warnings(len(repeated), len(paused)),
+        train,
+        held_out=sharp,
+        repeated=sorted({*repeated, *paused, *clip.skipped, *unscored}),
+        warnings=(*_warnings(len(repeated), len(paused)), *_blur_warnings(weights, unscored, count)),
+        weights={index: weight for index, weight in weights.items() if index in set(train)},
     )
 
 
@@ -179,8 +197,21 @@ def _warnings(repeated: int, paused: int) -> tuple[Notice, ...]:
     return tuple(Notice.warning(NoticeCode.HELD_OUT_REPEATED, text) for text in texts)
 
 
+def _blur_warnings(weights: Mapping[int, float], unscored: Sequence[int], frame_count: int) -> tuple[Notice, ...]:
+    if not weights:
+        return ()
+    text = (
+        f"frames are blurred beside those around them: {named_frames(sorted(weights))} ({len(weights)} of "
+        f"{frame_count:,}); training draws them less often or not at all"
+    )
+    text += f", and the {len(unscored)} held-out ones among them are not scored" if unscored else ""
+    return (Notice.warning(NoticeCode.BLURRED_FRAMES, text),)
+
+
 def _nothing_held_out(clip: DepthClip, reason: str) -> FrameSplit:
     text = f"no frames are held out, so quality is not measured: {reason}"
     skipped = set(clip.skipped)
     train = [index for index in range(clip.frame_count) if index not in skipped]
-    return FrameSplit(train, [], list(clip.skipped), (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text),))
+    weights = frame_weights(clip, train, train)
+    warnings = (Notice.warning(NoticeCode.NOTHING_HELD_OUT, text), *_blur_warnings(weights, (), clip.frame_count))
+    return FrameSplit(train, [], list(clip.skipped), warnings, weights)

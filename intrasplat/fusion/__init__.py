@@ -83,9 +83,10 @@ def fuse(
     moved: Mapping[int, Moved] = NO_TRACKS,
     right: Eye | None = None,
 ) -> PointCloud:
-    """The initial point cloud from the training frames `train` (clip indices, rising). Same arguments, same bits.
+    """The initial point cloud from the training frames `train` (clip indices). Same arguments, same bits.
 
     Args:
+        train: in order of preference: rising, or the sharp ones first.
         moved: for "fill", the tissue's displacement since each keyframe, by keyframe; empty: the tissue rests.
         right: for "fill", the right eye, if training uses it.
 

@@ -8,7 +8,7 @@ Symbols: K training frames, M sampled pixels of a frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,17 +29,20 @@ MIN_OVERLAP = 0.2
 """A keyframe is tracked to the frames that show at least this share of its tissue."""
 
 
-def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int]]]:
+def keyframes(clip: DepthClip, train: Sequence[int], blurred: Collection[int] = ()) -> list[tuple[int, list[int]]]:
     """Indices (into `train`) of the keyframes, each with the indices of the frames to which it is tracked.
 
-    The tissue is taken as at rest. Keyframes that show it from nearby come first, else the earlier ones.
+    The tissue is taken as at rest. Keyframes that show it from nearby come first, else the earlier ones. The frames of
+    `train` that are `blurred` become no keyframes, unless all are.
     """
+    sharp = [place for place, index in enumerate(train) if index not in blurred] or list(range(len(train)))
     poses = clip.world_from_camera[list(train)]
     if (poses == poses[0]).all():
-        return [(0, list(range(len(train))))]
+        return [(sharp[0], list(range(len(train))))]
     seen_mm = [_tissue_mm(clip, index) for index in train]
     keys = list[int]()
-    for place, points_mm in enumerate(seen_mm):
+    for place in sharp:
+        points_mm = seen_mm[place]
         if not len(points_mm):
             continue
         depth_mm = to_camera(points_mm, poses[place])[:, 2]
@@ -48,7 +51,7 @@ def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int
         if not keys or known.mean() < 1 - MAX_NEW_SHARE:
             keys.append(place)
     if not keys:  # no sampled pixel has a depth
-        return [(0, list(range(len(train))))]
+        return [(sharp[0], list(range(len(train))))]
     near_mm = {key: np.median(to_camera(seen_mm[key], poses[key])[:, 2]) for key in keys}
     least_mm = min(near_mm.values())
     keys.sort(key=lambda key: int(np.log(near_mm[key] / least_mm) / np.log(MAX_NEARER)))
@@ -60,10 +63,13 @@ def keyframes(clip: DepthClip, train: Sequence[int]) -> list[tuple[int, list[int
 
 
 def track_keyframes(
-    clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None
+    clip: DepthClip,
+    train: Sequence[int],
+    on_progress: Callable[[float], None] = lambda share: None,
+    blurred: Collection[int] = (),
 ) -> list[Tracks]:
-    """The tracks of each keyframe. on_progress is called as by `track`."""
-    followed, tracks = keyframes(clip, train), list[Tracks]()
+    """The tracks of each keyframe. on_progress is called as by `track`; blurred: as for `keyframes`."""
+    followed, tracks = keyframes(clip, train, blurred), list[Tracks]()
     total, done = sum(len(places) for _, places in followed), 0
     for key, places in followed:
         share, before = len(places) / total, done / total

@@ -38,8 +38,6 @@ MIN_FINE_DETAIL = 0.62
 """Detail below 1 px over that of 1 to 2 px: 0.71 to 1.7 in clean clips, 0.58 where all is blurred by 1.5 px."""
 MIN_DETAIL_LEVELS = 0.4
 """Detail in grey levels of 255; below it there is nothing that could be sharp, and the texture check warns."""
-MIN_EQUAL_DETAIL = 0.75
-"""Fine detail of a frame relative to that of the clip's sharpest frame: 0.93 and more in clean clips."""
 MIN_DOUBTFUL_FRAMES = 2
 """Smallest number of bad frames among the sampled ones that counts: one alone may be an accident."""
 MAX_COLOUR_DRIFT = 0.25
@@ -108,7 +106,7 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
 
 
 def picture_warnings(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
-    """Warnings about the pictures of the sampled training frames: veiled, out of focus, smeared, changing colour."""
+    """Warnings about the pictures of the sampled training frames: veiled, out of focus, changing colour."""
     seen = [index for index in clip.one_by_one(sampled) if clip.tissue[index].any()]
     if not seen:
         return []
@@ -170,22 +168,10 @@ def _focus_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:
     detail = np.array([each for each in measured if each is not None])
     if not detail.size:
         return []
-    if np.median(detail) < MIN_FINE_DETAIL:
-        return [
-            Notice.warning(
-                NoticeCode.OUT_OF_FOCUS,
-                "The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft.",
-            )
-        ]
-    smeared = int((detail < MIN_EQUAL_DETAIL * detail.max()).sum())
-    if smeared < MIN_DOUBTFUL_FRAMES:
+    if np.median(detail) >= MIN_FINE_DETAIL:
         return []
-    return [
-        Notice.warning(
-            NoticeCode.BLURRED_FRAMES,
-            f"{smeared} of {detail.size} frames looked at are blurred beside the others; motion in them is guessed.",
-        )
-    ]
+    text = "The picture has no fine detail: it is out of focus, or was enlarged; the scene is as soft."
+    return [Notice.warning(NoticeCode.OUT_OF_FOCUS, text)]
 
 
 def _colour_warnings(clip: DepthClip, frames: Sequence[int]) -> list[Notice]:

@@ -21,7 +21,6 @@ from intrasplat.splat.optimize import rates_at
 from intrasplat.splat.step import StepSums
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.run import CurvePoint, Run, frames_at
-from intrasplat.train.schedule import validation_frames
 from intrasplat.train.scoring import HeldOutScore
 
 CURVE_SECONDS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 90, 120, 180, 300, 600, 1200, 1800)
@@ -132,7 +131,7 @@ def _validation_psnr(run: Run) -> float:
     """Mean psnr_tissue in dB of the validation frames that show tissue; NaN if none does."""
     scores = [
         eye.psnr_tissue_db(index, run.model.render(eye.cameras[index], float(eye.t[index])))
-        for index in validation_frames(run.frames.indices)
+        for index in run.validation
         for eye in run.eyes
         if eye.picture(index)[1].any()
     ]

@@ -21,7 +21,7 @@ from intrasplat.splat.model import Model
 from intrasplat.train.calibrate import measured_schedule, warm_up
 from intrasplat.train.densify import Densifier
 from intrasplat.train.run import Box, Run
-from intrasplat.train.schedule import Schedule, validation_frames
+from intrasplat.train.schedule import Schedule
 from intrasplat.train.setup import Setup
 from intrasplat.train.start import bounded, box_of, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import TrainingFrames, units_per_mm
@@ -49,7 +49,7 @@ def prepare(setup: Setup) -> Run:
         moved = {train[each.reference]: moved_along(each, train, clip.intrinsics.width) for each in tracks}
         right = steady.teaching_eyes[1] if len(steady.teaching_eyes) > 1 else None
         fusion = fusion_for(preset, clip.intrinsics)
-        cloud = fuse(clip, train, fusion, seed=setup.options.seed, moved=moved, right=right)
+        cloud = fuse(clip, setup.split.sharp_first, fusion, seed=setup.options.seed, moved=moved, right=right)
     preset, fewer = bounded(preset, len(cloud.points_mm))
     setup.hooks.report_stage("start", 0.0)
     with timings.measure("start_s"):
@@ -129,7 +129,7 @@ def _tracks(setup: Setup) -> list[Tracks]:
     if not setup.preset.tracks or setup.preset.deformation != SharedBasis.kind or len(train) < 2:
         return []
     with setup.timings.measure("motion_s"):
-        tracks = track_keyframes(setup.clip, train, partial(setup.hooks.report_stage, "motion"))
+        tracks = track_keyframes(setup.clip, train, partial(setup.hooks.report_stage, "motion"), setup.split.weights)
     keep_free_memory(LITTLE_BYTES)
     return tracks
 
@@ -141,5 +141,5 @@ def _schedule(run: Run) -> Schedule:
     if fixed is not None:
         return Schedule(fixed, preset.warm_restarts, epoch=run.steps_an_epoch)
     setup.hooks.report_stage("calibrate", 0.0)
-    min_gain_db = preset.min_gain_db if validation_frames(run.frames.indices) else None
+    min_gain_db = preset.min_gain_db if run.validation else None
     return measured_schedule(run, setup.budget_s, min_gain_db)

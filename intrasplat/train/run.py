@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from intrasplat.clip.sharpness import WEIGHT_STEPS
 from intrasplat.machine.hooks import Progress
 from intrasplat.methods.method import Preset
 from intrasplat.motion.light import RecordedLight
@@ -103,9 +106,17 @@ class Run:
         return self.iteration * self.preset.frames_a_step
 
     @property
+    def validation(self) -> tuple[int, ...]:
+        """The validation frames, which are sharp ones."""
+        weights = self.setup.split.weights
+        return validation_frames([index for index in self.frames.indices if index not in weights])
+
+    @property
     def steps_an_epoch(self) -> int:
-        """The fewest iterations in which every training frame is seen."""
-        return -(-len(self.frames.indices) // self.preset.frames_a_step)
+        """The fewest iterations in which every training frame is seen as often as its weight says, once at most."""
+        weights = self.setup.split.weights
+        seen = math.ceil(sum(weights.get(index, 1.0) for index in self.frames.indices))
+        return -(-seen // self.preset.frames_a_step)
 
     def progress(self, stage: str, fraction: float, seconds_left: float | None = None) -> Progress:
         """A report of progress with the iterations and the curve's last scores."""
@@ -117,18 +128,41 @@ class Run:
 
 def frames_at(run: Run, iteration: int) -> list[int]:
     """The training frames of an iteration, counted from 1. They depend on preset, seed, schedule and iteration alone,
-    so that a run can be resumed. Epochs have no gap between them: a step may end one and start the next."""
+    so that a run can be resumed. Epochs have no gap between them: a step may end one and start the next. A blurred
+    frame is in as many of WEIGHT_STEPS epochs as its weight says."""
     indices, count = run.frames.indices, run.preset.frames_a_step
     if run.schedule.withholds_validation(iteration):
-        withheld = validation_frames(indices)
+        withheld = run.validation
         indices = [index for index in indices if index not in withheld]
+    epochs = _epochs(indices, run.setup.split.weights)
     if run.preset.order == "random":
-        drawn = np.random.default_rng([run.seed, iteration]).integers(len(indices), size=count)
-        return [indices[place] for place in drawn]
-    seen = (iteration - 1) * count
-    epochs = (divmod(each, len(indices)) for each in range(seen, seen + count))
-    orders = ((np.random.default_rng([run.seed, epoch]).permutation(len(indices)), place) for epoch, place in epochs)
-    return [indices[order[place]] for order, place in orders]
+        frames = [index for epoch in epochs for index in epoch]
+        drawn = np.random.default_rng([run.seed, iteration]).integers(len(frames), size=count)
+        return [frames[place] for place in drawn]
+    return [_drawn(run.seed, epochs, each) for each in range((iteration - 1) * count, iteration * count)]
+
+
+def _epochs(indices: Sequence[int], weights: Mapping[int, float]) -> list[list[int]]:
+    """The frames of successive epochs, which then repeat: one epoch of all frames, or WEIGHT_STEPS of them."""
+    rare = [index for index in indices if index in weights]
+    if not rare:
+        return [list(indices)]
+    times = {index: round(WEIGHT_STEPS * weights[index]) for index in rare}
+    turn = {index: place for place, index in enumerate(rare)}  # neighbours in time take turns
+    return [
+        [i for i in indices if i not in times or (epoch + turn[i]) * times[i] % WEIGHT_STEPS < times[i]]
+        for epoch in range(WEIGHT_STEPS)
+    ]
+
+
+def _drawn(seed: int, epochs: Sequence[Sequence[int]], seen: int) -> int:
+    """The frame that is drawn after `seen` others."""
+    rounds, place = divmod(seen, sum(map(len, epochs)))
+    for number, frames in enumerate(epochs, start=rounds * len(epochs)):
+        if place < len(frames):
+            return frames[int(np.random.default_rng([seed, number]).permutation(len(frames))[place])]
+        place -= len(frames)
+    raise AssertionError("a place in the epochs lies within one of them")
 
 
 def write_curve(path: Path, run: Run) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from intrasplat.clip.empty_frames import COVERED, EMPTY_FRAME, EYE_LOST, FADE, TORN, EmptyFrames, find_empty
+from intrasplat.clip.empty_frames import COVERED, EMPTY_FRAME, EYE_LOST, FADE, SMEARED, TORN, EmptyFrames, find_empty
 from intrasplat.clip.sampling import thumbnail
 from intrasplat.notices import NoticeCode
 from tests.intrasplat.clip.test_field_of_view import disc, tissue
+from tests.intrasplat.phantoms import phantom_clip
 
 COUNT = 24
 TRAIN = [index for index in range(COUNT) if (index - 1) % 8]
@@ -54,6 +55,23 @@ def test_an_empty_picture_is_left_out_wherever_it_is(where: int, change: Change)
     assert found_in(eye) == {where: EMPTY_FRAME}
     noisy = np.clip(eye + np.random.default_rng(0).normal(0, 3, eye.shape), 0, 255).astype(np.uint8)
     assert found_in(noisy) == {where: EMPTY_FRAME}
+
+
+@pytest.mark.parametrize("where", [[0], [5, 6], [9], [COUNT - 1]])
+def test_pictures_taken_while_the_lens_is_wiped_are_left_out(where: list[int]) -> None:
+    eye = phantom_clip(frames=COUNT, width=160, height=128).rgb.copy()
+    assert found_in(eye) == {}
+    for index in where:
+        eye[index] = cv2.blur(cv2.GaussianBlur(eye[index], (0, 0), 5), (25, 1))
+    assert found_in(eye) == dict.fromkeys(where, SMEARED)
+
+
+@pytest.mark.parametrize("sigma_px", [0.5, 1, 2])
+def test_pictures_that_are_merely_blurred_are_not(sigma_px: float) -> None:
+    eye = phantom_clip(frames=COUNT, width=160, height=128).rgb.copy()
+    for index in (5, 6, 12):
+        eye[index] = cv2.GaussianBlur(eye[index], (0, 0), sigma_px)
+    assert found_in(eye) == {}
 
 
 def test_a_sound_clip_loses_nothing_not_even_when_its_light_changes() -> None:

@@ -129,3 +129,13 @@ def test_progress_rises_to_its_end_over_all_keyframes() -> None:
     track_keyframes(clip, TRAIN, shares.append)
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("camera", [(), ("pan",)])
+def test_no_keyframe_is_blurred(camera: tuple[CameraPath, ...]) -> None:
+    clip = drawn("still", *camera)[1]
+    keys = [TRAIN[key] for key, _ in keyframes(clip, TRAIN)]
+    others = [TRAIN[key] for key, _ in keyframes(clip, TRAIN, blurred=keys)]
+    assert not set(keys) & set(others)
+    assert all(set(places) for _, places in keyframes(clip, TRAIN, blurred=keys))
+    assert [TRAIN[key] for key, _ in keyframes(clip, TRAIN, blurred=TRAIN)] == keys

@@ -50,7 +50,6 @@ def test_a_real_clip_is_not_doubted() -> None:
         ("smoke", 2, "Even the dark tissue is pale"),
         ("smoke", 5, "Even the dark tissue is pale"),
         ("defocus", 5, "no fine detail"),
-        ("motion_blur", 5, "are blurred beside the others"),
         ("white_balance", 4, "colour changes during the clip (blue over green"),
         ("blood", 2, "Blood covers"),
         ("blood", 5, "Blood covers"),

@@ -127,6 +127,20 @@ def test_an_epoch_shows_every_frame_once_in_another_order_each_time() -> None:
     assert epochs[0] != epochs[1]
 
 
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_blurred_frames_are_drawn_as_often_as_they_weigh(preset: str) -> None:
+    run, split = prepared(phantom_clip(), preset)
+    first, second, *others = split.train
+    run.setup = dataclasses.replace(run.setup, split=dataclasses.replace(split, weights={first: 0.0, second: 0.3}))
+    epochs = 200
+    drawn = [frames_at(run, iteration)[0] for iteration in range(1, epochs * len(split.train))]
+    often = drawn.count(others[0])
+    assert first not in drawn
+    assert drawn.count(second) == pytest.approx(0.3 * often, rel=0.05 if preset == "fast" else 0.4)
+    if preset == "fast":
+        assert len({drawn.count(each) for each in others}) <= 2
+
+
 def test_random_order_draws_training_frames_alone() -> None:
     run, split = prepared(phantom_clip(), "paper")
     drawn = [frames_at(run, iteration)[0] for iteration in range(1, 400)]
