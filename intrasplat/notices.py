@@ -52,6 +52,7 @@ class NoticeCode(StrEnum):
     EXPOSURE = "exposure"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
+    VIGNETTING = "vignetting"
     # warnings about the clip
     ALIGNMENT_UNKNOWN = "alignment_unknown"
     BLOOD = "blood"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from importlib.metadata import version
 
@@ -59,6 +59,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
             "preset": json.loads(json.dumps(asdict(run.preset), default=str)),
             **({} if run.motion_error is None else {"motion_error": run.motion_error}),
             **({} if run.exposure is None else {"log_gains": run.exposure.log_gains.tolist()}),
+            **({} if run.vignetting is None else {"vignetting": [run.vignetting.power, run.vignetting.level]}),
         },
     )
 
@@ -70,6 +71,15 @@ def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
     right = run.right.eye
     x, y, z = to_camera(right.world_from_camera[:1, :3, 3], run.setup.clip.world_from_camera[0])[0].tolist()
     return x, y, z
+
+
+def _light_notices(run: Run) -> Iterator[Notice]:
+    """What was corrected in the light of the recording."""
+    if run.exposure is not None:
+        yield run.exposure.notice
+    if run.vignetting is not None:
+        clip = run.setup.clip
+        yield run.vignetting.notice(clip.intrinsics, clip.tissue[run.frames.indices[0]])
 
 
 def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None) -> Training:
@@ -87,7 +97,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
         assumptions=(
-            *(() if run.exposure is None else (run.exposure.notice,)),
+            *_light_notices(run),
             *run.chosen,
             *run.schedule.notices,
             *(quantized.notices if quantized else (_floats(scene),)),

@@ -47,6 +47,7 @@ ORDER = {
         "machine",
         "intake",
         "camera",
+        "vignetting",
         "clip",
         "decode",
         "instruments",

@@ -22,6 +22,7 @@ export const DE = {
     "synthetic": "Dies ist ein berechneter Testclip, keine Aufnahme.",
     "bases": "Wie fein Bewegung beschrieben wird, wurde für diesen Clip gewählt.",
     "early_stopping": "Das Training endete früher, weil mehr davon zu wenig brachte.",
+    "vignetting": "Die Bilder sind zum Rand hin dunkler; die Szene wird gleichmäßig beleuchtet gezeigt.",
     "exposure": "Belichtung oder Weißabgleich änderten sich; die Szene wird in gleichmäßigem Licht gezeigt.",
     "spacing": "Wie fein das Gewebe beschrieben wird, wurde für diesen Clip gewählt.",
     "stored_precision": "Zahlen wurden gerundet, damit die Datei klein bleibt.",

@@ -22,6 +22,7 @@ export const EN = {
     "synthetic": "This is a computed test clip, no recording.",
     "bases": "How finely movement is described was chosen for this clip.",
     "early_stopping": "Training ended early, because more of it gained too little.",
+    "vignetting": "The pictures are darker towards their border; the scene is shown evenly lit.",
     "exposure": "Exposure or white balance changed; the scene is shown in steady light.",
     "spacing": "How finely the tissue is described was chosen for this clip.",
     "stored_precision": "Numbers were rounded to make the file small.",

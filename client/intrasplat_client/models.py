@@ -82,6 +82,7 @@ class NoticeCode(StrEnum):
     EXPOSURE = "exposure"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
+    VIGNETTING = "vignetting"
     ALIGNMENT_UNKNOWN = "alignment_unknown"
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"

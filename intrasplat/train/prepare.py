@@ -12,6 +12,7 @@ from intrasplat.methods.method import Preset
 from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.tracks import Tracks, moved_along
+from intrasplat.motion.vignetting import evenly_lit, find_vignetting
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import CPU, examine
 from intrasplat.splat.deformation import SharedBasis
@@ -23,6 +24,7 @@ from intrasplat.train.schedule import Schedule, validation_frames
 from intrasplat.train.setup import Setup
 from intrasplat.train.start import bounded, box_of, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import TrainingFrames, units_per_mm
+from intrasplat.vignetting import Vignetting
 
 
 def prepare(setup: Setup) -> Run:
@@ -37,10 +39,15 @@ def prepare(setup: Setup) -> Run:
     examine_device(setup)
     tracks = _tracks(setup)
     with timings.measure("motion_s"):
-        exposure = find_exposure(setup.clip, train, tracks)
-    steady = in_light_of(setup, exposure)
+        vignetting = find_vignetting(setup.clip, train, tracks)
+    even = in_light_of(setup, None, vignetting)
+    if vignetting is not None:
+        tracks = _tracks(even)  # flow follows tissue better in even and steady light
+    with timings.measure("motion_s"):
+        exposure = find_exposure(even.clip, train, tracks)
+    steady = in_light_of(even, exposure, None)
     if exposure is not None:
-        tracks = _tracks(steady)  # flow follows tissue better in steady light
+        tracks = _tracks(steady)
     clip = steady.clip
     setup.hooks.report_stage("fusion", 0.0)
     with timings.measure("capacity_s"):
@@ -57,15 +64,17 @@ def prepare(setup: Setup) -> Run:
             cloud, tracks, clip, train, preset, scale, setup.options.seed, setup.device, gloss=any(setup.sides)
         )
     run = new_run(setup, frames_of(steady, scale), model, preset, (*chosen, *fewer), box_of(model))
-    run.exposure = exposure
+    run.exposure, run.vignetting = exposure, vignetting
     keep_free_memory(LITTLE_BYTES)
     run.motion_error = motion_error
     run.schedule = _schedule(run)
     return run
 
 
-def in_light_of(setup: Setup, exposure: Exposure | None) -> Setup:
-    """The setup with the clip to train on: in steady light if its exposure changes, else as it is."""
+def in_light_of(setup: Setup, exposure: Exposure | None, vignetting: Vignetting | None) -> Setup:
+    """The setup with the clip to train on: evenly lit and in steady light, where these are known, else as it is."""
+    if vignetting is not None:
+        setup = replace(setup, clip=evenly_lit(setup.clip, vignetting))
     return setup if exposure is None else replace(setup, clip=in_steady_light(setup.clip, exposure))
 
 

@@ -27,6 +27,7 @@ from intrasplat.train.schedule import Schedule
 from intrasplat.train.setup import Setup
 from intrasplat.train.start import resting_model
 from intrasplat.train.targets import TrainingFrames
+from intrasplat.vignetting import Vignetting
 
 MISFITS = (KeyError, SceneError, TypeError, ValueError)
 """The errors raised by reading a state that is damaged or belongs to another run."""
@@ -48,7 +49,9 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         tensors, state = load_resume(directory)
         preset = _resolved_preset(setup.preset, state["start"])
         exposure = _exposure(state["start"]["exposure"])
-        frames = frames_of(in_light_of(setup, exposure), float(state["start"]["units_per_mm"]))
+        stored = state["start"].get("vignetting")
+        vignetting = None if stored is None else Vignetting(*stored)
+        frames = frames_of(in_light_of(setup, exposure, vignetting), float(state["start"]["units_per_mm"]))
         _check(state, setup, preset, frames)
         examine_device(setup)
         low, high = state["start"]["box"]
@@ -56,7 +59,7 @@ def resume(directory: Path, setup: Setup) -> Run | None:
         _load_parameters(model, tensors)  # a GPU warms up on them
         chosen = tuple(Notice.model_validate(each) for each in state["start"]["chosen"])
         run = new_run(setup, frames, model, preset, chosen, (low, high))
-        run.exposure = exposure
+        run.exposure, run.vignetting = exposure, vignetting
         _put(run, tensors, state)
     except MISFITS as error:
         problem = f"{directory / RESUME_FILE} does not continue this request: {str(error).rstrip('.')}."
@@ -89,6 +92,7 @@ def begin_save(directory: Path, run: Run, t_train_s: float) -> Callable[[], None
             "box": run.box,
             "motion_error": run.motion_error,
             "exposure": None if run.exposure is None else [run.exposure.log_gains.tolist(), run.exposure.reference],
+            "vignetting": None if run.vignetting is None else astuple(run.vignetting),
             "chosen": [notice.model_dump() for notice in run.chosen],
         },
         "iteration": run.iteration,

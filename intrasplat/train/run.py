@@ -20,6 +20,7 @@ from intrasplat.train.densify import Densifier
 from intrasplat.train.schedule import Schedule, validation_frames
 from intrasplat.train.setup import Setup
 from intrasplat.train.targets import TrainingFrames
+from intrasplat.vignetting import Vignetting
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class Run:
     chosen        what the preset left to the scene: the value chosen and the reason
     motion_error  error of the motion between training frames, squared grey levels, where no motion model follows it
     exposure      of every frame, if it changes: targets are in steady light; None: they are as recorded
+    vignetting    of the pictures, if it is strong: targets are evenly lit; None: they are as recorded
     curve         scores of held-out frames so far
     """
 
@@ -70,6 +72,7 @@ class Run:
     chosen: tuple[Notice, ...] = ()
     motion_error: float | None = None
     exposure: Exposure | None = None
+    vignetting: Vignetting | None = None
     curve: list[CurvePoint] = field(default_factory=list)
 
     @property

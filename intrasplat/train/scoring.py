@@ -51,6 +51,7 @@ def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None)
     `model` renders instead of the run's."""
     seen_by, scale = eye or run.setup.clip, run.frames.scale
     side = run.setup.sides[0 if eye is None else 1]
+    vignette = None if run.vignetting is None else run.vignetting.picture(seen_by.intrinsics)[..., None]
 
     def render(index: int) -> RenderedFrame:
         camera = camera_vector(camera_in_units(seen_by.intrinsics, seen_by.world_from_camera[index], scale, side))
@@ -59,6 +60,8 @@ def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None)
         rgb = image[:3].transpose(1, 2, 0)
         if run.exposure is not None:
             rgb = rgb * np.exp(run.exposure.log_gains[index]).astype(np.float32)
+        if vignette is not None:
+            rgb = rgb * vignette
         return RenderedFrame(rgb, depth_mm, image[4])
 
     return render
