@@ -53,6 +53,7 @@ class NoticeCode(StrEnum):
     SMOKE = "smoke"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
+    VIGNETTING = "vignetting"
     # warnings about the clip
     ALIGNMENT_UNKNOWN = "alignment_unknown"
     BLOOD = "blood"

@@ -87,7 +87,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
         assumptions=(
-            *run.light.notices,
+            *run.light.notices(run.setup.clip),
             *run.chosen,
             *run.schedule.notices,
             *(quantized.notices if quantized else (_floats(scene),)),

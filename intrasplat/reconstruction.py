@@ -113,8 +113,8 @@ class Scene:
             width, height: size of the picture in pixels; one alone keeps the aspect ratio. Default: the clip's size.
             intrinsics: another camera, instead of width and height.
             highlights: whether to show the highlights that were separated by means of the two eyes of a stereo clip.
-            light: "steady": where exposure or white balance change in the clip, that of one frame at all times;
-                "recorded": that in which the moment was recorded.
+            light: "steady": where exposure or white balance change in the clip, or the border is dark, the even light
+                of one frame at all times; "recorded": that in which the moment was recorded.
             smoke: "show": behind the smoke that was found before the tissue; "remove": without it.
 
         Returns:

@@ -149,8 +149,8 @@ class RenderQuery(ViewQuery):
     )
     light: Light = Field(
         default="steady",
-        description="the light of layer rgb where exposure or white balance change in the clip. steady: that of one "
-        "frame at all times; recorded: that in which the moment was recorded",
+        description="the light of layer rgb where exposure or white balance change in the clip, or the border is dark. "
+        "steady: that of one frame at all times, everywhere; recorded: that in which the moment was recorded",
     )
     smoke: Smoke = Field(
         default="remove",

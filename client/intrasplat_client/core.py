@@ -210,7 +210,7 @@ class Core:
         highlights: off shows rgb without the highlights that were separated by comparing both eyes of a stereo clip; a
             scene of one eye has none and is shown as it is. on is the default.
         light: steady (the default) shows rgb in the light of one frame, recorded in that of the moment; they differ
-            where exposure or white balance change in the clip.
+            where exposure or white balance change in the clip, or its border is dark.
         smoke: remove (the default) shows rgb without the smoke that was found before the tissue, show with it.
         known: an earlier view; it is returned if it is still what the service would send.
         camera: width, height, fx, fy, cx, cy in pixels.

@@ -83,6 +83,7 @@ class NoticeCode(StrEnum):
     SMOKE = "smoke"
     SPACING = "spacing"
     STORED_PRECISION = "stored_precision"
+    VIGNETTING = "vignetting"
     ALIGNMENT_UNKNOWN = "alignment_unknown"
     BLOOD = "blood"
     BLURRED_FRAMES = "blurred_frames"

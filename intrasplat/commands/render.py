@@ -58,8 +58,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--light",
         choices=get_args(Light),
         default="steady",
-        help="where exposure or white balance change: steady: colours in the light of one frame; recorded: in that of "
-        "the moment (default: steady)",
+        help="where exposure or white balance change, or the border is dark: steady: colours in the even light of one "
+        "frame; recorded: in that of the moment (default: steady)",
     )
     parser.add_argument(
         "--smoke",

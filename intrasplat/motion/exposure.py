@@ -87,20 +87,29 @@ def _measurements(
 ) -> Iterator[tuple[int, int, Reals, float]]:
     """A keyframe, a frame (indices into train), log gains [3] of the one against the other, share of cells measured."""
     for each in tracks:
-        start = cell_means(clip.rgb[train[each.reference]], each.step_px).astype(np.float32) / np.float32(255)
-        step = max(1, round(math.sqrt(start[..., 0].size / MAX_CELLS)))
-        some = np.s_[::step, ::step]
-        start = start[some]
-        for row, place in enumerate(each.followed.tolist()):
-            if place == each.reference:
-                continue
-            there = start + each.colour[row][some]
-            low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
-            good = (each.confidence[row][some] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
+        for place, row, _, good, ratio in measured_cells(clip, train, each):
             each.let_go(row)
             if good.sum() >= MIN_CELLS:
-                log_gain = np.median(np.log(there[good] / start[good]), axis=0).astype(np.float64)
+                log_gain = np.median(np.log(ratio[good]), axis=0).astype(np.float64)
                 yield each.reference, place, log_gain, float(good.mean())
+
+
+def measured_cells(
+    clip: DepthClip, train: Sequence[int], tracks: Tracks
+) -> Iterator[tuple[int, int, tuple[slice, slice], NDArray[np.bool_], NDArray[np.float32]]]:
+    """Of each tracked frame but the keyframe: its index in train and its row of tracks; about MAX_CELLS of the grid's
+    cells, as two slices; which of those are measured, and colour there / colour in the keyframe [..., 3].
+    """
+    start = cell_means(clip.rgb[train[tracks.reference]], tracks.step_px).astype(np.float32) / np.float32(255)
+    step = max(1, round(math.sqrt(start[..., 0].size / MAX_CELLS)))
+    some = np.s_[::step, ::step]
+    start = start[some]
+    for row, place in enumerate(tracks.followed.tolist()):
+        if place != tracks.reference:
+            there = start + tracks.colour[row][some]
+            low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
+            good = (tracks.confidence[row][some] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
+            yield place, row, some, good, there / np.maximum(start, np.float32(1e-6))
 
 
 def in_steady_light(clip: DepthClip, exposure: Exposure) -> DepthClip:

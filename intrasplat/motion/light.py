@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.motion.exposure import Exposure, in_steady_light
 from intrasplat.motion.veil import Veil, behind, notice_of, warnings_of
+from intrasplat.motion.vignetting import Vignetting, evenly_lit
 from intrasplat.notices import Notice
 
 Floats = NDArray[np.float32]
@@ -21,18 +23,23 @@ Floats = NDArray[np.float32]
 class RecordedLight:
     """The light in which a clip was recorded, against the light that its model has.
 
-    exposure  gains of every frame; None: they hardly change
-    veils     smoke before the left eye and, if there is one, the right eye; empty: none was found
+    exposure    gains of every frame; None: they hardly change
+    vignetting  of the pictures; None: it is weak
+    veils       smoke before the left eye and, if there is one, the right eye; empty: none was found
     """
 
     exposure: Exposure | None = None
+    vignetting: Vignetting | None = None
     veils: tuple[Veil, ...] = ()
 
-    @property
-    def notices(self) -> tuple[Notice, ...]:
+    def notices(self, clip: DepthClip) -> Iterator[Notice]:
         """What the report says about it."""
-        smoke = (notice_of(self.veils[0]),) if self.veils else ()
-        return (*smoke, *(() if self.exposure is None else (self.exposure.notice,)))
+        if self.veils:
+            yield notice_of(self.veils[0])
+        if self.vignetting is not None:
+            yield self.vignetting.notice(clip.intrinsics, np.asarray(clip.tissue.any(axis=0)))
+        if self.exposure is not None:
+            yield self.exposure.notice
 
     @property
     def warnings(self) -> tuple[Notice, ...]:
@@ -40,14 +47,19 @@ class RecordedLight:
         return warnings_of(self.veils[0]) if self.veils else ()
 
     def removed(self, clip: DepthClip) -> DepthClip:
-        """The clip to train on: without smoke, in steady light. The clip itself where neither was found."""
-        clear = behind(clip, self.veils) if self.veils else clip
-        return clear if self.exposure is None else in_steady_light(clear, self.exposure)
+        """The clip to train on: without smoke, in even and steady light. The clip itself where none was found."""
+        if self.veils:
+            clip = behind(clip, self.veils)
+        if self.vignetting is not None:
+            clip = evenly_lit(clip, self.vignetting)
+        return clip if self.exposure is None else in_steady_light(clip, self.exposure)
 
-    def added(self, rgb: Floats, index: int, depth_mm: Floats, *, right: bool = False) -> Floats:
+    def added(self, rgb: Floats, index: int, depth_mm: Floats, lens: Intrinsics, *, right: bool = False) -> Floats:
         """Colours [H, W, 3] of the model in a frame as that eye recorded it; depth_mm [H, W] is the render's."""
         if self.exposure is not None:
             rgb = rgb * np.exp(self.exposure.log_gains[index]).astype(np.float32)
+        if self.vignetting is not None:
+            rgb = rgb * self.vignetting.picture(lens)[..., None]
         if self.veils:
             veil = self.veils[1 if right and len(self.veils) > 1 else 0]
             rgb = veil.before(rgb, veil.transmission(index, depth_mm))
@@ -56,13 +68,15 @@ class RecordedLight:
     def settings(self) -> dict[str, Any]:
         """What a scene stores to show a moment as the left eye recorded it; JSON."""
         gains = {} if self.exposure is None else {"log_gains": self.exposure.log_gains.tolist()}
-        return gains | ({"veil": self.veils[0].stored()} if self.veils else {})
+        even = {} if self.vignetting is None else {"vignetting": self.vignetting.stored()}
+        return gains | even | ({"veil": self.veils[0].stored()} if self.veils else {})
 
     def stored(self) -> dict[str, Any]:
         """All of it as JSON, for read()."""
         exposure = self.exposure
         gains = None if exposure is None else [exposure.log_gains.tolist(), exposure.reference]
-        return {"exposure": gains, "veils": [veil.stored() for veil in self.veils]}
+        even = None if self.vignetting is None else self.vignetting.stored()
+        return {"exposure": gains, "vignetting": even, "veils": [veil.stored() for veil in self.veils]}
 
     @classmethod
     def read(cls, stored: Mapping[str, Any], frames: int) -> RecordedLight:
@@ -73,4 +87,5 @@ class RecordedLight:
         """
         gains = stored["exposure"]
         exposure = None if gains is None else Exposure(np.array(gains[0], np.float64), int(gains[1]))
-        return cls(exposure, tuple(Veil.read(veil, frames) for veil in stored["veils"]))
+        vignetting = None if stored["vignetting"] is None else Vignetting(*map(float, stored["vignetting"]))
+        return cls(exposure, vignetting, tuple(Veil.read(veil, frames) for veil in stored["veils"]))

@@ -73,7 +73,9 @@ def take_scene(
 
 def _settings(scene: TrainedScene) -> dict[str, Any]:
     """The settings that views need, checked: the scene's report says how it was trained."""
-    light = {} if scene.log_gains is None else {"log_gains": scene.log_gains.tolist()}
+    light: dict[str, Any] = {} if scene.log_gains is None else {"log_gains": scene.log_gains.tolist()}
+    if scene.vignetting is not None:
+        light["vignetting"] = scene.vignetting.stored()
     light |= {} if scene.veil is None else {"veil": scene.veil.stored()}
     warnings = [each.model_dump(mode="json") for each in scene.pose_warnings]
     return {"pose_warnings": warnings, "motion_error": scene.motion_error, **light}

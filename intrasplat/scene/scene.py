@@ -20,6 +20,7 @@ from torch import Tensor
 from intrasplat.camera import Intrinsics
 from intrasplat.errors import SceneError
 from intrasplat.motion.veil import Veil
+from intrasplat.motion.vignetting import Vignetting
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.scene.files import dtype_name
 from intrasplat.splat.deformation import Deformation
@@ -37,6 +38,7 @@ POSE_WARNINGS = frozenset(
 
 
 MAX_LOG_GAIN = 5.0
+MAX_POWER = 100.0
 """Seven octaves of recorded values, more than a camera's range."""
 
 
@@ -114,6 +116,21 @@ class TrainedScene:
         if found.shape != (self.frame_count, 3) or not (np.abs(found) <= MAX_LOG_GAIN).all():
             raise ValueError(f"log_gains are not {self.frame_count} x 3 numbers up to {MAX_LOG_GAIN:g}")
         return found
+
+    @cached_property
+    def vignetting(self) -> Vignetting | None:
+        """How the recorded frames darken towards their border against the model's light; None: not modelled.
+
+        Raises:
+            ValueError: the stored numbers are none, or too large.
+        """
+        stored = self.settings.get("vignetting")
+        if stored is None:
+            return None
+        power, level = map(float, stored)
+        if not (0 <= power <= MAX_POWER and 1e-3 <= level <= 1):
+            raise ValueError(f"vignetting is {power}, {level}")
+        return Vignetting(power, level)
 
     def gains(self, t: float) -> NDArray[np.float32] | None:
         """[3] gains of R G B of the light in which model time t was recorded, against the model's; None: all are 1."""

@@ -14,6 +14,7 @@ from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.light import RecordedLight
 from intrasplat.motion.smoke import find_veils
 from intrasplat.motion.tracks import Tracks, moved_along
+from intrasplat.motion.vignetting import find_vignetting
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import CPU, examine
 from intrasplat.splat.deformation import SharedBasis
@@ -103,7 +104,7 @@ def new_run(
 
 
 def _followed(setup: Setup) -> tuple[RecordedLight, Setup, list[Tracks]]:
-    """The light of the recording, the setup without it, and its tracks: flow follows tissue better in steady light."""
+    """The light of the recording, the setup without it, and its tracks: flow follows tissue better without."""
     train, tracks = setup.split.train, _tracks(setup)
     light, steady = RecordedLight(), setup
     for _ in range(SMOKE_PASSES):
@@ -112,6 +113,12 @@ def _followed(setup: Setup) -> tuple[RecordedLight, Setup, list[Tracks]]:
         if not veils:
             break
         light = RecordedLight(veils=veils)
+        steady = in_light_of(setup, light)
+        tracks = _tracks(steady)
+    with setup.timings.measure("motion_s"):
+        vignetting = find_vignetting(steady.clip, train, tracks)
+    if vignetting is not None:
+        light = replace(light, vignetting=vignetting)
         steady = in_light_of(setup, light)
         tracks = _tracks(steady)
     with setup.timings.measure("motion_s"):

@@ -57,7 +57,7 @@ def frame_renderer(run: Run, model: Model | None = None, eye: Eye | None = None)
         image = (model or run.model).render(camera, float(run.frames.t[index])).copy()
         depth_mm = solid_depth_mm(image[3], image[4], scale)
         rgb = image[:3].transpose(1, 2, 0)
-        rgb = run.light.added(rgb, index, depth_mm, right=eye is not None)
+        rgb = run.light.added(rgb, index, depth_mm, seen_by.intrinsics, right=eye is not None)
         return RenderedFrame(rgb, depth_mm, image[4])
 
     return render

@@ -36,6 +36,7 @@ from intrasplat.view.depth_range import DepthRange
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses, pixel_count
 from intrasplat.view.out_of_view import OutOfView
+from intrasplat.view.recorded_light import EndoscopeLight
 from intrasplat.view.smoky import smoke_share, with_smoke
 from intrasplat.view.unseen import blended_values, missing_pixels, unseen_pixels
 
@@ -111,11 +112,11 @@ class SceneRenderer:
         """The scene's colour in the light of the recording, depth in mm and alpha at model time t."""
         image, _ = self.layers(t, world_from_camera, intrinsics)
         depth_mm = solid_depth_mm(image[3], image[4], self.scene.units_per_mm)
-        rgb, gains = image[:3].transpose(1, 2, 0), self.scene.gains(t)
-        rgb = rgb if gains is None else rgb * gains
-        return RenderedFrame(
-            with_smoke(self.scene, t, rgb, depth_mm, (intrinsics, world_from_camera)), depth_mm, image[4]
-        )
+        rgb = image[:3].transpose(1, 2, 0)
+        light = EndoscopeLight(self.scene, t, world_from_camera, intrinsics).factors(depth_mm)
+        rgb = rgb if light is None else rgb * light
+        camera = (intrinsics, world_from_camera)
+        return RenderedFrame(with_smoke(self.scene, t, rgb, depth_mm, camera), depth_mm, image[4])
 
     def values(self, t: float) -> NDArray[np.float32] | None:
         """blended_values [N] at model time t: trust where positive. None: not known."""
@@ -286,12 +287,10 @@ class _Picture:
         colours = np.empty((3, *size), np.float32) if with_colours else None
         return cls(rgb, depth_mm, missing, np.zeros(size, np.float32), colours)
 
-    def fill(
-        self, rows: slice, band: NDArray[np.float32], units_per_mm: float, gains: NDArray[np.float32] | None
-    ) -> None:
+    def fill(self, rows: slice, band: NDArray[np.float32], units_per_mm: float, light: EndoscopeLight | None) -> None:
         """Set these rows from the blended planes R G B Z A and, if known, blended_values: [5 or 6, h, W].
 
-        gains: [3], of rgb alone.
+        light: that rgb is shown in; None: the model's.
         """
         alpha, blended = band[4], band[5] if len(band) > 5 else None
         solid = alpha >= COVERED_ALPHA
@@ -300,9 +299,10 @@ class _Picture:
             self.trust[rows] = np.clip(blended / np.where(solid, alpha, 1), 0, 1) * solid
         if self.colours is not None:
             self.colours[:, rows] = band[:3]
-        levels = np.float32(255) if gains is None else 255 * gains
-        self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * levels + 0.5, 0, 255)
         self.depth_mm[rows] = solid_depth_mm(band[3], alpha, units_per_mm)
+        factors = None if light is None else light.factors(self.depth_mm[rows], rows)
+        levels = np.float32(255) if factors is None else 255 * factors
+        self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * levels + 0.5, 0, 255)
 
 
 def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Parts[_Picture]:
@@ -312,9 +312,9 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Par
         projected.sort()
         yield
         picture = _Picture.empty(lens.height, lens.width, with_colours=with_colours)
-        gains = view.scene.gains(view.shown_t) if view.light == "recorded" else None
+        recorded = EndoscopeLight(view.scene, view.shown_t, view.pose, lens) if view.light == "recorded" else None
         for rows in projected.bands:
-            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm, gains)
+            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm, recorded)
             yield
     return picture
 
