@@ -31,8 +31,8 @@ MIN_CONFIDENCE, MIN_CELLS, MAX_CELLS = 0.3, 30, 5000
 MIN_LEVEL, MAX_LEVEL = 0.08, 0.95
 """Colours in [0, 1] that are measured: noise and the tone curve's foot spoil darker ones, clipping brighter ones."""
 MIN_CHANGE, MIN_TINT = 0.2, 0.12
-"""Least range of the log gains' mean (one stop is 0.32; `d4d_stereo` drifts by 0.16), and of red or blue against green, that is corrected. The bases
-follow smaller changes as well, and lamps change with the place, which one gain cannot follow."""
+"""Least range of the log gains' mean (one stop is 0.32, `d4d_stereo` drifts by 0.16), and of red or blue against green,
+that is corrected. The bases follow smaller changes as well, and lamps change with the place, which one gain cannot."""
 TONE_POWER = 2.2
 """Light is about this power of recorded values."""
 
