@@ -90,7 +90,7 @@ def judged_views(
     """The held-out score over the pixels `judged` [T, H, W], and the claims in the pixels `outside` [H, W]."""
     errors, confident, unseen = [], [], []
     for index in held_out_frames(len(truth), HOLDOUT):
-        view = scene.render(t=index / len(truth), light="recorded")
+        view = scene.render(t=index / len(truth), light="recorded", smoke="show")
         errors.append(np.square(view.rgb.astype(np.float64) - truth[index])[judged[index]].mean())
         confident.append((view.confidence[outside] >= CONFIDENT).mean())
         unseen.append(view.unseen[outside].mean())

@@ -109,7 +109,9 @@ def scores(scene: isp.Scene, clean: Eye, spoilt: Eye, *, is_right: bool = False)
             pose = pose @ np.reshape(eye.left_from_right, (4, 4))
             camera = replace(camera, fx=eye.fx_px, fy=eye.fy_px, cx=eye.cx_px, cy=eye.cy_px)
         t, tissue = index / clean.frame_count, clean.tissue[index]
-        views = [scene.render(t, pose, intrinsics=camera, light=light).rgb for light in ("steady", "recorded")]
+        clear = scene.render(t, pose, intrinsics=camera)
+        as_recorded = scene.render(t, pose, intrinsics=camera, light="recorded", smoke="show")
+        views = [clear.rgb, as_recorded.rgb]
         steady.append((views[0], clean.rgb[index], tissue))
         recorded.append((views[1], spoilt.rgb[index], tissue))
     by_frame = float(np.mean([fitted_db([view]) for view in steady]))

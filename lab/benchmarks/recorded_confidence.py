@@ -32,7 +32,7 @@ def recorded_errors() -> Iterator[tuple[str, str, PixelErrors]]:
             found = []
             for index in frames:
                 t, pose = index / matched.frame_count, eye.world_from_camera[index]
-                view = scene.render(t, pose, intrinsics=eye.intrinsics, light="recorded")
+                view = scene.render(t, pose, intrinsics=eye.intrinsics, light="recorded", smoke="show")
                 shown, true = (np.asarray(each, np.float32) / np.float32(255) for each in (view.rgb, eye.rgb[index]))
                 judged = eye.tissue[index] & (eye.depth_confidence[index] >= MIN_CONFIDENCE)
                 depths_mm = (view.depth_mm, eye.depth_mm[index])

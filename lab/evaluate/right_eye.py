@@ -29,7 +29,7 @@ def _errors(scene: TrainedScene, clip: DepthClip, frame: int) -> PixelErrors:
     assert clip.right is not None
     right = clip.right
     t, pose = frame / scene.frame_count, right.world_from_camera[frame]
-    shown = render_frame(scene, t, pose, right.intrinsics, light="recorded")
+    shown = render_frame(scene, t, pose, right.intrinsics, light="recorded", smoke="show")
     rgb, true = (each.astype(np.float32) / np.float32(255) for each in (shown.rgb, right.rgb[frame]))
     confidence = shown.confidence * ~shown.unseen
     return pixel_errors(confidence, (rgb, true), (shown.depth_mm, shown.depth_mm), judged_pixels(right, frame))
