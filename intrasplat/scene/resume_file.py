@@ -22,7 +22,7 @@ from intrasplat.files.durable import FOR_ALL, flush, temporary_path
 from intrasplat.names import RESUME
 
 RESUME_FILE = RESUME
-RESUME_VERSION = 4
+RESUME_VERSION = 5
 """It rises whenever the stored state changes; no version reads another's."""
 
 _DTYPES = {
