@@ -38,8 +38,9 @@ POSE_WARNINGS = frozenset(
 
 
 MAX_LOG_GAIN = 5.0
-MAX_POWER = 100.0
 """Seven octaves of recorded values, more than a camera's range."""
+MAX_POWER = 100.0
+"""Of a vignetting; recordings have up to 6."""
 
 
 @dataclass(frozen=True, eq=False)
