@@ -11,20 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.clip import DepthClip, Eye
-from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.clip import DepthClip
 from intrasplat.motion.lifted import cell_means
+from intrasplat.motion.recoloured import EyeOrClip, recoloured
 from intrasplat.motion.tracks import Tracks
 from intrasplat.notices import Notice, NoticeCode
 
 Reals = NDArray[np.float64]
-EyeOrClip = TypeVar("EyeOrClip", Eye, DepthClip)
 
 MIN_CONFIDENCE, MIN_CELLS, MAX_CELLS = 0.3, 30, 5000
 """Of a track that is measured; fewest and most tracks of a frame, the most about."""
@@ -119,10 +117,10 @@ def in_steady_light(clip: DepthClip, exposure: Exposure) -> DepthClip:
 
 
 def _steady(eye: EyeOrClip, exposure: Exposure) -> EyeOrClip:
-    rgb, levels = mapped_zeros(eye.rgb.shape, np.uint8), np.arange(256)[:, None]
-    for index, log_gain in enumerate(exposure.log_gains):
-        table = np.clip(levels / np.exp(log_gain) + 0.5, 0, 255).astype(np.uint8)
-        cv2.LUT(eye.rgb[index], table.reshape(1, 256, 3), dst=rgb[index])
-        eye.let_go(index)
-        let_go(rgb[index])
-    return replace(eye, rgb=rgb)
+    levels = np.arange(256)[:, None]
+
+    def picture(index: int) -> NDArray[np.uint8]:
+        table = np.clip(levels / np.exp(exposure.log_gains[index]) + 0.5, 0, 255).astype(np.uint8)
+        return np.asarray(cv2.LUT(eye.rgb[index], table.reshape(1, 256, 3)), np.uint8)
+
+    return recoloured(eye, picture)

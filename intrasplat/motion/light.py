@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.motion.exposure import Exposure, in_steady_light
-from intrasplat.motion.veil import Veil, behind, notice_of, warnings_of
+from intrasplat.motion.veil import Veil, notice_of, warnings_of, without_veils
 from intrasplat.motion.vignetting import Vignetting, evenly_lit
 from intrasplat.notices import Notice
 
@@ -49,7 +49,7 @@ class RecordedLight:
     def removed(self, clip: DepthClip) -> DepthClip:
         """The clip to train on: without smoke, in even and steady light. The clip itself where none was found."""
         if self.veils:
-            clip = behind(clip, self.veils)
+            clip = without_veils(clip, self.veils)
         if self.vignetting is not None:
             clip = evenly_lit(clip, self.vignetting)
         return clip if self.exposure is None else in_steady_light(clip, self.exposure)
@@ -62,7 +62,7 @@ class RecordedLight:
             rgb = rgb * self.vignetting.picture(lens)[..., None]
         if self.veils:
             veil = self.veils[1 if right and len(self.veils) > 1 else 0]
-            rgb = veil.before(rgb, veil.transmission(index, depth_mm))
+            rgb = veil.drawn_over(rgb, veil.transmission(index, depth_mm))
         return rgb
 
     def settings(self) -> dict[str, Any]:

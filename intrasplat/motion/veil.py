@@ -9,25 +9,23 @@ Symbols: T frames, H W pixels, h w nodes of a coarse grid over the picture.
 from __future__ import annotations
 
 import base64
+import math
 import zlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, Eye
-from intrasplat.machine.cores import cores
 from intrasplat.machine.mapped import let_go, mapped_zeros
-from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.motion.complete import complete_depth
+from intrasplat.motion.recoloured import EyeOrClip, recoloured
 from intrasplat.notices import Notice, NoticeCode
 
 Floats = NDArray[np.float32]
-EyeOrClip = TypeVar("EyeOrClip", Eye, DepthClip)
 
 MIN_TRANSMISSION = 0.2
 """Tissue of which less light arrives is unseen: at 8 bits its colour would be noise."""
@@ -69,7 +67,7 @@ class Veil:
         fine = cv2.resize(self.at(frame), depth_mm.shape[::-1], interpolation=cv2.INTER_LINEAR)
         return self.arriving(np.asarray(fine, np.float32), depth_mm)
 
-    def before(self, rgb: Floats, transmission: Floats) -> Floats:
+    def drawn_over(self, rgb: Floats, transmission: Floats) -> Floats:
         """A clear picture [H, W, 3] in [0, 1] as seen through the veil."""
         share = transmission[..., None]
         return np.asarray(share * rgb + (1 - share) * self.airlight, np.float32)
@@ -108,11 +106,11 @@ class Veil:
             content = base64.b64decode(stored["thickness"], validate=True)
         except (KeyError, TypeError) as error:
             raise ValueError(f"the veil lacks a value or has another type: {error}") from error
-        if len(shape) != 3 or shape[0] != frames or min(shape) < 1 or int(np.prod(shape)) > MAX_NODES:
+        if len(shape) != 3 or shape[0] != frames or min(shape) < 1 or math.prod(shape) > MAX_NODES:
             raise ValueError(f"the veil has shape {shape}, not {frames} x h x w")
         if airlight.shape != (3,) or not ((airlight >= 0) & (airlight <= 1)).all() or not 0 < depth_mm < np.inf:
             raise ValueError("the veil's airlight or depth is out of range")
-        count, unpacker = int(np.prod(shape)), zlib.decompressobj()
+        count, unpacker = math.prod(shape), zlib.decompressobj()
         try:
             steps = unpacker.decompress(content, count + 1)
         except zlib.error as error:
@@ -144,10 +142,10 @@ def warnings_of(veil: Veil) -> tuple[Notice, ...]:
     return (Notice.warning(NoticeCode.VEILED, text),)
 
 
-def behind(clip: DepthClip, veils: Sequence[Veil]) -> DepthClip:
+def without_veils(clip: DepthClip, veils: Sequence[Veil]) -> DepthClip:
     """The clip without its veils, the left eye's first. What they hide, MIN_TRANSMISSION, is no tissue any more."""
-    right = clip.right if clip.right is None or len(veils) < 2 else _behind(clip.right, veils[1])
-    return replace(_behind(clip, veils[0]), right=right)
+    right = clip.right if clip.right is None or len(veils) < 2 else _without_veil(clip.right, veils[1])
+    return replace(_without_veil(clip, veils[0]), right=right)
 
 
 def whole_depth_mm(eye: Eye, index: int) -> Floats:
@@ -159,19 +157,15 @@ def whole_depth_mm(eye: Eye, index: int) -> Floats:
     return np.asarray(cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _behind(eye: EyeOrClip, veil: Veil) -> EyeOrClip:
-    rgb, tissue = mapped_zeros(eye.rgb.shape, np.uint8), mapped_zeros(eye.tissue.shape, np.bool_)
-    airlight = veil.airlight * np.float32(255)
+def _without_veil(eye: EyeOrClip, veil: Veil) -> EyeOrClip:
+    tissue, airlight = mapped_zeros(eye.tissue.shape, np.bool_), veil.airlight * np.float32(255)
 
-    def clear(index: int) -> None:
+    def picture(index: int) -> NDArray[np.uint8]:
         share = veil.transmission(index, whole_depth_mm(eye, index))
         arrives = 1 / np.maximum(share, np.float32(MIN_TRANSMISSION))[..., None]
-        rgb[index] = np.clip((eye.rgb[index] - airlight) * arrives + airlight + np.float32(0.5), 0, 255)
         tissue[index] = eye.tissue[index] & (share >= MIN_TRANSMISSION)
-        eye.let_go(index)
-        let_go(rgb[index])
         let_go(tissue[index])
+        clear = (eye.rgb[index] - airlight) * arrives + airlight + np.float32(0.5)
+        return np.asarray(np.clip(clear, 0, 255).astype(np.uint8))
 
-    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(clear, range(eye.frame_count)))
-    return replace(eye, rgb=rgb, tissue=tissue)
+    return replace(recoloured(eye, picture), tissue=tissue)

@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
-from intrasplat.clip import DepthClip, Eye
-from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.clip import DepthClip
 from intrasplat.motion.exposure import MIN_CELLS, measured_cells
 from intrasplat.motion.lifted import PointGrid
+from intrasplat.motion.recoloured import EyeOrClip, recoloured
 from intrasplat.motion.tracks import Tracks
 from intrasplat.notices import Notice, NoticeCode
 
 Reals = NDArray[np.float64]
-EyeOrClip = TypeVar("EyeOrClip", Eye, DepthClip)
 
 MIN_DARKENING = 0.5
 """Least range of the log brightness over the tissue (98 % of it) that is corrected. The phantoms' lamp has 0.15 to 0.4,
@@ -146,9 +144,9 @@ def evenly_lit(clip: DepthClip, vignetting: Vignetting) -> DepthClip:
 
 
 def _even(eye: EyeOrClip, vignetting: Vignetting) -> EyeOrClip:
-    rgb, factor = mapped_zeros(eye.rgb.shape, np.uint8), vignetting.picture(eye.intrinsics)[..., None]
-    for index in range(len(rgb)):
-        rgb[index] = np.clip(eye.rgb[index] / factor + 0.5, 0, 255)
-        eye.let_go(index)
-        let_go(rgb[index])
-    return replace(eye, rgb=rgb)
+    factor = vignetting.picture(eye.intrinsics)[..., None]
+
+    def picture(index: int) -> NDArray[np.uint8]:
+        return np.asarray(np.clip(eye.rgb[index] / factor + 0.5, 0, 255).astype(np.uint8))
+
+    return recoloured(eye, picture)

@@ -14,6 +14,7 @@ from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.light import RecordedLight
 from intrasplat.motion.smoke import find_veils
 from intrasplat.motion.tracks import Tracks, moved_along
+from intrasplat.motion.veil import Veil
 from intrasplat.motion.vignetting import find_vignetting
 from intrasplat.notices import Notice
 from intrasplat.splat.backend import CPU, examine
@@ -106,28 +107,29 @@ def new_run(
 def _followed(setup: Setup) -> tuple[RecordedLight, Setup, list[Tracks]]:
     """The light of the recording, the setup without it, and its tracks: flow follows tissue better without."""
     train, tracks = setup.split.train, _tracks(setup)
-    light, steady = RecordedLight(), setup
+    veils, steady = tuple[Veil, ...](), setup
     for _ in range(SMOKE_PASSES):
         with setup.timings.measure("motion_s"):
-            veils = find_veils(setup.clip, train, tracks, steady.clip)
-        if not veils:
+            found = find_veils(setup.clip, train, tracks, steady.clip)
+        if not found:
             break
-        light = RecordedLight(veils=veils)
-        steady = in_light_of(setup, light)
-        tracks = _tracks(steady)
+        veils = found
+        steady, tracks = _steadied(setup, RecordedLight(veils=veils))
     with setup.timings.measure("motion_s"):
         vignetting = find_vignetting(steady.clip, train, tracks)
     if vignetting is not None:
-        light = replace(light, vignetting=vignetting)
-        steady = in_light_of(setup, light)
-        tracks = _tracks(steady)
+        steady, tracks = _steadied(steady, RecordedLight(vignetting=vignetting))
     with setup.timings.measure("motion_s"):
         exposure = find_exposure(steady.clip, train, tracks)
     if exposure is not None:
-        light = replace(light, exposure=exposure)
-        steady = in_light_of(setup, light)
-        tracks = _tracks(steady)
-    return light, steady, tracks
+        steady, tracks = _steadied(steady, RecordedLight(exposure=exposure))
+    return RecordedLight(exposure, vignetting, veils), steady, tracks
+
+
+def _steadied(setup: Setup, light: RecordedLight) -> tuple[Setup, list[Tracks]]:
+    """The setup without this light, and its tracks."""
+    steady = in_light_of(setup, light)
+    return steady, _tracks(steady)
 
 
 def _tracks(setup: Setup) -> list[Tracks]:

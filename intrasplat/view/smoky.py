@@ -40,4 +40,4 @@ def smoke_share(scene: TrainedScene, t: float, depth_mm: Floats, camera: Camera)
 
 def with_smoke(scene: TrainedScene, t: float, rgb: Floats, depth_mm: Floats, camera: Camera) -> Floats:
     """Colours [H, W, 3] in [0, 1] of a view behind its smoke; as given where there is none. Arguments as above."""
-    return rgb if scene.veil is None else scene.veil.before(rgb, 1 - smoke_share(scene, t, depth_mm, camera))
+    return rgb if scene.veil is None else scene.veil.drawn_over(rgb, 1 - smoke_share(scene, t, depth_mm, camera))

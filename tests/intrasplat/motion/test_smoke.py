@@ -14,7 +14,7 @@ import pytest
 from intrasplat.clip import DepthClip, Eye, split_frames
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.smoke import find_veils
-from intrasplat.motion.veil import MIN_TRANSMISSION, Veil, behind, warnings_of
+from intrasplat.motion.veil import MIN_TRANSMISSION, Veil, warnings_of, without_veils
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.quality.report import first_report
@@ -75,7 +75,7 @@ def error_after_a_fit(eye: Eye, true: Eye) -> float:
 @pytest.mark.parametrize("share", [0.25, 0.4])
 def test_smoke_that_drifts_is_removed_from_both_eyes(share: float) -> None:
     clip, veils = found(share)
-    clear, true = behind(clip, veils), clear_clip()
+    clear, true = without_veils(clip, veils), clear_clip()
     assert clear.right is not None
     assert clip.right is not None
     assert true.right is not None
@@ -112,7 +112,7 @@ def test_what_hardly_any_light_reaches_is_no_tissue() -> None:
     clip = clear_clip()
     thick = veil_over(clip, 0.3)
     thick.thickness[:, :64] = -2 * np.log(MIN_TRANSMISSION)
-    clear = behind(clip, (thick,))
+    clear = without_veils(clip, (thick,))
     assert not clear.tissue[:, :48].any()
     np.testing.assert_array_equal(clear.tissue[:, 80:], clip.tissue[:, 80:])
     assert [each.code for each in warnings_of(thick)] == [NoticeCode.VEILED]
