@@ -9,6 +9,7 @@ Symbols: H W pixels, K blocks of BLOCK_PX squared pixels, P patches of some bloc
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.types import Eye
+from intrasplat.machine.cores import cores
+from intrasplat.machine.opencv import one_opencv_thread
 
 Reals = NDArray[np.float64]
 Grey = NDArray[np.float32]  # [H, W], levels of 255
@@ -109,8 +112,15 @@ def frame_weights(eye: Eye, frames: Sequence[int], train: Sequence[int]) -> dict
 
     frames: indices, among them those of `train`, rising.
     """
-    analysed = ((index, detail_of(*_analysed(eye, index))) for index in eye.one_by_one(frames))
-    details = {index: each for index, each in analysed if each is not None and each.means.size >= MIN_BLOCKS}
+
+    def look(index: int) -> Detail | None:
+        found = detail_of(*_analysed(eye, index))
+        eye.let_go(index)
+        return found
+
+    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
+        analysed = zip(frames, pool.map(look, frames), strict=True)
+        details = {index: each for index, each in analysed if each is not None and each.means.size >= MIN_BLOCKS}
     found = relative_sharpness(details, [index for index in train if index in details])
     steps = {index: round(WEIGHT_STEPS * (share / BLURRED) ** STEEPNESS) for index, share in found.items()}
     return {index: step / WEIGHT_STEPS for index, step in steps.items() if step < WEIGHT_STEPS}
