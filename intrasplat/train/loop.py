@@ -1,7 +1,7 @@
 """The training loop. prepare.py builds the Run, its state; with a budget, calibrate.py makes the first steps.
 
-No schedule reads the clock. So on one device the same seed and iterations give a bit-identical model, also if the run
-was interrupted and resumed.
+Only a run with a budget reads the clock, before its last cycle. So on one device the same seed and iterations give a
+bit-identical model, also if the run was interrupted and resumed.
 """
 
 from __future__ import annotations
@@ -90,6 +90,8 @@ def train(
         if copy_scene is not None and hooks.wants_snapshot():
             hooks.on_snapshot(copy_scene(), run.iteration)
         iteration = _advance(run)
+        if run.setup.fixed_iterations is None and iteration == run.schedule.fitted_at:
+            _fit_last_cycle(run, clock, (clock.elapsed_s - began) / (iteration - first))
         if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
             _score(run, clock, evaluate)
@@ -125,6 +127,12 @@ def _end_cycle(run: Run, iteration: int) -> None:
         run.average.put(run.model.parameters())
     if run.schedule.scores_validation(iteration):
         run.schedule = run.schedule.with_score(_validation_psnr(run))
+
+
+def _fit_last_cycle(run: Run, clock: Stopwatch, step_s: float) -> None:
+    """Fit the last cycle into what is left of the budget; step_s: the time of a step so far."""
+    check_sums(run.model.wait(), run.iteration)
+    run.schedule = run.schedule.with_last_cycle(int((run.setup.budget_s - clock.elapsed_s) / step_s))
 
 
 def _validation_psnr(run: Run) -> float:

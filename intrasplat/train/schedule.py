@@ -24,6 +24,9 @@ AVERAGED_SHARE, AVERAGED = 1 / 8, 6
 CLOSING_SHARE, MIN_CLOSING_EPOCHS = 0.25, 2
 """Iterations after early stopping, which train on the validation frames too: their share of those before, and the
 fewest epochs. With two epochs a whole one is among them, wherever in an epoch they start."""
+MAX_REFIT = 2
+"""Largest factor by which the last cycle is longer or shorter than planned. A few timed steps are easily disturbed by
+other processes: a third of a minute's iterations was lost on pulls of the phantom."""
 VALIDATION_EVERY = 14
 """One training frame in 14 is a validation frame."""
 MIN_FRAMES_FOR_VALIDATION = 28
@@ -34,13 +37,14 @@ MIN_FRAMES_FOR_VALIDATION = 28
 class Schedule:
     """The cycles of a run; iterations count from 1.
 
-    planned        iterations without early stopping
+    planned        iterations without early stopping, by the time that the first steps took
     warm_restarts  whether there are several cycles, if planned is long enough for two, and each ends in an average
     min_gain_db    early stopping: the run ends if doubling the iterations gains less on the validation frames; None:
                    there are no validation frames and no early stopping
     epoch          iterations that show every training frame once; a long clip needs long cycles
     scores         psnr_tissue of the validation frames, dB, at the ends of the cycles so far
     opening        first iterations, made before `planned` was known: at full rates, without validation frames
+    fitted         iterations by the time that all cycles but the last took; None: not known yet
     """
 
     planned: int
@@ -49,6 +53,7 @@ class Schedule:
     epoch: int = 1
     scores: tuple[float, ...] = ()
     opening: int = 0
+    fitted: int | None = None
 
     @property
     def _planned_ends(self) -> tuple[int, ...]:
@@ -56,7 +61,7 @@ class Schedule:
         shortest = max(MIN_CYCLE_ITERATIONS, MIN_CYCLE_EPOCHS * self.epoch)
         while self.warm_restarts and ends[0] // 2 >= shortest:
             ends.insert(0, ends[0] // 2)
-        return tuple(ends)
+        return tuple(ends) if self.fitted is None else (*ends[:-1], self.fitted)
 
     @property
     def stopped_at(self) -> int | None:
@@ -73,7 +78,7 @@ class Schedule:
         if stopped_at is None:
             return self._planned_ends
         closed_at = max(round(stopped_at * (1 + CLOSING_SHARE)), stopped_at + MIN_CLOSING_EPOCHS * self.epoch)
-        return (*self._planned_ends[: len(self.scores)], min(self.planned, closed_at))
+        return (*self._planned_ends[: len(self.scores)], min(self._planned_ends[-1], closed_at))
 
     @property
     def iterations(self) -> int:
@@ -113,6 +118,18 @@ class Schedule:
     def with_score(self, psnr_db: float) -> Schedule:
         """The schedule after a cycle's end at which the validation frames scored psnr_db."""
         return replace(self, scores=(*self.scores, psnr_db))
+
+    @property
+    def fitted_at(self) -> int | None:
+        """The iteration after which the last cycle can be fitted to the time left; None: it cannot be, any more."""
+        ends = self._planned_ends
+        return ends[-2] if len(ends) > 1 and self.fitted is None and self.stopped_at is None else None
+
+    def with_last_cycle(self, fitting: int) -> Schedule:
+        """The schedule with a last cycle of the iterations that fit, from half to twice as many as planned."""
+        *_, start, end = self._planned_ends
+        planned = end - start
+        return replace(self, fitted=start + min(max(fitting, planned // MAX_REFIT), planned * MAX_REFIT))
 
     @property
     def settings(self) -> dict[str, Any]:

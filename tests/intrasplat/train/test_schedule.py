@@ -242,3 +242,22 @@ def test_in_the_opening_rates_are_full_and_validation_frames_stay_out(min_gain_d
     assert schedule.progress(16) == Schedule(300, True).progress(16)
     assert schedule.withholds_validation(15) == (min_gain_db is not None)
     assert not schedule.withholds_validation(16)
+
+
+@pytest.mark.parametrize(("fitting", "last"), [(700, 1700), (2000, 3000), (9000, 3000), (100, 1500)])
+def test_the_last_cycle_has_the_iterations_that_fit_within_bounds(fitting: int, last: int) -> None:
+    planned = Schedule(2000, warm_restarts=True)
+    assert planned.fitted_at == 1000
+    fitted = planned.with_last_cycle(fitting)
+    assert fitted.ends == (250, 500, 1000, last)
+    assert fitted.iterations == last
+    assert fitted.fitted_at is None  # once
+    assert fitted.progress(last) == 1.0
+    assert fitted.progress(1000) == 1.0
+    assert Schedule.of(fitted.settings) == fitted
+
+
+def test_a_run_that_ends_early_or_in_one_cycle_is_not_fitted() -> None:
+    stopped = Schedule(2000, warm_restarts=True, min_gain_db=0.25).with_score(30.0).with_score(30.0)
+    assert stopped.fitted_at is None
+    assert Schedule(400, warm_restarts=True).fitted_at is None
