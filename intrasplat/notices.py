@@ -45,6 +45,7 @@ class NoticeCode(StrEnum):
     POSES = "poses"
     RECTIFICATION = "rectification"
     ROTATION = "rotation"
+    SPLASHES = "splashes"
     SYNTHETIC = "synthetic"
     # choices of the training
     BASES = "bases"

@@ -23,6 +23,7 @@ export const DE = {
     "bases": "Wie fein Bewegung beschrieben wird, wurde für diesen Clip gewählt.",
     "early_stopping": "Das Training endete früher, weil mehr davon zu wenig brachte.",
     "smoke": "Rauch lag vor dem Gewebe; die Szene wird ohne ihn gezeigt.",
+    "splashes": "Tropfen lagen auf einer Linse; darunter wurde nichts gelesen.",
     "vignetting": "Die Bilder sind zum Rand hin dunkler; die Szene wird gleichmäßig beleuchtet gezeigt.",
     "exposure": "Belichtung oder Weißabgleich änderten sich; die Szene wird in gleichmäßigem Licht gezeigt.",
     "spacing": "Wie fein das Gewebe beschrieben wird, wurde für diesen Clip gewählt.",

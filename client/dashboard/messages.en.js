@@ -23,6 +23,7 @@ export const EN = {
     "bases": "How finely movement is described was chosen for this clip.",
     "early_stopping": "Training ended early, because more of it gained too little.",
     "smoke": "Smoke lay before the tissue; the scene is shown without it.",
+    "splashes": "Drops lay on a lens; nothing was read under them.",
     "vignetting": "The pictures are darker towards their border; the scene is shown evenly lit.",
     "exposure": "Exposure or white balance changed; the scene is shown in steady light.",
     "spacing": "How finely the tissue is described was chosen for this clip.",

@@ -76,6 +76,7 @@ class NoticeCode(StrEnum):
     POSES = "poses"
     RECTIFICATION = "rectification"
     ROTATION = "rotation"
+    SPLASHES = "splashes"
     SYNTHETIC = "synthetic"
     BASES = "bases"
     EARLY_STOPPING = "early_stopping"

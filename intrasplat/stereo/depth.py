@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.features import Features, find_features
-from intrasplat.clip.field_of_view import Fields
+from intrasplat.clip.field_of_view import Fields, Mask
 from intrasplat.clip.sampling import SkippedFrames, Thumbnail, skippable_frames, thumbnail
 from intrasplat.clip.shown import find_shown
 from intrasplat.clip.split import spread
@@ -44,6 +44,7 @@ from intrasplat.stereo.in_step import Profile, find_lag, move_frames, row_profil
 from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
+from intrasplat.stereo.splashes import TissueOf, find_splashes
 
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
@@ -128,7 +129,11 @@ def estimate_depth(
         registration, plan, outside = _plan(
             clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder, fields
         )
-        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, fields, finder)
+        splashes = find_splashes(
+            (rgb, right_rgb), _shown_tissue(clip, fields, has_masks=finder is None), measured,
+            (plan.min_disparity_px, plan.max_disparity_px), pool,
+        )  # fmt: skip
+        work = FrameWork.begin(clip, rgb, right_rgb, measured, registration, plan, fields, splashes, finder)
         first, share = measured[0], 1 - DECODING_SHARE - MEASURING_SHARE
         skipped = tuple(sorted({*empty.frames, *unused.frames, *clip.damaged, *unpaired}))
         wanted = sorted(set(range(clip.frame_count)) - set(skipped))
@@ -154,7 +159,13 @@ def estimate_depth(
         skipped=skipped,
         masks=masks,
         rectification=clip.rectification,
-        assumptions=(*assumptions, _scale_assumption(clip), *fields.notices, *unused.notices(clip.frame_count)),
+        assumptions=(
+            *assumptions,
+            _scale_assumption(clip),
+            *fields.notices,
+            *splashes.notices,
+            *unused.notices(clip.frame_count),
+        ),
         warnings=clip.warnings
         + empty.notices(clip.frame_count)
         + (() if lag is None else (lag.notice(unpaired),))
@@ -249,6 +260,21 @@ def _in_step(clip: RectifiedClip, received: _Received, sources: Sequence[int | N
     damaged = tuple(t for t, source in enumerate(chosen) if {t, source} & set(clip.damaged))
     tissue_right = None if clip.tissue_right is None else clip.tissue_right[chosen]
     return replace(clip, tissue_right=tissue_right, damaged=damaged)
+
+
+def _shown_tissue(clip: RectifiedClip, fields: Fields, *, has_masks: bool) -> tuple[TissueOf, TissueOf]:
+    """The tissue of each eye before any was found: in the field of view, and outside the given masks."""
+
+    def left(frame: int) -> Mask | None:
+        return fields.tissue(clip.tissue[frame]) if has_masks else fields.left
+
+    def right(frame: int) -> Mask | None:
+        if clip.tissue_right is None:
+            return fields.right
+        tissue: Mask = clip.tissue_right[frame]
+        return tissue if fields.right is None else tissue & fields.right
+
+    return left, right
 
 
 def _plan(

@@ -22,6 +22,7 @@ from intrasplat.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import Registration
 from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over, seen_nowhere
+from intrasplat.stereo.splashes import Splashes
 
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip
@@ -47,6 +48,7 @@ class FrameWork:
     matched  the clip with both eyes; it has all pictures, and each frame's depth after finish(i)
     label    [H, W] labels that are painted into both eyes' pictures
     fields   the eyes' fields of view
+    splashes drops on the eyes' lenses
     finder   finds the instruments of a clip without masks; None: the clip has masks
     counts   [T, 3] number of tissue pixels, of those with depth, of those with sure depth
     sure     [T, 3] `seen`, `clear` and `missed` of each FoundMask
@@ -59,6 +61,7 @@ class FrameWork:
     right: Eye
     label: NDArray[np.bool_]
     fields: Fields
+    splashes: Splashes
     finder: Finder | None = None
     counts: NDArray[np.int64] = field(init=False)
     sure: NDArray[np.float64] = field(init=False)
@@ -77,6 +80,7 @@ class FrameWork:
         registration: Registration,
         plan: MatchPlan,
         fields: Fields,
+        splashes: Splashes,
         finder: Finder | None = None,
     ) -> FrameWork:
         """The work before its first frame. The right eye has the calibrated baseline and the measured rotation.
@@ -111,13 +115,19 @@ class FrameWork:
             field_of_view=fields.left,
             fov=fields.entry,
         )
-        return cls(clip, plan, registration, matched, right, label, fields, finder)
+        return cls(clip, plan, registration, matched, right, label, fields, splashes, finder)
 
     @cached_property
-    def _supported(self) -> NDArray[np.uint8] | None:
-        """[H, W] 1 in the right eye's field of view, in the calibrated eye's pixels; None: the whole picture."""
+    def _rectified_field(self) -> NDArray[np.uint8] | None:
         field = self.fields.right
         return None if field is None else self.registration.rectified(field.astype(np.uint8))
+
+    def _supported(self, i: int) -> NDArray[np.uint8] | None:
+        """[H, W] 1 where the right eye sees in a frame, in the calibrated eye's pixels; None: in the whole picture."""
+        covered, field = self.splashes.covered(i, right=True), self.fields.right
+        if covered is None:
+            return self._rectified_field
+        return self.registration.rectified((~covered if field is None else field & ~covered).astype(np.uint8))
 
     def greys(self, i: int) -> tuple[Grey, Grey]:
         """The pair to match. Sets the final colours of the right picture."""
@@ -135,8 +145,15 @@ class FrameWork:
             rgb, offset_px = self.matched.rgb[i], self.clip.disparity_offset_px
             found = self.finder(rgb, lambda coarse: nearness(coarse, right, self.plan, offset_px))
             tissue &= ~found.tool
+            self._without_drops(tissue, i)  # an instrument under a drop is not found
             self.sure[i] = found.seen, found.clear, found.missed
         return tissue
+
+    def _without_drops(self, tissue: NDArray[np.bool_], i: int, *, right: bool = False) -> None:
+        """Remove what drops cover in a frame from an eye's tissue [H, W], in place."""
+        covered = self.splashes.covered(i, right=right)
+        if covered is not None:
+            tissue &= ~covered
 
     def match(self, i: int) -> None:
         """Match a frame and finish it."""
@@ -153,8 +170,8 @@ class FrameWork:
         """Transfer a frame's depth to the right eye, drop it beside instruments, and count pixels."""
         left, right, registration = self.matched, self.right, self.registration
         focal_baseline, offset_px = self.clip.intrinsics.fx * self.clip.baseline_mm, self.clip.disparity_offset_px
-        if self._supported is not None:
-            unseen = seen_nowhere(left.depth_mm[i], focal_baseline, offset_px, self._supported)
+        if (supported := self._supported(i)) is not None:
+            unseen = seen_nowhere(left.depth_mm[i], focal_baseline, offset_px, supported)
             left.depth_mm[i][unseen], left.depth_confidence[i][unseen] = 0, 0
         moved_mm, moved_trust = moved_depth(left.depth_mm[i], left.depth_confidence[i], focal_baseline, offset_px)
         right.depth_mm[i] = registration.recorded_depth(moved_mm)
@@ -170,6 +187,8 @@ class FrameWork:
             right.tissue[i] &= self.fields.right
         if self.fields.left is not None:  # what the right eye alone sees lies outside the left one's field
             right.tissue[i] &= filled(right.depth_mm[i] > 0, GAP_SHARE * self.clip.intrinsics.width)
+        self._without_drops(left.tissue[i], i)
+        self._without_drops(right.tissue[i], i, right=True)
         for eye in (left, right):
             drop_beside_instruments(eye.tissue[i], eye.depth_mm[i], eye.depth_confidence[i])
         trust = left.depth_confidence[i][left.tissue[i]]

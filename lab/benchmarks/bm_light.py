@@ -1,6 +1,6 @@
-"""What `fast` makes of stereo clips with smoke before both eyes, or with exposure or white balance that change.
+"""What `fast` makes of stereo clips with smoke or drops before both eyes, or with exposure or colours that change.
 
-    python -m lab.benchmarks.bm_light [--clips d4d_stereo ...] [--lights none smoke exposure white_balance]
+    python -m lab.benchmarks.bm_light [--clips d4d_stereo ...] [--lights none smoke exposure ...]
         [--iterations 300 | --budget-s 60] [--out lab/rows/light.csv]
 
 Each clip is matched once as it is, which gives the truth: its frames, masks and depth. Then each of LIGHTS is put on
@@ -32,6 +32,7 @@ from intrasplat.clip.types import Eye
 from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
 from lab.conditions.exposure import with_drift, with_tint
+from lab.conditions.lens import with_splash
 from lab.conditions.smoke import with_smoke
 from lab.evaluate.fitted import fitted_db, plain_db
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, texts_of, write_rows
@@ -44,6 +45,7 @@ LIGHTS: dict[str, tuple[float, Callable[[DepthClip, float, np.random.Generator],
     "smoke": (0.35, with_smoke),
     "exposure": (1.5, with_drift),
     "white_balance": (1.3, with_tint),
+    "splash": (0.1, with_splash),
 }
 """Levels as in lab/conditions/, and what puts each on a clip."""
 KEY = ("clip", "light", "level", "limit")

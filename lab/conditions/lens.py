@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.conditions.clean import CleanClip, Given, given, to_bytes
+from intrasplat.clip.types import DepthClip
+from intrasplat.motion.recoloured import EyeOrClip
+from lab.conditions.clean import REFERENCE_WIDTH, CleanClip, Given, given, to_bytes
 from lab.conditions.recording import recording_of
 from lab.phantom import PhantomFrame
 
@@ -61,10 +63,20 @@ def drops_over(height: int, width: int, level: float, px: float, random: np.rand
 
 def splash(clean: CleanClip, level: float, random: np.random.Generator) -> Given:
     """Drops cover `level` of the picture in the end; masks do not show them. Scored also behind them."""
-    frames, height, width = clean.clip.tissue.shape
-    drops = drops_over(height, width, level, clean.px, random)
-    rgb = np.stack([drops.over(picture, index / frames) for index, picture in enumerate(clean.clip.rgb)])
-    return given(clean, dataclasses.replace(clean.clip, rgb=rgb))
+    return given(clean, with_splash(clean.clip, level, random))
+
+
+def with_splash(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
+    """The clip with drops of its own before each eye, which cover `level` of its picture in the end."""
+    right = clip.right and _splashed(clip.right, level, random)
+    return dataclasses.replace(_splashed(clip, level, random), right=right)
+
+
+def _splashed(eye: EyeOrClip, level: float, random: np.random.Generator) -> EyeOrClip:
+    frames, height, width = eye.tissue.shape
+    drops = drops_over(height, width, level, width / REFERENCE_WIDTH, random)
+    rgb = np.stack([drops.over(picture, index / frames) for index, picture in enumerate(eye.rgb)])
+    return dataclasses.replace(eye, rgb=rgb)
 
 
 def splash_stereo(clean: CleanClip, level: float, random: np.random.Generator) -> Given:

@@ -1,0 +1,235 @@
+"""Drops on the lens of an eye: parts of its picture that lose their fine detail for a time, unlike the other eye's.
+
+Symbols: T frames, S of them measured, H W pixels, h w blocks, F frames of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.clip.field_of_view import Mask
+from intrasplat.clip.split import spread
+from intrasplat.machine.mapped import let_go
+from intrasplat.notices import Notice, NoticeCode
+
+Reals = NDArray[np.float64]
+TissueOf = Callable[[int], Mask | None]
+"""The tissue [H, W] of a frame; None: the whole picture."""
+
+MEASURED_FRAMES, MIN_FRAMES = 48, 12
+ANALYSED_WIDTH, BLOCK_PX = 320, 8
+"""Pictures are shrunk to at least this width; a block is a fortieth of it."""
+FINE_PX = 2.0
+"""Standard deviation of the blur, in pixels of the shrunk picture, below which detail is fine."""
+NOISE_LEVELS = 0.5
+"""Added to the detail of a block, so that noise alone does not vary."""
+WHOLE = 0.99
+"""Least share of a block that is tissue."""
+MIN_RUN, MIN_REST = 1 / 6, 1 / 8
+"""Shares of the measured frames: with a drop and without it, at least."""
+SEED, GROWN, MIN_SEEDS = 1.5, 1.0, 4
+"""Fall of the logarithm of detail within a drop, and at its edge; least number of connected blocks of the first. In
+clean clips at most two connected blocks lie above SEED; under drops of blood or water the median is 1.9 to 2.4."""
+MAX_DROPS = 8
+MIN_BOTH = 0.5
+"""Where the other eye's detail falls by this share of it, wherever the same tissue may be, the scene changed. Also the
+least share of a drop's blocks that the other eye has in view there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splash:
+    """A drop on the lens of one eye.
+
+    shown        [H, W] the pixels of that eye's picture that it covers
+    first, last  frames
+    """
+
+    shown: Mask
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Splashes:
+    """The drops on the lenses of a clip's eyes."""
+
+    left: tuple[Splash, ...] = ()
+    right: tuple[Splash, ...] = ()
+
+    def covered(self, frame: int, *, right: bool = False) -> Mask | None:
+        """The pixels [H, W] of an eye that drops cover in a frame; None: there are none."""
+        shown = [each.shown for each in (self.right if right else self.left) if each.first <= frame <= each.last]
+        return np.logical_or.reduce(shown) if shown else None
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """The assumption for the report, where there is a drop."""
+        if not self.left and not self.right:
+            return ()
+        drops = [
+            f"{np.mean(each.shown):.1%} of the {eye} eye's picture in frames {each.first} to {each.last}"
+            for eye, splashes in (("left", self.left), ("right", self.right))
+            for each in splashes
+        ]
+        text = f"splashes on the lens: {', '.join(drops)}; nothing is read there"
+        return (Notice.info(NoticeCode.SPLASHES, text),)
+
+
+def falls(detail: Reals) -> tuple[Reals, NDArray[np.int64]]:
+    """The largest fall [h, w] of mean detail in a run of frames beside all others, and that run's [2, h, w] bounds.
+
+    detail: [S, h, w] logarithms; NaN where tissue is not in view.
+    """
+    count = len(detail)
+    known = np.isfinite(detail)
+    sums, counts = (
+        np.concatenate([np.zeros((1, *detail.shape[1:])), np.cumsum(each, axis=0)])
+        for each in (np.where(known, detail, 0), known)
+    )
+    shortest, rest = max(1, round(MIN_RUN * count)), max(1, round(MIN_REST * count))
+    best, bounds = np.zeros(detail.shape[1:]), np.zeros((2, *detail.shape[1:]), np.int64)
+    for first in range(count - shortest + 1):
+        ends = np.arange(first + shortest, count + 1)
+        inside, outside = counts[ends] - counts[first], counts[-1] - counts[ends] + counts[first]
+        within = (sums[ends] - sums[first]) / np.maximum(inside, 1)
+        without = (sums[-1] - sums[ends] + sums[first]) / np.maximum(outside, 1)
+        fall = np.where((inside >= shortest) & (outside >= rest), without - within, 0)
+        chosen = fall.argmax(axis=0)
+        largest = np.take_along_axis(fall, chosen[None], axis=0)[0]
+        better = largest > best
+        best[better] = largest[better]
+        bounds[0, better], bounds[1, better] = first, ends[0] + chosen[better]
+    return best, bounds
+
+
+def find_splashes(
+    eyes: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    tissue: tuple[TissueOf, TissueOf],
+    frames: Sequence[int],
+    disparities_px: tuple[float, float],
+    pool: Executor,
+) -> Splashes:
+    """The drops on the lenses of a clip's eyes.
+
+    A drop that is there from the first frame to the last is not found.
+
+    Args:
+        eyes: [T, H, W, 3] of the left and the right eye.
+        tissue: of each eye, as far as masks and the field of view show it.
+        frames: those that may be measured, rising.
+        disparities_px: the least and the largest x_left - x_right of the scene.
+    """
+    measured = spread(frames, MEASURED_FRAMES)
+    count, height, width = eyes[0].shape[:3]
+    side = max(1, width // ANALYSED_WIDTH)
+    block = side * BLOCK_PX
+    if len(measured) < MIN_FRAMES or min(height, width) < block:
+        return Splashes()
+    jobs = [
+        [pool.submit(_detail, rgb, masks, index, side) for index in measured]
+        for rgb, masks in zip(eyes, tissue, strict=True)
+    ]
+    left, right = (np.stack([job.result() for job in each]) for each in jobs)
+    least, most = int(np.floor(disparities_px[0] / block)), int(np.ceil(disparities_px[1] / block))
+    bounds = [*measured, count]
+
+    def splashes(own: Reals, other: Reals, shifts: range) -> Iterator[Splash]:
+        for part, first, last in _parts(own):
+            comparisons = (
+                slice(None),
+                _around_an_end(first, last, len(own)),
+            )  # drops come at other times on other lenses
+            if not all(_falls_too(part, own, other, slice(first, last), frames, shifts) for frames in comparisons):
+                shown = np.zeros((height, width), np.bool_)
+                wide = cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8))
+                rows, columns = (length * block for length in part.shape)
+                shown[:rows, :columns] = np.kron(wide, np.ones((block, block), np.uint8)) > 0
+                shown[rows:], shown[:, columns:] = shown[rows - 1], shown[:, columns - 1 : columns]
+                yield Splash(shown, bounds[first - 1] + 1 if first else 0, bounds[last] - 1)
+
+    in_right, in_left = range(-most, -least + 1), range(least, most + 1)
+    return Splashes(tuple(splashes(left, right, in_right)), tuple(splashes(right, left, in_left)))
+
+
+def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> Reals:
+    """[h, w] logarithm of a frame's fine detail, beside its median; NaN where a block is not tissue alone."""
+    rows, columns = (length // (side * BLOCK_PX) for length in rgb.shape[1:3])
+    used = np.s_[: rows * BLOCK_PX * side, : columns * BLOCK_PX * side]
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb[index][used]), cv2.COLOR_RGB2GRAY)
+    let_go(rgb[index])
+    small = cv2.resize(grey, (columns * BLOCK_PX, rows * BLOCK_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
+    fine = cv2.resize(
+        (small - cv2.GaussianBlur(small, (0, 0), FINE_PX)) ** 2, (columns, rows), interpolation=cv2.INTER_AREA
+    )
+    detail = np.log(fine.astype(np.float64) + NOISE_LEVELS**2) / 2
+    mask = tissue(index)
+    if mask is not None:
+        shown = cv2.resize(mask[used].astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+        detail[shown < WHOLE] = np.nan
+    return np.asarray(detail - np.nanmedian(detail)) if np.isfinite(detail).any() else detail
+
+
+def _around_an_end(first: int, last: int, count: int) -> slice:
+    """The shortest run of frames, of `count`, before and after the start of a run, or of its end if it starts first."""
+    shortest = max(1, round(MIN_RUN * count))
+    end = first if first else last
+    return slice(max(0, end - shortest), end + shortest)
+
+
+def _fall(detail: Reals, run: slice, frames: slice = slice(None)) -> Reals:
+    """[h, w] fall of the mean detail [S, h, w] in a run beside all others of these frames; NaN: not known."""
+    inside, compared = np.zeros((2, len(detail)), np.bool_)
+    inside[run], compared[frames] = True, True
+    return _mean(detail[compared & ~inside]) - _mean(detail[compared & inside])
+
+
+def _mean(detail: Reals) -> Reals:
+    """[h, w] mean over frames of detail [F, h, w]; NaN where it is known in less than half of them."""
+    known = np.isfinite(detail)
+    counts = known.sum(axis=0)
+    return np.where(
+        counts >= max(1, len(detail) / 2), np.where(known, detail, 0).sum(axis=0) / np.maximum(counts, 1), np.nan
+    )
+
+
+def _parts(detail: Reals) -> Iterator[tuple[NDArray[np.bool_], int, int]]:
+    """Connected blocks [h, w] whose detail [S, h, w] falls in the same run of frames, and the run's first and end."""
+    best, bounds = falls(detail)
+    for _ in range(MAX_DROPS):
+        row, column = divmod(int(best.argmax()), best.shape[1])
+        if best[row, column] < SEED:
+            return
+        first, last = map(int, bounds[:, row, column])
+        fall = np.nan_to_num(_fall(detail, slice(first, last)))
+        _, label = cv2.connectedComponents((fall > GROWN).astype(np.uint8), connectivity=4)
+        part = (label == label[row, column]) & (fall > GROWN)
+        best[part] = 0
+        best[row, column] = 0
+        _, seeds = cv2.connectedComponents((part & (fall > SEED)).astype(np.uint8), connectivity=4)
+        if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS:
+            yield part, first, last
+
+
+def _falls_too(part: NDArray[np.bool_], own: Reals, other: Reals, run: slice, frames: slice, shifts: range) -> bool:
+    """Whether a part's detail falls in the other eye too, or may do so out of its view, beside all others of `frames`.
+
+    part: [h, w] of one eye. own, other: [S, h, w] detail. shifts: columns by which its tissue may lie to the right in
+    the other eye.
+    """
+    rows, columns = np.nonzero(part)
+    falls, theirs = _fall(own, run, frames)[part], _fall(other, run, frames)
+    least = MIN_BOTH * float(np.median(falls[np.isfinite(falls)])) if np.isfinite(falls).any() else 0.0
+    for shift in shifts:
+        moved = columns + shift
+        within = (moved >= 0) & (moved < part.shape[1])
+        seen = theirs[rows[within], moved[within]]
+        seen = seen[np.isfinite(seen)]
+        if len(seen) < MIN_BOTH * len(rows) or np.median(seen) > least:
+            return True
+    return False
