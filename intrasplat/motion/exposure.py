@@ -9,14 +9,17 @@ Symbols: T frames, H W pixels, K training frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
+from intrasplat.machine.cores import cores
 from intrasplat.motion.lifted import cell_means
 from intrasplat.motion.recoloured import EyeOrClip, recoloured
 from intrasplat.motion.tracks import Tracks
@@ -85,29 +88,57 @@ def _measurements(
 ) -> Iterator[tuple[int, int, Reals, float]]:
     """A keyframe, a frame (indices into train), log gains [3] of the one against the other, share of cells measured."""
     for each in tracks:
-        for place, row, _, good, ratio in measured_cells(clip, train, each):
-            each.let_go(row)
-            if good.sum() >= MIN_CELLS:
-                log_gain = np.median(np.log(ratio[good]), axis=0).astype(np.float64)
-                yield each.reference, place, log_gain, float(good.mean())
+        for place, log_gain, share in measured_cells(clip, train, each, _gain):
+            yield each.reference, place, log_gain, share
+
+
+def _gain(cells: Measured) -> tuple[int, Reals, float] | None:
+    if cells.good.sum() < MIN_CELLS:
+        return None
+    log_gain = np.median(np.log(cells.ratio[cells.good]), axis=0).astype(np.float64)
+    return cells.place, log_gain, float(cells.good.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Some cells of a keyframe in a tracked frame.
+
+    place, row  the frame's index in the training frames, and in the tracks
+    some        the cells of the grid, about MAX_CELLS of them
+    good        [...] bool, which of those are measured
+    ratio       [..., 3] colour there / colour in the keyframe
+    """
+
+    place: int
+    row: int
+    some: tuple[slice, slice]
+    good: NDArray[np.bool_]
+    ratio: NDArray[np.float32]
+
+
+Value = TypeVar("Value")
 
 
 def measured_cells(
-    clip: DepthClip, train: Sequence[int], tracks: Tracks
-) -> Iterator[tuple[int, int, tuple[slice, slice], NDArray[np.bool_], NDArray[np.float32]]]:
-    """Of each tracked frame but the keyframe: its index in train and its row of tracks; about MAX_CELLS of the grid's
-    cells, as two slices; which of those are measured, and colour there / colour in the keyframe [..., 3].
-    """
+    clip: DepthClip, train: Sequence[int], tracks: Tracks, measure: Callable[[Measured], Value | None]
+) -> Iterator[Value]:
+    """What `measure`, which several threads call, makes of each tracked frame but the keyframe, without None."""
     start = cell_means(clip.rgb[train[tracks.reference]], tracks.step_px).astype(np.float32) / np.float32(255)
     step = max(1, round(math.sqrt(start[..., 0].size / MAX_CELLS)))
     some = np.s_[::step, ::step]
     start = start[some]
-    for row, place in enumerate(tracks.followed.tolist()):
-        if place != tracks.reference:
-            there = start + tracks.colour[row][some]
-            low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
-            good = (tracks.confidence[row][some] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
-            yield place, row, some, good, there / np.maximum(start, np.float32(1e-6))
+
+    def measured(row: int, place: int) -> Value | None:
+        there = start + tracks.colour[row][some]
+        low, high = np.minimum(start, there).min(axis=-1), np.maximum(start, there).max(axis=-1)
+        good = (tracks.confidence[row][some] > MIN_CONFIDENCE) & (low > MIN_LEVEL) & (high < MAX_LEVEL)
+        found = measure(Measured(place, row, some, good, there / np.maximum(start, np.float32(1e-6))))
+        tracks.let_go(row)
+        return found
+
+    others = [(row, place) for row, place in enumerate(tracks.followed.tolist()) if place != tracks.reference]
+    with ThreadPoolExecutor(cores()) as pool:
+        yield from (each for each in pool.map(lambda other: measured(*other), others) if each is not None)
 
 
 def in_steady_light(clip: DepthClip, exposure: Exposure) -> DepthClip:

@@ -149,17 +149,26 @@ def find_veils(
 def _is_veiled(keys: Sequence[_Cells]) -> bool:
     """Whether offsets explain changes of colour along the tracks better than light does, and vary in the picture."""
     grey = np.full(3, 0.8, np.float32)
-    spreads, with_veil, with_light, trusted = list[float](), 0.0, 0.0, 0.0
-    for key in keys:
-        for seen in key.all_seen(key.sampled):
-            fit = _split(key.rgb, seen.rgb, seen.trust, grey, SEARCH_CELLS)
-            covered = fit.cover > MIN_COVER
-            if covered.any():
-                spreads.append(float(fit.offset[covered].std()))
-                with_veil += float((seen.trust * np.minimum(fit.squares, LOST)).sum())
-                with_light += float((seen.trust * np.minimum(_light_squares(key.rgb, seen), LOST)).sum())
-                trusted += float(seen.trust.sum())
-    if not spreads or with_veil > MAX_LOST * LOST * trusted:
+
+    def compare(sampled: tuple[_Cells, int]) -> tuple[float, float, float, float] | None:
+        """Spread of b, squares with a veil and with light, and trust; None: too few cells."""
+        key, row = sampled
+        seen = key.seen(row)
+        fit = _split(key.rgb, seen.rgb, seen.trust, grey, SEARCH_CELLS)
+        covered = fit.cover > MIN_COVER
+        if seen.trust.sum() <= MIN_CELLS or not covered.any():
+            return None
+        veil, light = (np.minimum(each, LOST) for each in (fit.squares, _light_squares(key.rgb, seen)))
+        spread_of, trust = float(fit.offset[covered].std()), seen.trust
+        return spread_of, float((trust * veil).sum()), float((trust * light).sum()), float(trust.sum())
+
+    with ThreadPoolExecutor(cores()) as pool:
+        found = [each for each in pool.map(compare, ((key, row) for key in keys for row in key.sampled)) if each]
+    if not found:
+        return False
+    spreads, *sums = zip(*found, strict=True)
+    with_veil, with_light, trusted = map(sum, sums)
+    if with_veil > MAX_LOST * LOST * trusted:
         return False
     return float(np.median(spreads)) > MIN_SPREAD and with_veil < MAX_RESIDUAL**2 * with_light
 

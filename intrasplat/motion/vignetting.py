@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
-from intrasplat.motion.exposure import MIN_CELLS, measured_cells
+from intrasplat.motion.exposure import MIN_CELLS, Measured, measured_cells
 from intrasplat.motion.lifted import PointGrid
 from intrasplat.motion.recoloured import EyeOrClip, recoloured
 from intrasplat.motion.tracks import Tracks
@@ -106,16 +107,22 @@ def _pairs(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks]) -> I
         depth_mm = depth_mm[: grid.size[1], : grid.size[0]]
         pose = clip.world_from_camera[key]
         world_mm = (grid.rays * depth_mm[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-        start = log_cosine(grid.rays)
-        for place, row, some, good, ratio in measured_cells(clip, train, each):
-            there = clip.world_from_camera[train[place]]
-            moved_mm = (world_mm + each.displacement_mm[row])[some] - there[:3, 3]
-            known = good & (depth_mm > 0)[some]
-            each.let_go(row)
-            if known.sum() >= MIN_CELLS:
-                angle = (log_cosine(moved_mm @ there[:3, :3]) - start[some])[known]
-                change = np.log(ratio[known]).mean(axis=-1, dtype=np.float64)
-                yield angle - np.median(angle), change - np.median(change)
+        world_mm[depth_mm <= 0] = np.nan
+        change = partial(_change, clip, train, each, world_mm, log_cosine(grid.rays))
+        yield from measured_cells(clip, train, each, change)
+
+
+def _change(
+    clip: DepthClip, train: Sequence[int], tracks: Tracks, world_mm: Reals, start: Reals, cells: Measured
+) -> tuple[Reals, Reals] | None:
+    """world_mm [h, w, 3], start [h, w]: a keyframe's points, NaN without depth, and their log cosines."""
+    there, known = clip.world_from_camera[train[cells.place]], cells.good & np.isfinite(world_mm[cells.some][..., 0])
+    if known.sum() < MIN_CELLS:
+        return None
+    moved_mm = (world_mm + tracks.displacement_mm[cells.row])[cells.some][known] - there[:3, 3]
+    angle = log_cosine(moved_mm @ there[:3, :3]) - start[cells.some][known]
+    darker = np.log(cells.ratio[known]).mean(axis=-1, dtype=np.float64)
+    return angle - np.median(angle), darker - np.median(darker)
 
 
 def _thinned(tracks: Tracks, every: int) -> Tracks:

@@ -170,6 +170,8 @@ class FrameWork:
         """Transfer a frame's depth to the right eye, drop it beside instruments, and count pixels."""
         left, right, registration = self.matched, self.right, self.registration
         focal_baseline, offset_px = self.clip.intrinsics.fx * self.clip.baseline_mm, self.clip.disparity_offset_px
+        if (covered := self.splashes.covered(i)) is not None:
+            left.depth_mm[i][covered], left.depth_confidence[i][covered] = 0, 0
         if (supported := self._supported(i)) is not None:
             unseen = seen_nowhere(left.depth_mm[i], focal_baseline, offset_px, supported)
             left.depth_mm[i][unseen], left.depth_confidence[i][unseen] = 0, 0
