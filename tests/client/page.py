@@ -44,7 +44,7 @@ from intrasplat.names import CURVE, MANIFEST, REPORT, Eye
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
 from intrasplat.pose import OrbitPose
-from intrasplat.report import Report
+from intrasplat.report import LightChanges, Report
 from intrasplat.scene.checkpoint import save_scene
 from intrasplat.scene.scene import TrainedScene
 from service.app import create_app
@@ -92,6 +92,9 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
         "warnings": (a_warning("The clip is short."),),
         "assumptions": (Notice.info(NoticeCode.MASKS, "Bright in the masks is the instrument."),),
         "seconds": {"t_train_s": 12.5},
+        "light": LightChanges(
+            reference=3, stops=(0.5,) * 12, red=(1.1,) * 12, blue=(0.9,) * 12, smoke_share=(0.2,) * 12, vignetting=0.6
+        ),
     }
 )
 
