@@ -177,6 +177,7 @@ export const DE = {
   "picture": {
     "guesses": "Vermutungen gezeigt",
     "no_highlights": "ohne Glanzlichter",
+    "recorded_light": "im Licht der Aufnahme",
     "guessed": "Ein Teil dieser Ansicht wurde nie gesehen; er ist geraten."
   },
   "screen": {

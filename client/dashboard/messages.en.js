@@ -177,6 +177,7 @@ export const EN = {
   "picture": {
     "guesses": "guesses shown",
     "no_highlights": "without highlights",
+    "recorded_light": "in the light of the recording",
     "guessed": "Part of this view was never seen; it is a guess."
   },
   "screen": {

@@ -40,7 +40,7 @@ from contract.wire.rendering import (
     SceneRequest,
     WorkerAddress,
 )
-from intrasplat.names import CURVE, MANIFEST, REPORT, Eye
+from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
 from intrasplat.pose import OrbitPose
@@ -131,6 +131,8 @@ class Painter:
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
         self.eye: Eye = "left"
+        self.light: tuple[Light, Smoke] = ("steady", "remove")
+        """Of the newest picture."""
         self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
@@ -145,6 +147,7 @@ class Painter:
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
         self.shown_unseen, self.shown_highlights, self.eye = request.unseen, request.highlights, request.eye
+        self.light = (request.light, request.smoke)
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
         warnings = list(self.warnings)
         if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:
