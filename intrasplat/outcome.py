@@ -74,6 +74,7 @@ def _right_eye_mm(run: Run) -> tuple[float, float, float] | None:
 
 def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None) -> Training:
     """The run's part of the report: settings, choices with their reasons, durations, warnings and versions."""
+    light = run.light.changes(run.setup.clip)
     return Training(
         preset=run.preset.name,
         eyes=run.trained_eyes,
@@ -86,8 +87,9 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         scene_bytes=scene.file_bytes,
         units_per_mm=scene.units_per_mm,
         seconds=dict(run.setup.timings.seconds),
+        light=light,
         assumptions=(
-            *run.light.notices(run.setup.clip),
+            *run.light.notices(light),
             *run.chosen,
             *run.schedule.notices,
             *(quantized.notices if quantized else (_floats(scene),)),

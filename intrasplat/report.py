@@ -117,6 +117,39 @@ class FieldOfView(BaseModel):
     label_share: float = Field(default=0.0, ge=0, le=1, description="share of the picture under labels and menus")
 
 
+class LightChanges(BaseModel):
+    """Changes of the light in the left eye's pictures, by frame, that the model is without (docs/conventions.md).
+
+    A frame that was not trained on has values interpolated in time.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    reference: int | None = Field(
+        default=None, ge=0, description="frame whose exposure and white balance the model has; None: they hardly change"
+    )
+    stops: tuple[float, ...] | None = Field(
+        default=None, description="exposure of every frame against that of reference, in stops; None as there"
+    )
+    red: tuple[float, ...] | None = Field(
+        default=None,
+        description="white balance: the gain of recorded red over that of green in every frame, against reference; "
+        "None as there",
+    )
+    blue: tuple[float, ...] | None = Field(default=None, description="the same of blue")
+    smoke_share: tuple[float, ...] | None = Field(
+        default=None,
+        description="mean share of the tissue's light that smoke takes in every frame; None: none was found",
+    )
+    vignetting: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="brightness of tissue at the border over that in the middle, where it differs most; None: the "
+        "border is hardly darker, or the camera does not move",
+    )
+
+
 class CameraPoses(BaseModel):
     """Where the endoscope was. Tissue that moves as a whole looks like a camera that moves the other way; what of the
     common motion follows the course of the tissue's own deformation was taken to be the tissue's.
@@ -224,6 +257,9 @@ class Report(BaseModel):
     masks: Masks | None = Field(default=None, description="how instruments were masked; None: a report of version 0.2")
     field_of_view: FieldOfView | None = Field(
         default=None, description="what of the pictures shows the scene; None: a report of version 0.3"
+    )
+    light: LightChanges | None = Field(
+        default=None, description="its changes, which the model is without; None: it hardly changes, or an older report"
     )
     poses: CameraPoses | None = Field(default=None, description="the endoscope's path; None: a report of version 0.2")
     recorded: Recorded | None = Field(

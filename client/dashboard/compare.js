@@ -1,5 +1,5 @@
 // The recorded frame beside or over the model's picture of the same moment. Both show the same only from the
-// endoscope's own pose: choosing it goes there, and turning away ends it.
+// endoscope's own pose and in the light of the recording: choosing it goes there, and turning away ends it.
 
 import { setText } from "./element.js";
 import { languageEvents, words } from "./messages.js";
@@ -67,7 +67,7 @@ export class Compare {
     if (mode === "off") return this.#end("");
     if (!this.report) return this.#end(words("compare.not_yet"));
     if (!this.report.recorded) return this.#end(words("compare.none"));
-    if (this.mode === "off") this.isComing = true; // until the view from home is there
+    if (this.mode === "off") this.isComing = true; // until the view from home, as recorded, is there
     this.mode = this.parts.mode.value = mode;
     this.#say("");
     this.parts.stage.dataset.compare = mode;
@@ -76,7 +76,7 @@ export class Compare {
     this.#moveSeam(MIDDLE);
     this.#draw();
     const { orbit, parts } = this.viewer;
-    const wish = parts.layer.value === "recorded" ? { layer: "rgb" } : {};
+    const wish = { light: "recorded", ...(parts.layer.value === "recorded" ? { layer: "rgb" } : {}) };
     this.viewer.look(orbit.isHome ? wish : { ...wish, pose: null }); // at home either eye may stay
   }
 
@@ -90,6 +90,7 @@ export class Compare {
     this.parts.box.hidden = this.parts.tools.closest("label").hidden = true;
     this.parts.canvas.width = this.parts.canvas.height = 0; // its pixels are gone, not only hidden
     this.#say(why);
+    if (this.viewer.light === "recorded") this.viewer.look({ light: "steady" });
   }
 
   /** @param {string} text for a while: it lies over the picture */
@@ -100,10 +101,10 @@ export class Compare {
   }
 
   /** @param {import("./viewer.js").Shown} shown */
-  #follow({ scene, t, pose, layer, eye }) {
+  #follow({ scene, t, pose, layer, eye, light }) {
     if (this.mode === "off" || scene !== this.scene) return;
     const isHome = pose === null && layer !== "recorded";
-    if (!isHome && this.isComing) return;
+    if (this.isComing && !(isHome && light === "recorded")) return;
     if (!isHome) return this.#end(layer === "recorded" ? "" : words("compare.turned"));
     this.isComing = false;
     const { recorded, frame_count: frameCount } = this.report;

@@ -20,6 +20,7 @@ import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
 import { listenToKeys, onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
+import { drawStrip } from "./lightstrip.js";
 import { Measure } from "./measure.js";
 import { languageEvents, showWords, words } from "./messages.js";
 import { hush, prepareNews } from "./news.js";
@@ -108,6 +109,7 @@ function view(id, message) {
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
   say(words("page.report_of"));
   drawCurve(get("curve"), [], []);
+  drawStrip(get("light-strip"), null);
   showJobs();
 }
 
@@ -119,6 +121,7 @@ async function report(id) {
     if (!isStill()) return;
     compare.know(id, found);
     showReport(get("report"), id, found, sendMasks);
+    drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
     drawCurve(get("curve"), pointsOfCsv(csv), baselinesOf(found));

@@ -53,11 +53,11 @@ export class Memory extends EventTarget {
 
   /**
    * Why the service draws a view; null: this browser does.
-   * @param {Pick<View, "scene" | "layer" | "eye">} view
+   * @param {Pick<View, "scene" | "layer" | "eye" | "light">} view
    * @param {"running"|"done"|undefined} state of what is shown
    * @returns {string | null} a code
    */
-  whyNot({ scene, layer, eye = "left" }, state) {
+  whyNot({ scene, layer, eye = "left", light = "steady" }, state) {
     if (this.choice === "never") return "never";
     const found = graphics();
     if (!found.canDraw || (!found.isFast && this.choice !== "always")) return found.why;
@@ -66,6 +66,7 @@ export class Memory extends EventTarget {
     if (!this.mayDownload()) return "no_scope";
     if (this.refused) return this.refused;
     if (this.player === null || this.scene !== scene) return "loading";
+    if (light === "recorded" && this.player.hasRecordedLight) return "layer";
     return layer === "rgb" && eye === "left" ? null : "layer"; // the right eye's lens is known to the service alone
   }
 

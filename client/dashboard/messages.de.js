@@ -177,6 +177,7 @@ export const DE = {
   "picture": {
     "guesses": "Vermutungen gezeigt",
     "no_highlights": "ohne Glanzlichter",
+    "recorded_light": "im Licht der Aufnahme",
     "guessed": "Ein Teil dieser Ansicht wurde nie gesehen; er ist geraten."
   },
   "screen": {
@@ -357,6 +358,16 @@ export const DE = {
     "send_masks": "Masken senden",
     "send_better_masks": "Bessere Masken senden",
     "how_to_correct": "So werden Masken besser: speichern, Instrumente weiß und Gewebe schwarz malen, senden. Der Clip selbst muss nicht noch einmal gesendet werden."
+  },
+  "strip": {
+    "title": "Licht der Aufnahme",
+    "name": "Licht im Verlauf des Clips.",
+    "where": "Unter dem Zeitregler: die Belichtung als Linie, Rauch als Fläche.",
+    "stops": "Belichtung: {low} bis {high} Blendenstufen gegenüber Bild {frame}, dessen Licht das Modell hat.",
+    "red": "Weißabgleich: Rot im Verhältnis zu Grün ist {low}- bis {high}-mal das von Bild {frame}.",
+    "blue": "Weißabgleich: Blau im Verhältnis zu Grün ist {low}- bis {high}-mal das von Bild {frame}.",
+    "smoke": "Rauch nimmt {low} bis {high} des Lichts, im Mittel {mean}, und ist herausgerechnet.",
+    "border": "Der Rand des Bildes ist mit {share} seiner Helligkeit aufgenommen; das Modell ist gleichmäßig beleuchtet."
   },
   "figure": {
     "everything": "Alle Zahlen mit ihren Namen",

@@ -177,6 +177,7 @@ export const EN = {
   "picture": {
     "guesses": "guesses shown",
     "no_highlights": "without highlights",
+    "recorded_light": "in the light of the recording",
     "guessed": "Part of this view was never seen; it is a guess."
   },
   "screen": {
@@ -357,6 +358,16 @@ export const EN = {
     "send_masks": "Send masks",
     "send_better_masks": "Send better masks",
     "how_to_correct": "To correct the masks: save them, paint instruments white and tissue black, and send them. The clip itself need not be sent again."
+  },
+  "strip": {
+    "title": "Light of the recording",
+    "name": "Light over the clip.",
+    "where": "Under the time slider: exposure as a line, smoke as an area.",
+    "stops": "Exposure: {low} to {high} stops against frame {frame}, whose light the model has.",
+    "red": "White balance: red against green is {low} to {high} times that of frame {frame}.",
+    "blue": "White balance: blue against green is {low} to {high} times that of frame {frame}.",
+    "smoke": "Smoke takes {low} to {high} of the light, {mean} on average, and is left out.",
+    "border": "The border of the picture is recorded at {share} of its brightness; the model is evenly lit."
   },
   "figure": {
     "everything": "All figures by their names",

@@ -5,6 +5,7 @@ import { download } from "./downloads.js";
 import { button, element } from "./element.js";
 import { figuresOf, percent } from "./figures.js";
 import { lightMark, reasonsOf, trustOf } from "./light.js";
+import { lightList } from "./lightstrip.js";
 import { figure, noticeWords, words } from "./messages.js";
 
 /** @typedef {import("./wire.js").Report} Report */
@@ -78,6 +79,7 @@ export function showReport(target, id, report, onMasks) {
     element("h3", { text: words("report.trusted") }),
     listOf(trusted(report), "trusted"),
     ...careful(report, trust),
+    ...lightList(report.light),
     figures,
     ...correction(id, report, message, onMasks),
     message,

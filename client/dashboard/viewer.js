@@ -26,7 +26,7 @@ const COARSE = "coarse";
  * camera: null where it is not known, as of recorded frames; way: how the picture came; isMoving: it was drawn at once, perhaps
  * with its Gaussians sorted for the view before, and an exact picture follows.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
- *   highlights: "on"|"off", state: "running"|"done", way: "stream"|"single"|"memory",
+ *   highlights: "on"|"off", light: "steady"|"recorded", state: "running"|"done", way: "stream"|"single"|"memory",
  *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null, isMoving: boolean}} Shown
  */
 /** Not a layer of the model, but what the endoscope saw. */
@@ -58,6 +58,8 @@ export class Viewer extends EventTarget {
     this.isConfirming = false;
     this.isMoving = false;
     this.wishedAt = 0;
+    /** @type {"steady"|"recorded"} recorded: as the moment was recorded, through its smoke, too */
+    this.light = "steady";
     this.orbit = new Orbit(() => this.timeline.t);
     this.pace = new Pace();
     this.pictures = new Pictures();
@@ -88,6 +90,7 @@ export class Viewer extends EventTarget {
     this.pictures.giveUp(); // the other scene's
     this.memory.open(scene);
     this.orbit.goHome();
+    this.light = "steady";
     this.shown = null;
     this.screen.clear(scene, message);
     this.dispatchEvent(new Event("gone")); // what was measured or compared in it goes, too
@@ -100,10 +103,12 @@ export class Viewer extends EventTarget {
 
   /**
    * Look elsewhere; what is left out stays.
-   * @param {{t?: number, pose?: string | null, layer?: string, unseen?: "mark"|"guess", highlights?: "on"|"off"}} wish
+   * @param {{t?: number, pose?: string | null, layer?: string, unseen?: "mark"|"guess", highlights?: "on"|"off",
+   *   light?: "steady"|"recorded"}} wish
    */
-  look({ t, pose, layer, unseen, highlights }) {
+  look({ t, pose, layer, unseen, highlights, light }) {
     const { parts } = this;
+    if (light !== undefined) this.light = light;
     if (pose !== undefined && !this.orbit.stand(pose)) this.dispatchEvent(new Event("refused"));
     if (layer !== undefined) parts.layer.value = layer;
     if (unseen !== undefined) parts.guess.checked = unseen === "guess";
@@ -185,8 +190,9 @@ export class Viewer extends EventTarget {
     const guesses = this.parts.guess.checked ? `, ${words("picture.guesses")}` : "";
     const view = this.#view(scene);
     const highlights = view.highlights === "off" ? `, ${words("picture.no_highlights")}` : "";
+    const light = view.light ? `, ${words("picture.recorded_light")}` : "";
     const layer = this.parts.layer.selectedOptions[0].text;
-    const name = view.layer === RECORDED ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}`;
+    const name = view.layer === RECORDED ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}${light}`;
     const isDrawnHere = this.#isDrawnHere;
     try {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
@@ -235,6 +241,7 @@ export class Viewer extends EventTarget {
     };
     if (this.orbit.pose) view.pose = this.orbit.pose;
     else if (this.orbit.eye === "right") view.eye = "right";
+    if (this.light === "recorded") Object.assign(view, { light: "recorded", smoke: "show" });
     return view;
   }
 
@@ -267,7 +274,7 @@ export class Viewer extends EventTarget {
 }
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
-function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights }, picture) {
+function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights, light = "steady" }, picture) {
   const { t, state, way, camera, depthRangeMm, isMoving = false } = picture;
-  return { scene, t, pose, eye, layer, unseen, highlights, state, way, camera, depthRangeMm, isMoving };
+  return { scene, t, pose, eye, layer, unseen, highlights, light, state, way, camera, depthRangeMm, isMoving };
 }

@@ -138,6 +138,16 @@
  */
 /**
  * @typedef {{
+ *   reference?: number | null,
+ *   stops?: number[] | null,
+ *   red?: number[] | null,
+ *   blue?: number[] | null,
+ *   smoke_share?: number[] | null,
+ *   vignetting?: number | null,
+ * }} LightChanges
+ */
+/**
+ * @typedef {{
  *   source: "given"|"found"|"segmenter"|"none",
  *   share?: number,
  *   sure?: number | null,
@@ -230,6 +240,7 @@
  *   right_eye?: RightEye | null,
  *   masks?: Masks | null,
  *   field_of_view?: FieldOfView | null,
+ *   light?: LightChanges | null,
  *   poses?: CameraPoses | null,
  *   recorded?: Recorded | null,
  *   measurements?: Record<string, number>,

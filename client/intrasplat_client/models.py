@@ -387,6 +387,28 @@ class JobView(Model):
     links: dict[str, str]
 
 
+class LightChanges(Model):
+    """Changes of the light in the left eye's pictures, by frame, that the model is without (docs/conventions.md).
+
+    A frame that was not trained on has values interpolated in time.
+    """
+
+    reference: int | None = None
+    """frame whose exposure and white balance the model has; None: they hardly change"""
+    stops: tuple[float, ...] | None = None
+    """exposure of every frame against that of reference, in stops; None as there"""
+    red: tuple[float, ...] | None = None
+    """white balance: the gain of recorded red over that of green in every frame, against reference; None as there"""
+    blue: tuple[float, ...] | None = None
+    """the same of blue"""
+    smoke_share: tuple[float, ...] | None = None
+    """mean share of the tissue's light that smoke takes in every frame; None: none was found"""
+    vignetting: float | None = None
+    """brightness of tissue at the border over that in the middle, where it differs most; None: the border is
+    hardly darker, or the camera does not move
+    """
+
+
 class Masks(Model):
     """How instruments were distinguished from tissue."""
 
@@ -545,6 +567,8 @@ class Report(Model):
     """how instruments were masked; None: a report of version 0.2"""
     field_of_view: FieldOfView | None = None
     """what of the pictures shows the scene; None: a report of version 0.3"""
+    light: LightChanges | None = None
+    """its changes, which the model is without; None: it hardly changes, or an older report"""
     poses: CameraPoses | None = None
     """the endoscope's path; None: a report of version 0.2"""
     recorded: Recorded | None = None

@@ -46,10 +46,19 @@ class Exposure:
     reference: int
 
     @property
+    def stops(self) -> Reals:
+        """[T] exposure of every frame against the reference's, in stops."""
+        return np.asarray(self.log_gains.mean(axis=1) * TONE_POWER / np.log(2))
+
+    @property
+    def log_tints(self) -> Reals:
+        """[T, 3] logarithms of the gains of R G B against that of G."""
+        return np.asarray(self.log_gains - self.log_gains[:, 1:2])
+
+    @property
     def notice(self) -> Notice:
         """The report's sentence on the light."""
-        stops = np.ptp(self.log_gains.mean(axis=1)) * TONE_POWER / np.log(2)
-        tint = np.exp(np.ptp(self.log_gains - self.log_gains[:, 1:2], axis=0).max())
+        stops, tint = np.ptp(self.stops), np.exp(np.ptp(self.log_tints, axis=0).max())
         text = (
             f"light: exposure changes by {stops:.1f} stops and white balance by {tint:.2f} times; the model has the "
             f"light of frame {self.reference}"

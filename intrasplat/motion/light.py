@@ -13,10 +13,13 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.motion.exposure import Exposure, in_steady_light
 from intrasplat.motion.veil import Veil, notice_of, warnings_of, without_veils
-from intrasplat.motion.vignetting import Vignetting, evenly_lit
+from intrasplat.motion.vignetting import Vignetting, evenly_lit, notice_of_border
 from intrasplat.notices import Notice
+from intrasplat.report import LightChanges
 
 Floats = NDArray[np.float32]
+REPORTED_DIGITS = 3
+"""Decimals of the report's figures: finer than they are measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +35,26 @@ class RecordedLight:
     vignetting: Vignetting | None = None
     veils: tuple[Veil, ...] = ()
 
-    def notices(self, clip: DepthClip) -> Iterator[Notice]:
-        """What the report says about it."""
+    def changes(self, clip: DepthClip) -> LightChanges | None:
+        """Its figures for the report, of the left eye; None: there are none."""
+        entry = dict[str, Any]()
+        if self.exposure is not None:
+            red, _, blue = np.exp(self.exposure.log_tints).T
+            entry |= {"reference": self.exposure.reference, "stops": _rounded(self.exposure.stops)}
+            entry |= {"red": _rounded(red), "blue": _rounded(blue)}
+        if self.veils:
+            entry["smoke_share"] = _rounded(self.veils[0].share_taken())
+        if self.vignetting is not None:
+            share = self.vignetting.border_share(clip.intrinsics, np.asarray(clip.tissue.any(axis=0)))
+            entry["vignetting"] = round(share, REPORTED_DIGITS)
+        return LightChanges(**entry) if entry else None
+
+    def notices(self, changes: LightChanges | None) -> Iterator[Notice]:
+        """What the report says about it. changes: as changes() found it."""
         if self.veils:
             yield notice_of(self.veils[0])
-        if self.vignetting is not None:
-            yield self.vignetting.notice(clip.intrinsics, np.asarray(clip.tissue.any(axis=0)))
+        if changes is not None and changes.vignetting is not None:
+            yield notice_of_border(changes.vignetting)
         if self.exposure is not None:
             yield self.exposure.notice
 
@@ -89,3 +106,7 @@ class RecordedLight:
         exposure = None if gains is None else Exposure(np.array(gains[0], np.float64), int(gains[1]))
         vignetting = None if stored["vignetting"] is None else Vignetting(*map(float, stored["vignetting"]))
         return cls(exposure, vignetting, tuple(Veil.read(veil, frames) for veil in stored["veils"]))
+
+
+def _rounded(values: NDArray[np.float64]) -> tuple[float, ...]:
+    return tuple((np.round(values, REPORTED_DIGITS) + 0.0).tolist())

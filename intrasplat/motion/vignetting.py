@@ -59,11 +59,16 @@ class Vignetting:
         """The factors [H, W] of an eye's pixels."""
         return self.brightness(rays(intrinsics))
 
-    def notice(self, intrinsics: Intrinsics, tissue: NDArray[np.bool_]) -> Notice:
-        """The report's sentence on the darkening; tissue [H, W] of some frame."""
+    def border_share(self, intrinsics: Intrinsics, tissue: NDArray[np.bool_]) -> float:
+        """The least over the largest factor of the pixels that show tissue [H, W]."""
         shown = self.picture(intrinsics)[tissue]
-        text = f"light: tissue darkens towards the border to {shown.min() / shown.max():.0%}; the model is evenly lit"
-        return Notice.info(NoticeCode.VIGNETTING, text)
+        return float(shown.min() / shown.max())
+
+
+def notice_of_border(border_share: float) -> Notice:
+    """The report's sentence on the darkening."""
+    text = f"light: tissue darkens towards the border to {border_share:.0%}; the model is evenly lit"
+    return Notice.info(NoticeCode.VIGNETTING, text)
 
 
 def rays(intrinsics: Intrinsics) -> Reals:

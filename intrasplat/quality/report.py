@@ -20,7 +20,7 @@ from intrasplat.names import Eyes
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.baselines import CopyBaselines
 from intrasplat.quality.right_eye import RightScores
-from intrasplat.report import FrameScore, Report
+from intrasplat.report import FrameScore, LightChanges, Report
 from intrasplat.splat.metrics import (
     clear_of_highlights,
     coverage,
@@ -80,6 +80,7 @@ class Training:
     units_per_mm: float
     seconds: dict[str, float]
     versions: dict[str, str]
+    light: LightChanges | None = None
     assumptions: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
     measurements: dict[str, float] = field(default_factory=dict)

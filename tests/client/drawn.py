@@ -97,7 +97,8 @@ def picture_of(page: Page) -> NDArray[np.uint8]:
 def render_of(url: str, shown: dict[str, Any]) -> NDArray[np.uint8]:
     """[H, W, 3] of what the service draws of the same view, without the loss of JPEG."""
     size = {name: shown["camera"][name] for name in ("width", "height")}
-    asked = {name: shown[name] for name in ("scene", "t", "pose", "layer", "unseen", "highlights") if shown[name]}
+    names = ("scene", "t", "pose", "layer", "unseen", "highlights", "light")
+    asked = {name: shown[name] for name in names if shown[name]}
     answer = httpx.get(f"{url}/render", params={**asked, **size, "format": "npy"}, timeout=60)
     found: NDArray[np.uint8] = np.load(io.BytesIO(answer.raise_for_status().content))
     return found

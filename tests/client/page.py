@@ -40,11 +40,11 @@ from contract.wire.rendering import (
     SceneRequest,
     WorkerAddress,
 )
-from intrasplat.names import CURVE, MANIFEST, REPORT, Eye
+from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
 from intrasplat.pose import OrbitPose
-from intrasplat.report import Report
+from intrasplat.report import LightChanges, Report
 from intrasplat.scene.checkpoint import save_scene
 from intrasplat.scene.scene import TrainedScene
 from service.app import create_app
@@ -92,6 +92,9 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
         "warnings": (a_warning("The clip is short."),),
         "assumptions": (Notice.info(NoticeCode.MASKS, "Bright in the masks is the instrument."),),
         "seconds": {"t_train_s": 12.5},
+        "light": LightChanges(
+            reference=3, stops=(0.5,) * 12, red=(1.1,) * 12, blue=(0.9,) * 12, smoke_share=(0.2,) * 12, vignetting=0.6
+        ),
     }
 )
 
@@ -128,6 +131,8 @@ class Painter:
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
         self.eye: Eye = "left"
+        self.light: tuple[Light, Smoke] = ("steady", "remove")
+        """Of the newest picture."""
         self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
@@ -142,6 +147,7 @@ class Painter:
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
         self.shown_unseen, self.shown_highlights, self.eye = request.unseen, request.highlights, request.eye
+        self.light = (request.light, request.smoke)
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
         warnings = list(self.warnings)
         if isinstance(request.pose, OrbitPose) and abs(request.pose.yaw_deg) > FAR_DEG:

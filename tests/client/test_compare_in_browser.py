@@ -233,6 +233,27 @@ def test_side_by_side_each_has_half_of_the_stage(site: Site, page: Page, width: 
         assert not page.find("#seam").is_displayed()
 
 
+@pytest.mark.parametrize("mode", ["wipe", "side"])
+def test_the_model_is_drawn_as_the_moment_was_recorded_until_the_comparison_ends(
+    site: Site, page: Page, mode: str
+) -> None:
+    view(page, recorded_scene(site))
+    page.find("#stage").send_keys(Keys.ARROW_LEFT)
+    page.until(lambda: "turned" in page.view)
+    assert site.painter.light == ("steady", "remove")
+    choose(page, mode)
+    until_frame(page, 0)
+    assert site.painter.light == ("recorded", "show")
+    assert say("picture.recorded_light") in page.view
+    for _ in range(4):  # of the slider's 40 places; the report's clip has 12 frames
+        page.find("#step-on").click()
+    until_frame(page, 1)
+    assert site.painter.light == ("recorded", "show")
+    choose(page, "off")
+    page.until(lambda: site.painter.light == ("steady", "remove"))
+    page.until(lambda: say("picture.recorded_light") not in page.view)
+
+
 def test_the_right_eyes_frames_are_compared_with_what_the_right_eye_sees(site: Site, page: Page) -> None:
     view(page, recorded_scene(site, ("left", "right")))
     choose(page, "wipe")

@@ -178,6 +178,7 @@ def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewh
         "layer": "depth",
         "unseen": "mark",
         "highlights": "on",
+        "light": "steady",
         "state": "done",
         "way": way,
         "camera": CAMERA.model_dump(mode="json"),

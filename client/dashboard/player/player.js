@@ -11,6 +11,8 @@ const FAR_POSE = 0.35;
 const MAX_UNSEEN_SHARE = 0.05;
 const MAX_LOW_SHARE = 0.1;
 const ROUNDING = 1e-6;
+/** What a scene stores of the light and the smoke in which it was recorded, where the model's differ; not drawn here. */
+const RECORDED_LIGHT = ["log_gains", "vignetting", "veil"];
 const SCENE = "scene.safetensors";
 
 /**
@@ -61,6 +63,7 @@ export class Player {
     this.canvas = drawing.canvas;
     this.cameras = new Cameras(manifest);
     this.poseWarnings = manifest.settings?.pose_warnings ?? [];
+    this.hasRecordedLight = RECORDED_LIGHT.some((name) => manifest.settings?.[name] !== undefined);
     this.isClosed = false;
     /** Broken when the scene is let go of: a worker that has ended answers nobody. */
     this.closing = new Promise((_, reject) => (this.reject = reject));

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
 from intrasplat.motion.keyframes import track_keyframes
+from intrasplat.motion.light import RecordedLight
 from intrasplat.notices import NoticeCode
 from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.train.scoring import frame_renderer
@@ -94,7 +95,21 @@ def test_a_scene_shows_steady_light_or_the_recorded_one_and_resumes_with_its_gai
     np.testing.assert_allclose(
         np.clip(frame_renderer(run)(frame).rgb, 0, 1) * 255, recorded, atol=1.1
     )  # held-out scores are in the recorded light
-    assert NoticeCode.EXPOSURE in {each.code for each in training_of(run, scene, None).assumptions}
+    training = training_of(run, scene, None)
+    assert NoticeCode.EXPOSURE in {each.code for each in training.assumptions}
+    assert training.light is not None
+    assert training.light.smoke_share is training.light.vignetting is None
+    stops = run.light.exposure.log_gains.mean(axis=1) / (np.log(2) / 2.2)
+    assert training.light.stops == pytest.approx(stops, abs=5.1e-4)
+    assert training.light.stops[training.light.reference or 0] == 0
+
+
+def test_the_report_has_white_balance_as_factors_of_red_and_blue_against_green() -> None:
+    logs = np.log([[1.0, 1.0, 1.0], [2.4, 2.0, 1.8], [0.5, 0.5, 0.5]])
+    changes = RecordedLight(Exposure(logs, 0)).changes(phantom_clip())
+    assert changes is not None
+    assert (changes.reference, changes.red, changes.blue) == (0, (1, 1.2, 1), (1, 0.9, 1))
+    assert RecordedLight().changes(phantom_clip()) is None
 
 
 @pytest.mark.parametrize(

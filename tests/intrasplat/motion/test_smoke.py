@@ -167,6 +167,8 @@ def test_a_scene_is_clear_or_shows_its_smoke_and_resumes_with_it(tmp_path: Path)
     assert NoticeCode.SMOKE in {each.code for each in training.assumptions}
     report = first_report(clip, run.setup.split, training, [Notice.warning(NoticeCode.BRIGHTNESS_CHANGES, "")])
     assert NoticeCode.BRIGHTNESS_CHANGES not in {each.code for each in report.warnings}
+    assert report.light is not None
+    assert report.light.smoke_share == pytest.approx(run.light.veils[0].share_taken(), abs=5.1e-4)
 
 
 def test_a_scene_without_smoke_has_an_empty_layer() -> None:

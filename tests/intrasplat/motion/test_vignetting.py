@@ -102,7 +102,11 @@ def test_a_scene_is_evenly_lit_or_as_recorded_from_every_pose_and_resumes(tmp_pa
     ratio = recorded.rgb.mean(-1) / np.maximum(steady.rgb.mean(-1), 1)
     ratio[(steady.depth_mm == 0) | (steady.rgb.max(-1) > 180)] = np.nan
     assert np.nanmedian(ratio[:, :40]) > 1.5 * np.nanmedian(ratio[:, -40:])
-    assert NoticeCode.VIGNETTING in {each.code for each in training_of(run, scene, None).assumptions}
+    training = training_of(run, scene, None)
+    assert NoticeCode.VIGNETTING in {each.code for each in training.assumptions}
+    seen = shown[clip.tissue.any(axis=0)]
+    assert training.light is not None
+    assert training.light.vignetting == pytest.approx(seen.min() / seen.max(), abs=5.1e-4)
     assert _settings(scene)["vignetting"] == [run.light.vignetting.power, run.light.vignetting.level]
 
 
