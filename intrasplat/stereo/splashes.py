@@ -38,8 +38,9 @@ SEED, GROWN, MIN_SEEDS = 1.5, 1.0, 4
 clean clips at most two connected blocks lie above SEED; under drops of blood or water the median is 1.9 to 2.4."""
 MAX_DROPS = 8
 MIN_BOTH, MOST = 0.5, 0.7
-"""If the other eye's detail falls by MIN_BOTH of it in MOST blocks where the same tissue may be, the scene changed. With
-a MOST of 0.5, some drops that lie on both lenses by chance are missed; with 0.85, tissue that changed counts as drops."""
+"""If the other eye's detail falls by MIN_BOTH of it in MOST blocks where the same tissue may be, the scene changed.
+With a MOST of 0.5, drops that lie on both lenses by chance are missed; with 0.85, tissue that changed counts as drops.
+"""
 MIN_VIEW = 0.5
 """Least share of a drop's blocks that the other eye has in view there."""
 
