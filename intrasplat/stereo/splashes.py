@@ -140,24 +140,48 @@ def find_splashes(
     ]
     left, right = (np.stack([job.result() for job in each]) for each in jobs)
     least, most = int(np.floor(disparities_px[0] / block)), int(np.ceil(disparities_px[1] / block))
+    in_right, in_left = range(-most, -least + 1), range(least, most + 1)
+    left_parts, right_parts = list(_parts(left)), list(_parts(right))
+    on_left = _drops(left_parts, left, right, in_right)
+    on_right = _drops(right_parts, right, _without(left, on_left), in_left)
+    on_left = _drops(left_parts, left, _without(right, on_right), in_right)
     bounds = [*measured, count]
 
-    def splashes(own: Reals, other: Reals, shifts: range) -> Iterator[Splash]:
-        for part, first, last in _parts(own):
-            comparisons = (
-                slice(None),
-                _around_an_end(first, last, len(own)),
-            )  # drops come at other times on other lenses
-            if not all(_falls_too(part, own, other, slice(first, last), frames, shifts) for frames in comparisons):
-                shown = np.zeros((height, width), np.bool_)
-                wide = cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8))
-                rows, columns = (length * block for length in part.shape)
-                shown[:rows, :columns] = np.kron(wide, np.ones((block, block), np.uint8)) > 0
-                shown[rows:], shown[:, columns:] = shown[rows - 1], shown[:, columns - 1 : columns]
-                yield Splash(shown, bounds[first - 1] + 1 if first else 0, bounds[last] - 1)
+    def splash(part: Part) -> Splash:
+        shown = np.zeros((height, width), np.bool_)
+        wide = cv2.dilate(part.blocks.astype(np.uint8), np.ones((3, 3), np.uint8))
+        rows, columns = (length * block for length in wide.shape)
+        shown[:rows, :columns] = np.kron(wide, np.ones((block, block), np.uint8)) > 0
+        shown[rows:], shown[:, columns:] = shown[rows - 1], shown[:, columns - 1 : columns]
+        return Splash(shown, bounds[part.first - 1] + 1 if part.first else 0, bounds[part.end] - 1)
 
-    in_right, in_left = range(-most, -least + 1), range(least, most + 1)
-    return Splashes(tuple(splashes(left, right, in_right)), tuple(splashes(right, left, in_left)))
+    return Splashes(tuple(map(splash, on_left)), tuple(map(splash, on_right)))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Connected blocks [h, w] whose detail falls in the same run of measured frames, first to end - 1."""
+
+    blocks: NDArray[np.bool_]
+    first: int
+    end: int
+
+
+def _drops(parts: Sequence[Part], own: Reals, other: Reals, shifts: range) -> list[Part]:
+    """Those parts of an eye whose detail does not fall in the other eye, beside all frames or where the run starts."""
+    return [
+        part
+        for part in parts
+        if not all(_falls_too(part, own, other, near, shifts) for near in (slice(None), _around_an_end(part, len(own))))
+    ]
+
+
+def _without(detail: Reals, drops: Sequence[Part]) -> Reals:
+    """The detail [S, h, w] of an eye as if nothing fell under its drops: they say nothing about the tissue there."""
+    cleared = detail.copy()
+    for drop in drops:
+        cleared[:, drop.blocks] = 0
+    return cleared
 
 
 def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> Reals:
@@ -178,11 +202,11 @@ def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> 
     return np.asarray(detail - np.nanmedian(detail)) if np.isfinite(detail).any() else detail
 
 
-def _around_an_end(first: int, last: int, count: int) -> slice:
-    """The shortest run of frames, of `count`, before and after the start of a run, or of its end if it starts first."""
+def _around_an_end(part: Part, count: int) -> slice:
+    """The shortest run of frames, of `count`, before and after the start of a part, or its end if it starts first."""
     shortest = max(1, round(MIN_RUN * count))
-    end = first if first else last
-    return slice(max(0, end - shortest), end + shortest)
+    middle = part.first or part.end
+    return slice(max(0, middle - shortest), middle + shortest)
 
 
 def _fall(detail: Reals, run: slice, frames: slice = slice(None)) -> Reals:
@@ -201,8 +225,8 @@ def _mean(detail: Reals) -> Reals:
     )
 
 
-def _parts(detail: Reals) -> Iterator[tuple[NDArray[np.bool_], int, int]]:
-    """Connected blocks [h, w] whose detail [S, h, w] falls in the same run of frames, and the run's first and end."""
+def _parts(detail: Reals) -> Iterator[Part]:
+    """The parts of an eye's picture whose detail [S, h, w] falls for a time."""
     best, bounds = falls(detail)
     for _ in range(MAX_DROPS):
         row, column = divmod(int(best.argmax()), best.shape[1])
@@ -216,22 +240,22 @@ def _parts(detail: Reals) -> Iterator[tuple[NDArray[np.bool_], int, int]]:
         best[row, column] = 0
         _, seeds = cv2.connectedComponents((part & (fall > SEED)).astype(np.uint8), connectivity=4)
         if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS:
-            yield part, first, last
+            yield Part(part, first, last)
 
 
-def _falls_too(part: NDArray[np.bool_], own: Reals, other: Reals, run: slice, frames: slice, shifts: range) -> bool:
+def _falls_too(part: Part, own: Reals, other: Reals, frames: slice, shifts: range) -> bool:
     """Whether a part's detail falls in the other eye too, or may do so out of its view, beside all others of `frames`.
 
-    part: [h, w] of one eye. own, other: [S, h, w] detail. shifts: columns by which its tissue may lie to the right in
-    the other eye.
+    own, other: [S, h, w] detail. shifts: columns by which its tissue may lie to the right in the other eye.
     """
-    falls, theirs = _fall(own, run, frames)[part], _fall(other, run, frames)
+    blocks, run = part.blocks, slice(part.first, part.end)
+    falls, theirs = _fall(own, run, frames)[blocks], _fall(other, run, frames)
     least = MIN_BOTH * float(np.median(falls[np.isfinite(falls)])) if np.isfinite(falls).any() else 0.0
     for shift in shifts:
-        width = part.shape[1] - abs(shift)
-        moved = np.zeros_like(part)
-        moved[:, max(0, shift) : max(0, shift) + width] = part[:, max(0, -shift) : max(0, -shift) + width]
+        width = blocks.shape[1] - abs(shift)
+        moved = np.zeros_like(blocks)
+        moved[:, max(0, shift) : max(0, shift) + width] = blocks[:, max(0, -shift) : max(0, -shift) + width]
         seen = theirs[moved & np.isfinite(theirs)]
-        if len(seen) < MIN_VIEW * part.sum() or np.percentile(seen, 100 * (1 - MOST)) > least:
+        if len(seen) < MIN_VIEW * blocks.sum() or np.percentile(seen, 100 * (1 - MOST)) > least:
             return True
     return False
