@@ -98,6 +98,7 @@ class NoticeCode(StrEnum):
     DEPTH_JUMPS = "depth_jumps"
     DEPTH_OUT_OF_RANGE = "depth_out_of_range"
     DEPTH_UNUSUAL = "depth_unusual"
+    DETAIL_LOST = "detail_lost"
     EYES_COLOURED_APART = "eyes_coloured_apart"
     EYES_DISAGREE = "eyes_disagree"
     EYES_OUT_OF_STEP = "eyes_out_of_step"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +13,15 @@ from intrasplat.clip.empty_frames import EmptyFrames, find_empty
 from intrasplat.clip.field_of_view import Fields, Mask, find_fields
 from intrasplat.clip.given_field import FIELD
 from intrasplat.clip.sampling import Mapping, Thumbnail, sampled, thumbnail
+from intrasplat.clip.splashes import lost_detail
 from intrasplat.clip.split import training_frames
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import InputError
+from intrasplat.machine.cores import cores
 from intrasplat.machine.mapped import let_go, mapped_zeros
+from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.names import Fov
+from intrasplat.notices import Notice
 from intrasplat.options import ReconstructionOptions
 
 
@@ -43,9 +48,17 @@ def with_shown_parts(clip: DepthClip, options: ReconstructionOptions) -> DepthCl
         field_of_view=fields.left,
         fov=fields.entry,
         assumptions=(*clip.assumptions, *fields.notices),
-        warnings=(*clip.warnings, *empty.notices(clip.frame_count)),
+        warnings=(*clip.warnings, *empty.notices(clip.frame_count), *_drops(clip, _some(train, empty))),
     )
     return sampled(clip, options, empty.frames)
+
+
+def _drops(clip: DepthClip, frames: Sequence[int]) -> tuple[Notice, ...]:
+    """What may be drops on the lens. A clip without masks is not searched: instruments have no fine detail, either."""
+    if clip.masks is not None and clip.masks.source == "none":
+        return ()
+    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
+        return lost_detail(clip.rgb, lambda index: clip.tissue[index], frames, pool)
 
 
 def find_shown(

@@ -19,6 +19,7 @@ from intrasplat.clip.features import Features, find_features
 from intrasplat.clip.field_of_view import Fields, Mask
 from intrasplat.clip.sampling import SkippedFrames, Thumbnail, skippable_frames, thumbnail
 from intrasplat.clip.shown import find_shown
+from intrasplat.clip.splashes import TissueOf, find_splashes
 from intrasplat.clip.split import spread
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import Cancelled, InputError
@@ -44,7 +45,6 @@ from intrasplat.stereo.in_step import Profile, find_lag, move_frames, row_profil
 from intrasplat.stereo.matching import MatchPlan
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import MatchedPair, Registration
-from intrasplat.stereo.splashes import TissueOf, find_splashes
 
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip.field_of_view import Fields, filled
+from intrasplat.clip.splashes import Splashes
 from intrasplat.clip.types import DepthClip, Eye
 from intrasplat.instruments import Finder
 from intrasplat.machine.mapped import let_go, mapped_zeros
@@ -22,7 +23,6 @@ from intrasplat.stereo.matching import MIN_CONFIDENCE, Grey, MatchPlan, match
 from intrasplat.stereo.nearness import nearness
 from intrasplat.stereo.registration import Registration
 from intrasplat.stereo.right_eye import moved_depth, moved_tissue, painted_over, seen_nowhere
-from intrasplat.stereo.splashes import Splashes
 
 if TYPE_CHECKING:  # matching itself needs no calibration module
     from intrasplat.clip.calibration import RectifiedClip

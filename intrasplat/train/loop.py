@@ -31,6 +31,8 @@ REPORT_EVERY_S = 0.25
 REMAINING_AFTER_S = 1.0
 """Seconds of training after which the remaining time is reported. The run's state is written to disk during the first
 steps, so they do not show how long the others take."""
+TIMED_ITERATIONS = 50
+"""Fewest iterations by whose time the last cycle is fitted; a resumed run may have made fewer."""
 
 
 def step(run: Run, iteration: int) -> None:
@@ -90,8 +92,9 @@ def train(
         if copy_scene is not None and hooks.wants_snapshot():
             hooks.on_snapshot(copy_scene(), run.iteration)
         iteration = _advance(run)
-        if run.setup.fixed_iterations is None and iteration == run.schedule.fitted_at:
-            _fit_last_cycle(run, clock, (clock.elapsed_s - began) / (iteration - first))
+        has_budget, made = run.setup.fixed_iterations is None, iteration - first
+        if has_budget and iteration == run.schedule.fitted_at and made >= TIMED_ITERATIONS:
+            _fit_last_cycle(run, clock, (clock.elapsed_s - began) / made)
         if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
             _score(run, clock, evaluate)

@@ -30,7 +30,7 @@ class Condition:
     title      its name, with the unit of its levels
     levels     the levels of severity 1 to 5
     stereo     whether it is written as stereo files and read, rectified and matched; so is its clean cell then
-    any_light  whether the clip does not tell which of its frames has the truth's light
+    any_light  whether the clip does not tell which light the truth has: that of which frame, or that below the smoke
     calm       for a condition with its own tissue motion: the harmless level of severity 0, because scores of different
                motions cannot be compared. Else None: severity 0 is the clean clip
     """
@@ -78,10 +78,10 @@ def _conditions() -> dict[str, Condition]:
         Condition("tools", "instruments, share of picture", hiding.tools_over_frame, (0.1, 0.25, 0.4, 0.55, 0.7)),
         Condition("hidden_at_start", "hidden in frame 0, share", hiding.hidden_at_start, (0.1, 0.2, 0.3, 0.45, 0.6)),
         Condition("highlights", "moving highlights, number", light.highlights, (4, 8, 16, 32, 64)),
-        Condition("smoke", "smoke, share of light", smoke.smoke, (0.1, 0.25, 0.4, 0.6, 0.8)),
+        Condition("smoke", "smoke, share of light", smoke.smoke, (0.1, 0.25, 0.4, 0.6, 0.8), any_light=True),
         Condition(
             "smoke_stereo", "smoke before both eyes, share of light", smoke.smoke_stereo, (0.1, 0.25, 0.4, 0.6, 0.8),
-            True,
+            True, any_light=True,
         ),
         Condition("splash", "drops on the lens, share of picture", lens.splash, (0.02, 0.05, 0.1, 0.2, 0.35)),
         Condition(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -9,9 +11,9 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
 from intrasplat.clip.calibration import RectifiedClip
+from intrasplat.clip.splashes import falls, lost_detail
 from intrasplat.notices import NoticeCode
 from intrasplat.stereo import estimate_depth
-from intrasplat.stereo.splashes import falls
 from tests.intrasplat.stereo.test_stereo import HEIGHT, WIDTH, clip_of, draw_pair, slanted
 
 FRAMES, FIRST, DISPARITY_PX = 24, 8, 12
@@ -85,3 +87,13 @@ def test_the_largest_fall_has_its_run_of_frames() -> None:
     fall, bounds = falls(detail)
     assert fall[0].tolist() == [0.0, 2.0]
     assert bounds[:, 0, 1].tolist() == [10, 16]
+
+
+def test_a_clip_of_one_eye_warns_of_a_part_that_loses_its_detail() -> None:
+    wet, dry = (np.stack([left for left, _ in recorded(left=column).pairs()]) for column in (COLUMN, None))
+    with ThreadPoolExecutor() as pool:
+        (warning,) = lost_detail(wet, lambda _: None, range(FRAMES), pool)
+        assert warning.code is NoticeCode.DETAIL_LOST
+        assert f"In frames {FIRST} to {FRAMES - 1}" in warning.text
+        assert lost_detail(dry, lambda _: None, range(FRAMES), pool) == ()
+        assert lost_detail(wet, lambda _: ~disc(COLUMN, 2 * RADIUS_PX), range(FRAMES), pool) == ()

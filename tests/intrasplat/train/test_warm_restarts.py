@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -241,3 +243,32 @@ def test_only_a_run_that_is_given_time_may_end_before_it(clip: DepthClip, split:
     assert prepared_for(clip, split, budget_s=0.01).schedule.min_gain_db == PRESETS["fast"].min_gain_db
     few = phantom_clip()
     assert prepared_for(few, split_frames(few, "every8"), budget_s=0.01).schedule.min_gain_db is None
+
+
+class StepClock:
+    """A clock by which each iteration takes a second; it is read, and paused, as a Stopwatch is."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+
+    @property
+    def elapsed_s(self) -> float:
+        return float(self.run.iteration)
+
+    def paused(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+
+@pytest.mark.parametrize(("budget_s", "made"), [(150.0, 150), (230.0, 230), (1000.0, 288), (10.0, 144)])
+def test_the_last_cycle_takes_the_time_that_is_left(
+    clip: DepthClip, split: FrameSplit, monkeypatch: pytest.MonkeyPatch, budget_s: float, made: int
+) -> None:
+    """Planned are 192 iterations; the last cycle, from 96 on, may have half or twice its 96."""
+    run = validated(clip, split, ALWAYS_ENOUGH_DB)
+    run.setup = dataclasses.replace(run.setup, options=ReconstructionOptions(budget_s=budget_s))
+    clock = cast("Stopwatch", StepClock(run))
+    monkeypatch.setattr("intrasplat.train.loop._end_cycle", lambda run, iteration: None)
+    monkeypatch.setattr("intrasplat.train.loop.step", lambda run, iteration: None)
+    train(run, clock, lambda: HeldOutScore(math.nan, math.nan), TrainingHooks())
+    assert run.iteration == made
+    assert run.schedule.planned == PLANNED

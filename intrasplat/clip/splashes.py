@@ -6,7 +6,7 @@ Symbols: T frames, S of them measured, H W pixels, h w blocks, F frames of a run
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import cv2
@@ -130,15 +130,11 @@ def find_splashes(
     """
     measured = spread(frames, MEASURED_FRAMES)
     count, height, width = eyes[0].shape[:3]
-    side = max(1, width // ANALYSED_WIDTH)
-    block = side * BLOCK_PX
-    if len(measured) < MIN_FRAMES or min(height, width) < block:
+    jobs = [_details(rgb, masks, measured, pool) for rgb, masks in zip(eyes, tissue, strict=True)]
+    left, right = (_joined(each) for each in jobs)
+    if left is None or right is None:
         return Splashes()
-    jobs = [
-        [pool.submit(_detail, rgb, masks, index, side) for index in measured]
-        for rgb, masks in zip(eyes, tissue, strict=True)
-    ]
-    left, right = (np.stack([job.result() for job in each]) for each in jobs)
+    block = _shrunk_by(width) * BLOCK_PX
     least, most = int(np.floor(disparities_px[0] / block)), int(np.ceil(disparities_px[1] / block))
     in_right, in_left = range(-most, -least + 1), range(least, most + 1)
     left_parts, right_parts = list(_parts(left)), list(_parts(right))
@@ -156,6 +152,23 @@ def find_splashes(
         return Splash(shown, bounds[part.first - 1] + 1 if part.first else 0, bounds[part.end] - 1)
 
     return Splashes(tuple(map(splash, on_left)), tuple(map(splash, on_right)))
+
+
+def lost_detail(rgb: NDArray[np.uint8], tissue: TissueOf, frames: Sequence[int], pool: Executor) -> tuple[Notice, ...]:
+    """A warning for each part of a clip of one eye that may be a drop on its lens; arguments as of find_splashes."""
+    measured = spread(frames, MEASURED_FRAMES)
+    detail = _joined(_details(rgb, tissue, measured, pool))
+    if detail is None:
+        return ()
+    return tuple(
+        Notice.warning(
+            NoticeCode.DETAIL_LOST,
+            f"In frames {measured[part.first]} to {measured[part.end - 1]} {part.blocks.mean():.1%} of the picture has "
+            "lost its fine detail, by a drop on the lens or by blood or water on the tissue; it is modelled as tissue. "
+            "If it is a drop, give masks that cover it.",
+        )
+        for part in _parts(detail)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +197,23 @@ def _without(detail: Reals, drops: Sequence[Part]) -> Reals:
     return cleared
 
 
+def _shrunk_by(width: int) -> int:
+    return max(1, width // ANALYSED_WIDTH)
+
+
+def _details(rgb: NDArray[np.uint8], tissue: TissueOf, measured: Sequence[int], pool: Executor) -> list[Future[Reals]]:
+    """The jobs of the measured frames; none if they are too few, or the picture is smaller than a block."""
+    side = _shrunk_by(rgb.shape[2])
+    if len(measured) < MIN_FRAMES or min(rgb.shape[1:3]) < side * BLOCK_PX:
+        return []
+    return [pool.submit(_detail, rgb, tissue, index, side) for index in measured]
+
+
+def _joined(jobs: Sequence[Future[Reals]]) -> Reals | None:
+    """[S, h, w] of the jobs; None without any."""
+    return np.stack([job.result() for job in jobs]) if jobs else None
+
+
 def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> Reals:
     """[h, w] logarithm of a frame's fine detail, beside its median; NaN where a block is not tissue alone."""
     rows, columns = (length // (side * BLOCK_PX) for length in rgb.shape[1:3])
@@ -198,6 +228,7 @@ def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> 
     mask = tissue(index)
     if mask is not None:
         shown = cv2.resize(mask[used].astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+        let_go(mask)
         detail[shown < WHOLE] = np.nan
     return np.asarray(detail - np.nanmedian(detail)) if np.isfinite(detail).any() else detail
 
