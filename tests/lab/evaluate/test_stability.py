@@ -99,9 +99,9 @@ def test_where_light_is_ambiguous_the_score_after_a_fit_decides_and_elsewhere_th
     drifted = verdict(lit("exposure_drift", 20.0, 29.0), clean)
     assert (drifted["outcome"], drifted["loss_db"], drifted["fitted_loss_db"]) == ("held", "10.00", "1.50")
     assert verdict(lit("exposure_drift", 20.0, 26.0), clean)["outcome"] == "silent"
-    assert verdict(lit("smoke", 20.0, 29.0), clean)["outcome"] == "silent"
+    assert verdict(lit("splash", 20.0, 29.0), clean)["outcome"] == "silent"
     assert verdict(lit("exposure_drift", 20.0, 29.0), lit(CLEAN, 30.0, None))["outcome"] == "unknown"
-    before = verdict(lit("smoke", 29.0, 29.0), lit(CLEAN, 30.0, None))
+    before = verdict(lit("splash", 29.0, 29.0), lit(CLEAN, 30.0, None))
     assert (before["outcome"], before["fitted_loss_db"]) == ("held", "")
 
 
@@ -256,10 +256,10 @@ def test_the_table_says_what_the_user_is_told() -> None:
 
 
 def test_the_loss_after_a_fit_stands_beside_the_plain_one_where_it_differs() -> None:
-    rows = [placed("smoke", severity, "silent", "5.00") for severity in (1, 2)]
+    rows = [placed("splash", severity, "silent", "5.00") for severity in (1, 2)]
     places = places_of([rows[0] | {"fitted_loss_db": "2.30"}, rows[1] | {"fitted_loss_db": "4.80"}], "fast")
     assert "| **silent** 5.0 / 2.3 | **silent** 5.0 |" in told_table(places, "fast")
-    assert places["smoke", 1].judged_db == 5.0
+    assert places["splash", 1].judged_db == 5.0
     drift = placed("exposure_drift", 1, "held", "5.00") | {"fitted_loss_db": "2.30"}
     assert places_of([drift], "fast")["exposure_drift", 1].judged_db == 2.3
 
