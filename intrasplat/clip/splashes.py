@@ -24,7 +24,7 @@ TissueOf = Callable[[int], Mask | None]
 
 MEASURED_FRAMES, MIN_FRAMES = 48, 12
 ANALYSED_WIDTH, BLOCK_PX = 320, 8
-"""Pictures are shrunk to at least this width; a block is a fortieth of it."""
+"""Pictures are shrunk to about this width; a block is about a fortieth of it."""
 FINE_PX = 2.0
 """Standard deviation of the blur, in pixels of the shrunk picture, below which detail is fine."""
 NOISE_LEVELS = 0.5
@@ -36,6 +36,9 @@ MIN_RUN, MIN_REST = 1 / 6, 1 / 8
 SEED, GROWN, MIN_SEEDS = 1.5, 1.0, 4
 """Fall of the logarithm of detail within a drop, and at its edge; least number of connected blocks of the first. In
 clean clips at most two connected blocks lie above SEED; under drops of blood or water the median is 1.9 to 2.4."""
+MAX_DETAIL = -1.0
+"""Most of the median logarithm of detail in a drop, beside the frame's own: -1.3 and less in drops, -0.4 and more where
+a camera moves on to smoother tissue."""
 MAX_DROPS = 8
 MIN_BOTH, MOST = 0.5, 0.7
 """If the other eye's detail falls by MIN_BOTH of it in MOST blocks where the same tissue may be, the scene changed.
@@ -198,7 +201,7 @@ def _without(detail: Reals, drops: Sequence[Part]) -> Reals:
 
 
 def _shrunk_by(width: int) -> int:
-    return max(1, width // ANALYSED_WIDTH)
+    return max(1, round(width / ANALYSED_WIDTH))
 
 
 def _details(rgb: NDArray[np.uint8], tissue: TissueOf, measured: Sequence[int], pool: Executor) -> list[Future[Reals]]:
@@ -270,7 +273,8 @@ def _parts(detail: Reals) -> Iterator[Part]:
         best[part] = 0
         best[row, column] = 0
         _, seeds = cv2.connectedComponents((part & (fall > SEED)).astype(np.uint8), connectivity=4)
-        if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS:
+        left = _mean(detail[first:last])[part]
+        if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS and np.nanmedian(left) < MAX_DETAIL:
             yield Part(part, first, last)
 
 

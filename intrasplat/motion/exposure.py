@@ -29,6 +29,10 @@ Reals = NDArray[np.float64]
 
 MIN_CONFIDENCE, MIN_CELLS, MAX_CELLS = 0.3, 30, 5000
 """Of a track that is measured; fewest and most tracks of a frame, the most about."""
+MIN_SHARE = 0.05
+"""Least share of the cells that is measured: the median of a few is that of one highlight or shadow."""
+STEADY = 1e-3
+"""Weight of "neighbouring training frames have the same gain", beside shares of up to 1 of what is measured."""
 MIN_LEVEL, MAX_LEVEL = 0.08, 0.95
 """Colours in [0, 1] that are measured: noise and the tone curve's foot spoil darker ones, clipping brighter ones."""
 MIN_CHANGE, MIN_TINT = 0.2, 0.12
@@ -81,7 +85,9 @@ def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks
         return None
     system = np.array(rows)
     known = system.any(axis=0)
-    found, *_ = np.linalg.lstsq(system[:, known], np.array(values), rcond=None)
+    steady = STEADY * (np.eye(known.sum())[1:] - np.eye(known.sum())[:-1])  # joins frames that no track joins
+    targets = np.concatenate([values, np.zeros((len(steady), 3))])
+    found, *_ = np.linalg.lstsq(np.concatenate([system[:, known], steady]), targets, rcond=None)
     if np.ptp(found.mean(axis=1)) < MIN_CHANGE and np.ptp(found - found[:, 1:2], axis=0).max() < MIN_TINT:
         return None
     measured = np.asarray(train)[known]
@@ -102,7 +108,7 @@ def _measurements(
 
 
 def _gain(cells: Measured) -> tuple[int, Reals, float] | None:
-    if cells.good.sum() < MIN_CELLS:
+    if cells.good.sum() < max(MIN_CELLS, MIN_SHARE * cells.good.size):
         return None
     log_gain = np.median(np.log(cells.ratio[cells.good]), axis=0).astype(np.float64)
     return cells.place, log_gain, float(cells.good.mean())

@@ -95,7 +95,7 @@ class FrameWork:
         label = painted_over(rgb[middle], right_rgb[middle], ~sometime_tissue)  # as recorded
         right = Eye(
             rgb=right_rgb,
-            tissue=mapped_zeros(shape, np.bool_) if clip.tissue_right is None else clip.tissue_right,
+            tissue=mapped_zeros(shape, np.bool_) if clip.tissue_right is None else _writeable(clip.tissue_right),
             depth_mm=mapped_zeros(shape, np.float32),
             depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=registration.camera,
@@ -197,6 +197,17 @@ class FrameWork:
         self.counts[i] = trust.size, np.count_nonzero(trust), np.count_nonzero(trust >= SURE)
         for eye in (left, right):
             eye.let_go(i)
+
+
+def _writeable(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Masks [T, H, W] as they are, or a copy of them."""
+    if masks.flags.writeable:
+        return masks
+    copied = mapped_zeros(masks.shape, np.bool_)
+    for index, mask in enumerate(masks):
+        copied[index] = mask
+        let_go(copied[index])
+    return copied
 
 
 def to_depth(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -14,7 +15,7 @@ from intrasplat.clip.calibration import RectifiedClip
 from intrasplat.clip.splashes import falls, lost_detail
 from intrasplat.notices import NoticeCode
 from intrasplat.stereo import estimate_depth
-from tests.intrasplat.stereo.test_stereo import HEIGHT, WIDTH, clip_of, draw_pair, slanted
+from tests.intrasplat.stereo.test_stereo import HEIGHT, WIDTH, clip_of, draw_pair, slanted, texture
 
 FRAMES, FIRST, DISPARITY_PX = 24, 8, 12
 ROW, COLUMN, RADIUS_PX = 70, 120, 22
@@ -76,9 +77,32 @@ def test_clean_lenses_and_tissue_that_changes_for_both_eyes_have_no_drops(left: 
     assert clip.tissue.all()
 
 
-def test_a_drop_that_only_held_out_frames_show_is_not_read() -> None:
-    clip = estimate_depth(recorded(left=COLUMN), measured_frames=range(FIRST))
+def test_held_out_frames_do_not_decide_where_drops_are() -> None:
+    wet, dry = recorded(left=COLUMN), recorded()
+    pairs = [w if index % 2 else d for index, (w, d) in enumerate(zip(wet.pairs(), dry.pairs(), strict=True))]
+    clip = estimate_depth(clip_of(pairs), measured_frames=range(0, FRAMES, 2))
     assert not notices(clip)
+    assert clip.tissue.all()
+
+
+def test_masks_that_cannot_be_written_are_copied() -> None:
+    masks = np.broadcast_to(np.True_, (FRAMES, HEIGHT, WIDTH))
+    clip = estimate_depth(dataclasses.replace(recorded(right=COLUMN), tissue_right=masks))
+    assert clip.right is not None
+    assert clip.right.tissue[FIRST:, disc(COLUMN)].mean() < 0.02
+
+
+def test_smooth_tissue_that_comes_into_view_is_no_drop() -> None:
+    """Detail falls from much to the usual amount."""
+    rough = texture(HEIGHT, WIDTH, 0)
+    rough[disc(COLUMN)] = 128 + 6 * (rough[disc(COLUMN)] - 128)
+    before, after = (
+        np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        for grey in (rough, texture(HEIGHT, WIDTH, 0))
+    )
+    with ThreadPoolExecutor() as pool:
+        rgb = np.stack([before if index < FIRST else after for index in range(FRAMES)])
+        assert lost_detail(rgb, lambda _: None, range(FRAMES), pool) == ()
 
 
 def test_the_largest_fall_has_its_run_of_frames() -> None:
