@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, split_frames
-from intrasplat.motion.exposure import Exposure, find_exposure, in_steady_light
+from intrasplat.motion.exposure import MIN_CELLS, MIN_SHARE, Exposure, find_exposure, in_steady_light
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.light import RecordedLight
+from intrasplat.motion.tracks import Tracks
 from intrasplat.notices import NoticeCode
 from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.train.scoring import frame_renderer
@@ -54,6 +56,43 @@ def test_light_that_hardly_changes_is_left_alone() -> None:
     assert found(0.0)[1] is None
     assert found(0.3)[1] is None
     assert "log_gains" not in snapshot_of(prepared(phantom_clip())[0]).settings
+
+
+def grey_clip(log_gains: NDArray[np.float64]) -> DepthClip:
+    """A clip of even pictures with these log gains [T]."""
+    clip = phantom_clip(width=160, height=128, tools=False)
+    levels = np.clip(100 * np.exp(log_gains) + 0.5, 0, 255).astype(np.uint8)
+    return dataclasses.replace(clip, rgb=np.broadcast_to(levels[:, None, None, None], clip.rgb.shape).copy())
+
+
+def still(clip: DepthClip, reference: int, frames: Sequence[int]) -> Tracks:
+    """Tracks of a clip in which nothing moves."""
+    step_px = 4
+    shape = (len(frames), *(side // step_px for side in clip.rgb.shape[1:3]))
+    levels = clip.rgb[:, 0, 0].astype(np.float32) / 255
+    colour = np.broadcast_to((levels[frames] - levels[reference])[:, None, None], (*shape, 3)).copy()
+    return Tracks(
+        np.zeros((*shape, 3), np.float32), colour, np.ones(shape, np.float32), step_px, reference, list(frames)
+    )
+
+
+def test_frames_that_no_track_joins_have_the_gain_of_their_neighbours() -> None:
+    log_gains = np.minimum(np.arange(FRAMES) * 0.05, 0.05 * (FRAMES // 2))
+    clip, train, half = grey_clip(log_gains), range(FRAMES), FRAMES // 2
+    exposure = find_exposure(clip, train, [still(clip, 0, range(half)), still(clip, half, range(half, FRAMES))])
+    assert exposure is not None
+    true = log_gains - log_gains[exposure.reference]
+    assert np.abs(exposure.log_gains - true[:, None]).max() < 0.08
+
+
+def test_a_few_cells_do_not_tell_a_frames_gain() -> None:
+    clip = grey_clip(np.zeros(FRAMES))
+    tracks = still(clip, 0, range(FRAMES))
+    tracks.confidence[7] = 0
+    tracks.confidence[7].ravel()[:40] = 1
+    tracks.colour[7] = -0.2
+    assert MIN_CELLS < 40 < MIN_SHARE * tracks.confidence[7].size
+    assert find_exposure(clip, range(FRAMES), [tracks]) is None
 
 
 def test_held_out_frames_are_not_read() -> None:
