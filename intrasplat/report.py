@@ -139,7 +139,7 @@ class LightChanges(BaseModel):
     blue: tuple[float, ...] | None = Field(default=None, description="the same of blue")
     smoke_share: tuple[float, ...] | None = Field(
         default=None,
-        description="mean share of the tissue's light that smoke takes in every frame; None: none was found",
+        description="mean share of the light that smoke takes over the picture, in every frame; None: none was found",
     )
     vignetting: float | None = Field(
         default=None,

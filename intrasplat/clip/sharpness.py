@@ -45,6 +45,8 @@ MIN_COMPARED = 3
 """Fewest frames that a patch is compared with."""
 MIN_COARSE_LEVELS, MIN_COARSE_SHARE = 1.0, 0.25
 """Coarse detail of a patch that is compared, and its least share of the usual one: less is blur that takes this too."""
+MIN_RATIO = 1e-3
+"""Fine over coarse detail: with less, as in pictures enlarged without smoothing, nothing can be compared."""
 MIN_CONTINUITY, MIN_COMPARED_BLOCKS = 0.95, 9
 """Correlation of successive frames' blocks: 0.99 in videos; 0.6 in stills 3 s apart, which show different tissue."""
 BLURRED = 0.82
@@ -102,7 +104,8 @@ def relative_sharpness(details: Mapping[int, Detail], train: Sequence[int]) -> d
         near, nearest = _around(index, train, NEAR), _around(index, train, NEAREST)
         found[index] = 1.0
         if np.median(alike[near]) >= MIN_CONTINUITY:
-            by_whole = whole[index] / max(sorted(whole[other] for other in train[nearest])[-2], 1e-9)
+            usual = sorted(whole[other] for other in train[nearest])[-2]
+            by_whole = whole[index] / usual if usual > MIN_RATIO else 1.0
             found[index] = max(by_whole, _sharpness(detail, fine[near], coarse[near]))
     return found
 

@@ -33,8 +33,8 @@ MAX_TAKEN, MAX_THICK_SHARE = 0.5, 0.1
 """Share of the light, and of the frames in which smoke takes more, from which on a warning says so."""
 STEP, LEVELS = np.float32(1 / 64), 255
 """The stored thickness is a whole number of steps, up to this many: 4, of which two percent of the light are left."""
-MAX_NODES = 1 << 24
-"""Of a stored veil: an hour at 30 frames a second on the usual grid."""
+MAX_NODES = 1 << 26
+"""Of a stored veil: half an hour at 30 frames a second on the usual grid."""
 DEPTH_STEP_PX = 8
 """Missing depth is completed on a grid of every eighth pixel."""
 

@@ -71,11 +71,11 @@ def notice_of_border(border_share: float) -> Notice:
     return Notice.info(NoticeCode.VIGNETTING, text)
 
 
-def rays(intrinsics: Intrinsics) -> Reals:
-    """[H, W, 3] points at depth 1 that the pixels show, camera axes."""
+def rays(intrinsics: Intrinsics, rows: slice = slice(None)) -> Reals:
+    """[h, W, 3] points at depth 1 that the pixels of some rows show, camera axes."""
     k = intrinsics
-    x, y = (np.arange(k.width) + 0.5 - k.cx) / k.fx, (np.arange(k.height) + 0.5 - k.cy) / k.fy
-    return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
+    x, y = (np.arange(k.width) + 0.5 - k.cx) / k.fx, (np.arange(k.height)[rows] + 0.5 - k.cy) / k.fy
+    return np.stack([*np.meshgrid(x, y), np.ones((y.size, x.size))], axis=-1)
 
 
 def log_cosine(points: NDArray[np.floating]) -> Reals:

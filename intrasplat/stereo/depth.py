@@ -86,7 +86,7 @@ def estimate_depth(
     frames are moved, and frames without a partner are skipped.
     On "cuda" another matcher (intrasplat/stereo/cuda, needs triton) matches many pairs at once. finder_of creates the
     finder of instruments for a clip without masks, from some of its pictures; it runs on each frame by itself, before
-    matching. None: `clip.tissue` is used.
+    matching. None: `clip.tissue` is used, and changed: masks that can be written become the result's.
 
     `measurements` gains vertical_misalignment_px and vertical_residual_px (median |dy| after the correction),
     min_disparity_px and max_disparity_px (the range searched), depth_valid_share (of tissue pixels) and

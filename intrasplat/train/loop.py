@@ -93,8 +93,8 @@ def train(
             hooks.on_snapshot(copy_scene(), run.iteration)
         iteration = _advance(run)
         has_budget, made = run.setup.fixed_iterations is None, iteration - first
-        if has_budget and iteration == run.schedule.fitted_at and made >= TIMED_ITERATIONS:
-            _fit_last_cycle(run, clock, (clock.elapsed_s - began) / made)
+        if has_budget and iteration == run.schedule.fitted_at:
+            _fit_last_cycle(run, clock, (clock.elapsed_s - began) / made if made >= TIMED_ITERATIONS else None)
         if iteration < run.iterations and (iteration in run.schedule.ends or (marks and clock.elapsed_s >= marks[0])):
             marks = [mark for mark in marks if mark > clock.elapsed_s]
             _score(run, clock, evaluate)
@@ -132,10 +132,11 @@ def _end_cycle(run: Run, iteration: int) -> None:
         run.schedule = run.schedule.with_score(_validation_psnr(run))
 
 
-def _fit_last_cycle(run: Run, clock: Stopwatch, step_s: float) -> None:
-    """Fit the last cycle into what is left of the budget; step_s: the time of a step so far."""
+def _fit_last_cycle(run: Run, clock: Stopwatch, step_s: float | None) -> None:
+    """Fit the last cycle into what is left of the budget; step_s: time of a step so far, None: as planned."""
     check_sums(run.model.wait(), run.iteration)
-    run.schedule = run.schedule.with_last_cycle(int((run.setup.budget_s - clock.elapsed_s) / step_s))
+    left = run.schedule.planned - run.iteration if step_s is None else (run.setup.budget_s - clock.elapsed_s) / step_s
+    run.schedule = run.schedule.with_last_cycle(int(left))
 
 
 def _validation_psnr(run: Run) -> float:

@@ -37,7 +37,7 @@ class EndoscopeLight:
             return gains
         far_mm = np.where(depth_mm > 0, depth_mm, MEDIAN_DEPTH_UNITS / self.scene.units_per_mm)
         eye_from_camera = np.linalg.inv(self._eye()) @ self.world_from_camera
-        places_mm = rays(self.lens)[rows] * far_mm[..., None]
+        places_mm = rays(self.lens, rows) * far_mm[..., None]
         seen = vignetting.brightness(places_mm @ eye_from_camera[:3, :3].T + eye_from_camera[:3, 3])[..., None]
         return seen if gains is None else seen * gains
 

@@ -62,6 +62,14 @@ def test_frames_that_are_all_blurred_alike_weigh_the_same() -> None:
     assert frame_weights(replace(clip, rgb=soft), ALL, ALL) == {}
 
 
+def test_pictures_enlarged_without_smoothing_weigh_the_same() -> None:
+    """No fine detail at all is left to compare: pixels repeat in squares of four."""
+    clip = drawn()
+    rgb = clip.rgb[:, ::4, ::4].repeat(4, axis=1).repeat(4, axis=2)[:, : clip.rgb.shape[1], : clip.rgb.shape[2]]
+    train = split_frames(clip).train
+    assert frame_weights(replace(clip, rgb=rgb), range(clip.frame_count), train) == {}
+
+
 def test_veiled_and_dark_frames_are_not_blurred() -> None:
     rgb = drawn().rgb.copy()
     rgb[5] = rgb[5] // 2 + 90
