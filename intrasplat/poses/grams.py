@@ -73,7 +73,7 @@ def link_gram(
     functions = np.concatenate([field.powers(world), world[:, 2:]], axis=1)  # [M, F + 1]
     weighted = by_point * total[:, None, None]
     size = functions.shape[1]
-    pairs = (functions[:, :, None] * functions[:, None]).reshape(len(world), -1)
+    pairs = (functions[:, :, None] * functions[:, None]).reshape(len(world), size * size)
     points = np.matmul(weighted.transpose(0, 2, 1), by_point).reshape(len(world), 9)
     gram = np.empty((3 * size + 1, 3 * size + 1))
     gram[:-1, :-1] = (pairs.T @ points).reshape(size, size, 3, 3).transpose(0, 2, 1, 3).reshape(3 * size, 3 * size)

@@ -83,6 +83,17 @@ def test_frames_of_other_tissue_are_lost_left_out_and_named() -> None:
     assert trajectory_error(found.world_from_camera[placed], true[placed]).mm < 1.3
 
 
+def test_a_held_out_frame_without_any_depth_is_not_placed() -> None:
+    """As where one lens is fogged: no track to it has a point."""
+    clip, _ = clip_of("retreat", 17, breath=2.5)
+    train = training_frames(17, "every8")
+    fogged = next(index for index in range(17) if index not in train)
+    depth_mm, rgb = clip.depth_mm.copy(), clip.rgb.copy()
+    depth_mm[fogged], rgb[fogged] = 0, 200
+    found = find_path(replace(clip, depth_mm=depth_mm, rgb=rgb), train)
+    assert fogged in found.unsure
+
+
 def test_a_held_out_frame_between_far_ones_is_placed_by_features() -> None:
     clip, true = clip_of("pan", 24)
     frames = [0, 9, 1, 2, 3, 4, 5, 6, 7, 8]  # frames 0 and 1 show nothing that frame 9 does
