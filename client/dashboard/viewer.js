@@ -241,7 +241,7 @@ export class Viewer extends EventTarget {
     };
     if (this.orbit.pose) view.pose = this.orbit.pose;
     else if (this.orbit.eye === "right") view.eye = "right";
-    if (this.light === "recorded" && view.layer === "rgb") Object.assign(view, { light: "recorded", smoke: "show" });
+    if (this.light === "recorded") Object.assign(view, { light: "recorded", smoke: "show" });
     return view;
   }
 
