@@ -87,6 +87,11 @@ class Splashes:
         return (Notice.info(NoticeCode.SPLASHES, text),)
 
 
+def _shortest_run(count: int) -> int:
+    """The fewest frames of `count` in which a drop is found."""
+    return max(1, round(MIN_RUN * count))
+
+
 def falls(detail: Reals) -> tuple[Reals, NDArray[np.int64]]:
     """The largest fall [h, w] of mean detail in a run of frames beside all others, and that run's [2, h, w] bounds.
 
@@ -98,7 +103,7 @@ def falls(detail: Reals) -> tuple[Reals, NDArray[np.int64]]:
         np.concatenate([np.zeros((1, *detail.shape[1:])), np.cumsum(each, axis=0)])
         for each in (np.where(known, detail, 0), known)
     )
-    shortest, rest = max(1, round(MIN_RUN * count)), max(1, round(MIN_REST * count))
+    shortest, rest = _shortest_run(count), max(1, round(MIN_REST * count))
     best, bounds = np.zeros(detail.shape[1:]), np.zeros((2, *detail.shape[1:]), np.int64)
     for first in range(count - shortest + 1):
         ends = np.arange(first + shortest, count + 1)
@@ -133,10 +138,10 @@ def find_splashes(
     """
     measured = spread(frames, MEASURED_FRAMES)
     count, height, width = eyes[0].shape[:3]
-    jobs = [_details(rgb, masks, measured, pool) for rgb, masks in zip(eyes, tissue, strict=True)]
-    left, right = (_joined(each) for each in jobs)
-    if left is None or right is None:
+    details = [_details(rgb, masks, measured, pool) for rgb, masks in zip(eyes, tissue, strict=True)]
+    if not all(details):
         return Splashes()
+    left, right = (np.stack([job.result() for job in each]) for each in details)
     block = _shrunk_by(width) * BLOCK_PX
     least, most = int(np.floor(disparities_px[0] / block)), int(np.ceil(disparities_px[1] / block))
     in_right, in_left = range(-most, -least + 1), range(least, most + 1)
@@ -160,8 +165,8 @@ def find_splashes(
 def lost_detail(rgb: NDArray[np.uint8], tissue: TissueOf, frames: Sequence[int], pool: Executor) -> tuple[Notice, ...]:
     """A warning for each part of a clip of one eye that may be a drop on its lens; arguments as of find_splashes."""
     measured = spread(frames, MEASURED_FRAMES)
-    detail = _joined(_details(rgb, tissue, measured, pool))
-    if detail is None:
+    jobs = _details(rgb, tissue, measured, pool)
+    if not jobs:
         return ()
     return tuple(
         Notice.warning(
@@ -170,7 +175,7 @@ def lost_detail(rgb: NDArray[np.uint8], tissue: TissueOf, frames: Sequence[int],
             "lost its fine detail, by a drop on the lens or by blood or water on the tissue; it is modelled as tissue. "
             "If it is a drop, give masks that cover it.",
         )
-        for part in _parts(detail)
+        for part in _parts(np.stack([job.result() for job in jobs]))
     )
 
 
@@ -212,11 +217,6 @@ def _details(rgb: NDArray[np.uint8], tissue: TissueOf, measured: Sequence[int], 
     return [pool.submit(_detail, rgb, tissue, index, side) for index in measured]
 
 
-def _joined(jobs: Sequence[Future[Reals]]) -> Reals | None:
-    """[S, h, w] of the jobs; None without any."""
-    return np.stack([job.result() for job in jobs]) if jobs else None
-
-
 def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> Reals:
     """[h, w] logarithm of a frame's fine detail, beside its median; NaN where a block is not tissue alone."""
     rows, columns = (length // (side * BLOCK_PX) for length in rgb.shape[1:3])
@@ -238,8 +238,7 @@ def _detail(rgb: NDArray[np.uint8], tissue: TissueOf, index: int, side: int) -> 
 
 def _around_an_end(part: Part, count: int) -> slice:
     """The shortest run of frames, of `count`, before and after the start of a part, or its end if it starts first."""
-    shortest = max(1, round(MIN_RUN * count))
-    middle = part.first or part.end
+    shortest, middle = _shortest_run(count), part.first or part.end
     return slice(max(0, middle - shortest), middle + shortest)
 
 
@@ -266,16 +265,16 @@ def _parts(detail: Reals) -> Iterator[Part]:
         row, column = divmod(int(best.argmax()), best.shape[1])
         if best[row, column] < SEED:
             return
-        first, last = map(int, bounds[:, row, column])
-        fall = np.nan_to_num(_fall(detail, slice(first, last)))
+        first, end = map(int, bounds[:, row, column])
+        fall = np.nan_to_num(_fall(detail, slice(first, end)))
         _, label = cv2.connectedComponents((fall > GROWN).astype(np.uint8), connectivity=4)
         part = (label == label[row, column]) & (fall > GROWN)
         best[part] = 0
         best[row, column] = 0
         _, seeds = cv2.connectedComponents((part & (fall > SEED)).astype(np.uint8), connectivity=4)
-        left = _mean(detail[first:last])[part]
-        if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS and np.nanmedian(left) < MAX_DETAIL:
-            yield Part(part, first, last)
+        remaining = _mean(detail[first:end])[part]
+        if np.bincount(seeds.ravel())[1:].max(initial=0) >= MIN_SEEDS and np.nanmedian(remaining) < MAX_DETAIL:
+            yield Part(part, first, end)
 
 
 def _falls_too(part: Part, own: Reals, other: Reals, frames: slice, shifts: range) -> bool:
@@ -284,8 +283,8 @@ def _falls_too(part: Part, own: Reals, other: Reals, frames: slice, shifts: rang
     own, other: [S, h, w] detail. shifts: columns by which its tissue may lie to the right in the other eye.
     """
     blocks, run = part.blocks, slice(part.first, part.end)
-    falls, theirs = _fall(own, run, frames)[blocks], _fall(other, run, frames)
-    least = MIN_BOTH * float(np.median(falls[np.isfinite(falls)])) if np.isfinite(falls).any() else 0.0
+    ours, theirs = _fall(own, run, frames)[blocks], _fall(other, run, frames)
+    least = MIN_BOTH * float(np.median(ours[np.isfinite(ours)])) if np.isfinite(ours).any() else 0.0
     for shift in shifts:
         width = blocks.shape[1] - abs(shift)
         moved = np.zeros_like(blocks)

@@ -76,11 +76,12 @@ def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks
     Only training frames are measured. The gains of other frames are interpolated in time.
     """
     rows, values = list[Reals](), list[Reals]()
-    for key, place, log_gain, share in _measurements(clip, train, tracks):
-        row = np.zeros(len(train))
-        row[place], row[key] = share, -share
-        rows.append(row)
-        values.append(share * log_gain)
+    for each in tracks:
+        for place, log_gain, share in measured_cells(clip, train, each, _gain):
+            row = np.zeros(len(train))
+            row[place], row[each.reference] = share, -share
+            rows.append(row)
+            values.append(share * log_gain)
     if not rows:
         return None
     system = np.array(rows)
@@ -98,16 +99,8 @@ def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks
     return Exposure(log_gains, int(measured[usual]))
 
 
-def _measurements(
-    clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks]
-) -> Iterator[tuple[int, int, Reals, float]]:
-    """A keyframe, a frame (indices into train), log gains [3] of the one against the other, share of cells measured."""
-    for each in tracks:
-        for place, log_gain, share in measured_cells(clip, train, each, _gain):
-            yield each.reference, place, log_gain, share
-
-
 def _gain(cells: Measured) -> tuple[int, Reals, float] | None:
+    """A frame, log gains [3] of it against the keyframe, share of cells measured; None: too few."""
     if cells.good.sum() < max(MIN_CELLS, MIN_SHARE * cells.good.size):
         return None
     log_gain = np.median(np.log(cells.ratio[cells.good]), axis=0).astype(np.float64)

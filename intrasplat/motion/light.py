@@ -78,15 +78,14 @@ class RecordedLight:
         if self.vignetting is not None:
             rgb = rgb * self.vignetting.picture(lens)[..., None]
         if self.veils:
-            veil = self.veils[1 if right and len(self.veils) > 1 else 0]
+            veil = self.veils[int(right)]
             rgb = veil.drawn_over(rgb, veil.transmission(index, depth_mm))
         return rgb
 
     def settings(self) -> dict[str, Any]:
         """What a scene stores to show a moment as the left eye recorded it; JSON."""
-        gains = {} if self.exposure is None else {"log_gains": self.exposure.log_gains.tolist()}
-        even = {} if self.vignetting is None else {"vignetting": self.vignetting.stored()}
-        return gains | even | ({"veil": self.veils[0].stored()} if self.veils else {})
+        gains = None if self.exposure is None else self.exposure.log_gains
+        return light_settings(gains, self.vignetting, self.veils[0] if self.veils else None)
 
     def stored(self) -> dict[str, Any]:
         """All of it as JSON, for read()."""
@@ -106,6 +105,15 @@ class RecordedLight:
         exposure = None if gains is None else Exposure(np.array(gains[0], np.float64), int(gains[1]))
         vignetting = None if stored["vignetting"] is None else Vignetting(*map(float, stored["vignetting"]))
         return cls(exposure, vignetting, tuple(Veil.read(veil, frames) for veil in stored["veils"]))
+
+
+def light_settings(
+    log_gains: NDArray[np.float64] | None, vignetting: Vignetting | None, veil: Veil | None
+) -> dict[str, Any]:
+    """The settings of a scene that was recorded in this light; JSON. log_gains [T, 3]. None: there is none."""
+    gains = {} if log_gains is None else {"log_gains": log_gains.tolist()}
+    even = {} if vignetting is None else {"vignetting": vignetting.stored()}
+    return gains | even | ({} if veil is None else {"veil": veil.stored()})
 
 
 def _rounded(values: NDArray[np.float64]) -> tuple[float, ...]:

@@ -17,6 +17,7 @@ from intrasplat.errors import InputError, SceneError
 from intrasplat.files.durable import FOR_ALL, replace_file
 from intrasplat.intake.limits import ClipLimits
 from intrasplat.intake.sniff import check_file
+from intrasplat.motion.light import light_settings
 from intrasplat.names import MANIFEST, RECORDED, REPORT, THUMBNAIL
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.report import Imported, Report
@@ -73,10 +74,7 @@ def take_scene(
 
 def _settings(scene: TrainedScene) -> dict[str, Any]:
     """The settings that views need, checked: the scene's report says how it was trained."""
-    light: dict[str, Any] = {} if scene.log_gains is None else {"log_gains": scene.log_gains.tolist()}
-    if scene.vignetting is not None:
-        light["vignetting"] = scene.vignetting.stored()
-    light |= {} if scene.veil is None else {"veil": scene.veil.stored()}
+    light = light_settings(scene.log_gains, scene.vignetting, scene.veil)
     warnings = [each.model_dump(mode="json") for each in scene.pose_warnings]
     return {"pose_warnings": warnings, "motion_error": scene.motion_error, **light}
 

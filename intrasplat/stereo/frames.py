@@ -95,7 +95,7 @@ class FrameWork:
         label = painted_over(rgb[middle], right_rgb[middle], ~sometime_tissue)  # as recorded
         right = Eye(
             rgb=right_rgb,
-            tissue=mapped_zeros(shape, np.bool_) if clip.tissue_right is None else _writeable(clip.tissue_right),
+            tissue=_own(clip.tissue_right, shape),
             depth_mm=mapped_zeros(shape, np.float32),
             depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=registration.camera,
@@ -104,7 +104,7 @@ class FrameWork:
         )
         matched = DepthClip(
             rgb=rgb,
-            tissue=clip.tissue if clip.tissue.flags.writeable else mapped_zeros(shape, np.bool_),
+            tissue=_own(clip.tissue, shape),
             depth_mm=mapped_zeros(shape, np.float32),
             depth_confidence=mapped_zeros(shape, np.uint8),
             intrinsics=clip.intrinsics,
@@ -182,6 +182,8 @@ class FrameWork:
             no_tool = self.label if self.fields.left is None else self.label | ~self.fields.left
             shown = moved_tissue(left.tissue[i] | no_tool, left.depth_mm[i], focal_baseline, offset_px)
             right.tissue[i] = (registration.recorded((~shown).astype(np.uint8)) == 0) & ~self.label
+        elif right.tissue is not self.clip.tissue_right:
+            right.tissue[i] = self.clip.tissue_right[i]
         for eye in (left, right):
             if eye.field_of_view is not None:
                 eye.depth_mm[i][~eye.field_of_view], eye.depth_confidence[i][~eye.field_of_view] = 0, 0
@@ -199,15 +201,9 @@ class FrameWork:
             eye.let_go(i)
 
 
-def _writeable(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Masks [T, H, W] as they are, or a copy of them."""
-    if masks.flags.writeable:
-        return masks
-    copied = mapped_zeros(masks.shape, np.bool_)
-    for index, mask in enumerate(masks):
-        copied[index] = mask
-        let_go(copied[index])
-    return copied
+def _own(masks: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Masks [T, H, W] that may be written: these, or new ones to be filled frame by frame."""
+    return masks if masks is not None and masks.flags.writeable else mapped_zeros(shape, np.bool_)
 
 
 def to_depth(
