@@ -254,6 +254,14 @@ def test_the_model_is_drawn_as_the_moment_was_recorded_until_the_comparison_ends
     page.until(lambda: say("picture.recorded_light") not in page.view)
 
 
+def test_another_layer_is_compared_too(site: Site, page: Page) -> None:
+    view(page, recorded_scene(site))
+    Select(page.find("#layer")).select_by_value("depth")
+    choose(page, "wipe")
+    until_frame(page, 0)
+    page.until(lambda: page.find("#seam").is_displayed())
+
+
 def test_the_right_eyes_frames_are_compared_with_what_the_right_eye_sees(site: Site, page: Page) -> None:
     view(page, recorded_scene(site, ("left", "right")))
     choose(page, "wipe")
