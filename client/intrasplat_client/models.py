@@ -403,7 +403,7 @@ class LightChanges(Model):
     blue: tuple[float, ...] | None = None
     """the same of blue"""
     smoke_share: tuple[float, ...] | None = None
-    """mean share of the tissue's light that smoke takes in every frame; None: none was found"""
+    """mean share of the light that smoke takes over the picture, in every frame; None: none was found"""
     vignetting: float | None = None
     """brightness of tissue at the border over that in the middle, where it differs most; None: the border is
     hardly darker, or the camera does not move
