@@ -33,7 +33,7 @@ from intrasplat.errors import InputError
 from intrasplat.machine.hooks import Hooks
 from lab.conditions.exposure import with_drift, with_tint
 from lab.conditions.lens import with_splash
-from lab.conditions.smoke import with_smoke
+from lab.conditions.smoke import with_haze, with_smoke
 from lab.evaluate.fitted import fitted_db, plain_db
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, texts_of, write_rows
 from lab.evaluate.sources import DATA_VARIABLE, Source, open_source, source_of
@@ -43,6 +43,7 @@ CLIPS = ("d4d_stereo", "phantom:breathing:60frames:stereo", "phantom:pull:60fram
 LIGHTS: dict[str, tuple[float, Callable[[DepthClip, float, np.random.Generator], DepthClip]]] = {
     "none": (0.0, lambda clip, *_: clip),
     "smoke": (0.35, with_smoke),
+    "haze": (0.35, with_haze),
     "exposure": (1.5, with_drift),
     "white_balance": (1.3, with_tint),
     "splash": (0.1, with_splash),

@@ -2,7 +2,7 @@
 
 recorded = passes * tissue + (1 - passes) * AIRLIGHT, where passes = exp(-density * depth) is the share of light that
 reaches the eye. The density is smooth over the picture and drifts. Both eyes look through the same cloud. with_smoke()
-takes any clip, of one eye or two.
+takes any clip, of one eye or two, and so does with_haze(), whose density is even and comes and goes.
 
 Symbols: T frames, H W pixels. Lengths in pixels refer to a picture 640 wide.
 """
@@ -26,6 +26,7 @@ from lab.phantom import PhantomFrame
 AIRLIGHT = 205.0  # light grey
 PUFF_PX, DRIFT_PX, UNEVEN = 40.0, 12.0, 0.35  # sigma of a puff, drift per frame, deviation of the density, mean 1
 CLOUD_AT = 0.5  # of the way to the tissue hangs the cloud: its parallax is that of this distance
+HAZE_PERIODS = 1.5  # of a haze in the clip; each is clear for its other half
 MAX_DENSITY = 50.0  # thickest smoke that is tried, times the depth
 COARSE = 4  # depth is completed at a fraction of the resolution
 
@@ -89,6 +90,20 @@ def with_smoke(clip: DepthClip, level: float, random: np.random.Generator) -> De
     smoke = smoke_before(clip.depth_mm, level, random, focal_baseline)
     veiled_right = None if right is None else dataclasses.replace(right, rgb=_seen(smoke, right, right=True))
     return dataclasses.replace(clip, rgb=_seen(smoke, clip, right=False), right=veiled_right)
+
+
+def with_haze(clip: DepthClip, level: float, random: np.random.Generator) -> DepthClip:
+    """Any clip with depth, through even smoke that comes and goes, and takes `level` of the light at most; as above."""
+    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * HAZE_PERIODS * np.arange(clip.frame_count) / clip.frame_count
+    density = -np.log1p(-level * np.maximum(np.sin(phase), 0)) / float(np.median(clip.depth_mm[clip.depth_mm > 0]))
+    everywhere = np.ones(clip.tissue.shape[1:], np.float32)
+
+    def seen(eye: Eye) -> NDArray[np.uint8]:
+        smokes = [Smoke(each * everywhere, 0.0, 0.0) for each in density.astype(np.float32)]
+        return np.stack([smoke.over(eye.rgb[index], index, eye.depth_mm[index]) for index, smoke in enumerate(smokes)])
+
+    right = clip.right and dataclasses.replace(clip.right, rgb=seen(clip.right))
+    return dataclasses.replace(clip, rgb=seen(clip), right=right)
 
 
 def smoke(clean: CleanClip, level: float, random: np.random.Generator) -> Given:

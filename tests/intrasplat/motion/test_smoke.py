@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, Eye, split_frames
 from intrasplat.motion.keyframes import track_keyframes
@@ -20,6 +21,7 @@ from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.quality.report import first_report
 from intrasplat.train.scoring import frame_renderer
 from intrasplat.view.render import render_frame
+from lab.conditions.lens import with_splash
 from lab.phantom import PhantomSettings
 from tests.intrasplat.motion.test_exposure import drifting
 from tests.intrasplat.phantoms import keep, kept, matched_stereo, phantom_clip, prepared, trained
@@ -42,6 +44,12 @@ def veil_over(clip: DepthClip, share: float, cloud_px: float = 24.0) -> Veil:
     return Veil(thickness, np.full(3, GREY / 255, np.float32), float(np.median(clip.depth_mm[clip.depth_mm > 0])))
 
 
+def veil_in(clip: DepthClip, by_frame: NDArray[np.floating], picture: NDArray[np.floating]) -> Veil:
+    """Smoke that takes by_frame [T] times picture [H, W] of the light."""
+    thickness = -np.log(1 - by_frame[:, None, None] * picture).astype(np.float32)
+    return Veil(thickness, np.full(3, GREY / 255, np.float32), float(np.median(clip.depth_mm[clip.depth_mm > 0])))
+
+
 def spoilt(eye: Any, veil: Veil) -> Any:
     depth_mm = np.where(eye.depth_mm > 0, eye.depth_mm, np.float32(veil.depth_mm))
     through = [veil.transmission(index, depth_mm[index])[..., None] for index in range(len(depth_mm))]
@@ -49,16 +57,23 @@ def spoilt(eye: Any, veil: Veil) -> Any:
     return dataclasses.replace(eye, rgb=np.rint(rgb).astype(np.uint8))
 
 
-def smoky(clip: DepthClip, share: float) -> DepthClip:
-    veil = veil_over(clip, share)
+def behind(clip: DepthClip, veil: Veil) -> DepthClip:
     return dataclasses.replace(spoilt(clip, veil), right=clip.right and spoilt(clip.right, veil))
+
+
+def smoky(clip: DepthClip, share: float) -> DepthClip:
+    return behind(clip, veil_over(clip, share))
+
+
+def found_in(clip: DepthClip) -> tuple[Veil, ...]:
+    train = split_frames(clip).train
+    return find_veils(clip, train, track_keyframes(clip, train), clip)
 
 
 @cache
 def found(share: float) -> tuple[DepthClip, tuple[Veil, ...]]:
     clip = smoky(clear_clip(), share)
-    train = split_frames(clip).train
-    return clip, find_veils(clip, train, track_keyframes(clip, train), clip)
+    return clip, found_in(clip)
 
 
 def error_after_a_fit(eye: Eye, true: Eye) -> float:
@@ -84,11 +99,55 @@ def test_smoke_that_drifts_is_removed_from_both_eyes(share: float) -> None:
     assert np.abs(veils[0].airlight * 255 - GREY).max() < 40
 
 
+EVERYWHERE = np.ones((128, 160))
+LATER, AT_FIRST = np.clip((np.arange(FRAMES) - 10) / 3, 0, 1), np.clip((12 - np.arange(FRAMES)) / 3, 0, 1)
+CORNER = np.exp(-((np.indices((128, 160)) - np.array([28, 116]).reshape(2, 1, 1)) ** 2).sum(0) / (2 * 16**2))
+
+
+@pytest.mark.parametrize(
+    ("by_frame", "picture", "share", "left"),
+    [
+        (LATER, EVERYWHERE, 0.35, 0.4),
+        (LATER, EVERYWHERE, 0.2, 0.4),
+        (AT_FIRST, EVERYWHERE, 0.35, 0.4),
+        (LATER, CORNER, 0.5, 0.6),
+    ],
+    ids=["later", "thin", "at first", "in a corner"],
+)
+def test_smoke_in_a_part_of_the_frames_is_removed_and_leaves_the_others_alone(
+    by_frame: NDArray[np.floating], picture: NDArray[np.floating], share: float, left: float
+) -> None:
+    true = clear_clip()
+    veil = veil_in(true, share * by_frame, picture)
+    clip = behind(true, veil)
+    veils = found_in(clip)
+    assert veils
+    clear, tissue = without_veils(clip, veils), true.tissue
+    with_smoke, without = by_frame == 1, by_frame == 0
+    before, after = (np.abs(each.rgb.astype(float) - true.rgb).mean(-1) for each in (clip, clear))
+    assert after[with_smoke][tissue[with_smoke]].mean() < left * before[with_smoke][tissue[with_smoke]].mean()
+    assert after[without][tissue[without]].mean() < 2.5
+    assert veils[0].share_taken()[without].max() < 0.04
+    assert veils[0].share_taken()[with_smoke].mean() > 0.6 * veil.share_taken()[with_smoke].mean()
+
+
+def test_dark_tissue_stays_as_it_is_in_clear_frames() -> None:
+    true = clear_clip()
+    dim = np.exp(-2 * (np.linspace(-1, 1, 160) ** 4))[:, None]
+    true = dataclasses.replace(true, rgb=np.rint(true.rgb * dim).astype(np.uint8), right=None)
+    clip = behind(true, veil_in(true, 0.35 * LATER, EVERYWHERE))
+    clear, frame = without_veils(clip, found_in(clip)), 4
+    dark = true.tissue[frame] & (true.rgb[frame].max(-1) < 50)
+    assert dark.sum() > 500
+    assert np.abs(clear.rgb[frame][dark].astype(float) - true.rgb[frame][dark]).mean() < 3
+
+
 def test_clear_clips_and_changing_light_have_no_smoke() -> None:
     steady = clear_clip()
-    for clip in (steady, drifting(1.5)[0], drifting(0.0, 1.8)[0]):
-        train = split_frames(clip).train
-        assert find_veils(clip, train, track_keyframes(clip, train), clip) == ()
+    blurred = np.stack([cv2.GaussianBlur(each, (0, 0), 1 + index % 2) for index, each in enumerate(steady.rgb)])
+    splashed = with_splash(steady, 0.1, np.random.default_rng(0))
+    for clip in (steady, drifting(1.5)[0], drifting(0.0, 1.8)[0], dataclasses.replace(steady, rgb=blurred), splashed):
+        assert found_in(clip) == ()
 
 
 def test_tracks_of_other_tissue_show_no_smoke() -> None:

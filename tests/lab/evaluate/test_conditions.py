@@ -14,7 +14,7 @@ from intrasplat.clip.types import Eye
 from lab.conditions import CONDITIONS, SEVERITIES, CleanClip, Given, Recording, clean_clip, write_recording
 from lab.conditions.exposure import TONE_POWER
 from lab.conditions.lens import BLOOD_FROM
-from lab.conditions.smoke import AIRLIGHT, CLOUD_AT, smoke_before, with_smoke
+from lab.conditions.smoke import AIRLIGHT, CLOUD_AT, smoke_before, with_haze, with_smoke
 from lab.phantom import PhantomSettings
 
 pytestmark = pytest.mark.usefixtures("each_phantom_once")
@@ -222,6 +222,16 @@ def test_both_eyes_of_any_clip_see_one_cloud() -> None:
     assert veiled.rgb.mean() == pytest.approx(0.4 * AIRLIGHT, rel=0.02)
     assert veiled.rgb[:, :8, :8].min() > 0  # also where depth is not known
     np.testing.assert_array_equal(veiled.depth_mm, clip.depth_mm)
+
+
+def test_haze_is_even_in_both_eyes_and_clear_for_half_of_the_time() -> None:
+    hazy = with_haze(on_a_wall(), 0.4, np.random.default_rng(0))
+    assert hazy.right is not None
+    np.testing.assert_array_equal(hazy.right.rgb, hazy.rgb)
+    assert 0 < hazy.rgb.max() <= round(0.4 * AIRLIGHT)
+    assert np.ptp(hazy.rgb, axis=(1, 2, 3)).max() == 0
+    seen = with_haze(clean().clip, 0.4, np.random.default_rng(0)).rgb
+    assert (seen == clean().clip.rgb).all(axis=(1, 2, 3)).mean() == pytest.approx(0.5, abs=0.1)
 
 
 def test_exposure_follows_a_bright_and_a_dark_instrument_by_the_stops_of_the_level() -> None:
