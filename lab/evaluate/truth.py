@@ -255,17 +255,17 @@ class SceneCandidate:
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))
-        alpha = self._image(0, self._scene.world_from_camera[0])[4]
         moved_mm = (end - start) / np.float32(self._scene.units_per_mm)
-        blended = np.stack([self._model.blend_values(np.ascontiguousarray(axis)).copy() for axis in moved_mm], -1)
-        solid = (alpha >= COVERED_ALPHA)[..., None]
-        return np.where(solid, blended / np.maximum(alpha, COVERED_ALPHA)[..., None], np.nan)
+        image = self._model.blended(self._camera(0, self._scene.world_from_camera[0]), 0.0, moved_mm)
+        blended, alpha = image[:3].transpose(1, 2, 0), image[4, ..., None]
+        return np.where(alpha >= COVERED_ALPHA, blended / np.maximum(alpha, COVERED_ALPHA), np.nan)
+
+    def _camera(self, frame: int, pose: Pose) -> NDArray[np.float64]:
+        return view_camera(self._scene, frame / self._scene.frame_count, pose, self._scene.intrinsics)
 
     def _image(self, frame: int, pose: Pose) -> NDArray[np.float32]:
         """R G B Z A [5, H, W], a copy."""
-        scene = self._scene
-        camera = view_camera(scene, frame / scene.frame_count, pose, scene.intrinsics)
-        return self._model.render(camera, frame / scene.frame_count).copy()
+        return self._model.render(self._camera(frame, pose), frame / self._scene.frame_count).copy()
 
 
 def _seen_by(

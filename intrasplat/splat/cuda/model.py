@@ -99,7 +99,6 @@ class CudaModel:
         self._sent: list[int] = []  # the harmonics' degree of every step since the last wait
         self._learnt: StepSums | None = None
         self._gradients: Gradients | None = None
-        self._shown: FrameBuffers | None = None
 
     # Steps
 
@@ -271,7 +270,7 @@ class CudaModel:
         Raises:
             ValueError: more times than the rasteriser draws at once (bins.MAX_FRAMES).
         """
-        view = self._shown = self._steer(camera, times)
+        view = self._steer(camera, times)
         with_values = values is not None
         if values is not None:
             view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
@@ -294,14 +293,17 @@ class CudaModel:
         """The picture of render(), already blended: a GPU does not divide it into bands."""
         return Blended(self.render_times(camera, [t], values)[0].to("cpu", copy=True).numpy())
 
-    def blend_values(self, values: Floats) -> Floats:
-        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
-        view = self._shown
-        if view is None:
-            raise ValueError("nothing has been rendered")
-        view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
-        image: Floats = view.rasterizer.render(view.values)[0, 5].cpu().numpy()
-        return image
+    def blended(self, camera: NDArray[np.float64], t: float, planes: Floats) -> Floats:
+        """planes [3, N], blended in place of R G B: [5, H, W]; a view the next render overwrites."""
+        view = self._steer(camera, [t])
+        control, wanted = view.control.values, torch.from_numpy(np.ascontiguousarray(planes, np.float32))
+        while True:
+            self.motion.deform(self._values, control, view.state, view.colour)
+            view.colour[0, :, : self.count] = wanted.to(self.device)
+            view.rasterizer.project_and_sort(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
+            image: Floats = view.rasterizer.render(None)[0].cpu().numpy()
+            if self._fitted(view):
+                return image
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * image), cotangents [5, H, W], to the Gaussians as they are at t, [VALUES, N]."""
@@ -347,7 +349,7 @@ class CudaModel:
         self._training.fit(len(chosen))
         for view in self._views.values():
             view.fit(len(chosen))
-        self._gradients = self._shown = None
+        self._gradients = None
 
     def parameters(self) -> dict[str, Tensor]:
         """The trained tensors by name; views."""
