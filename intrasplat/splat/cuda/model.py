@@ -99,6 +99,7 @@ class CudaModel:
         self._sent: list[int] = []  # the harmonics' degree of every step since the last wait
         self._learnt: StepSums | None = None
         self._gradients: Gradients | None = None
+        self._shown: FrameBuffers | None = None
 
     # Steps
 
@@ -270,7 +271,7 @@ class CudaModel:
         Raises:
             ValueError: more times than the rasteriser draws at once (bins.MAX_FRAMES).
         """
-        view = self._steer(camera, times)
+        view = self._shown = self._steer(camera, times)
         with_values = values is not None
         if values is not None:
             view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
@@ -349,7 +350,7 @@ class CudaModel:
         self._training.fit(len(chosen))
         for view in self._views.values():
             view.fit(len(chosen))
-        self._gradients = None
+        self._gradients = self._shown = None
 
     def parameters(self) -> dict[str, Tensor]:
         """The trained tensors by name; views."""
