@@ -241,7 +241,8 @@ class Views:
         attributes = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
         view = ViewRequest(
             drawn, request.t, pose, camera, self._device,
-            highlights=highlights, light=request.light, smoke=request.smoke, detail=request.detail,
+            highlights=highlights, light=request.light, smoke=request.smoke,
+            detail=request.detail if request.layer is Layer.RGB else "off",
             is_coarse=level > 0, max_pixels=request.max_pixels,
         )  # fmt: skip
         with traces.span("draw", **attributes):

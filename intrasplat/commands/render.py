@@ -126,7 +126,8 @@ def run_cli(options: argparse.Namespace) -> int:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
         frame = render_frame(
             scene, t, pose, camera, device,
-            highlights=highlights, light=options.light, smoke=options.smoke, detail=options.detail,
+            highlights=highlights, light=options.light, smoke=options.smoke,
+            detail=options.detail if layer is Layer.RGB else "off",
         )  # fmt: skip
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
