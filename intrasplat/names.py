@@ -57,6 +57,9 @@ Light = Literal["steady", "recorded"]
 Smoke = Literal["remove", "show"]
 """Whether a render shows the smoke that lay before the tissue when it was recorded."""
 
+Detail = Literal["on", "off"]
+"""Whether a render gets what the model misses of the recorded frames."""
+
 UsedFrames = Literal["new", "all"]
 """The frames of a clip that a model may be trained on."""
 
@@ -77,6 +80,8 @@ MASKS = "masks.zip"
 """The masks that were found, if any: one PNG per frame, in the format of a clip's `masks`."""
 RECORDED = "recorded.zip"
 """Recorded frames and their masks, unless the caller declined them (intrasplat/scene/recorded_file.py)."""
+DETAIL = "detail.mkv"
+"""Recorded training frames for views, if recorded frames are kept (intrasplat/scene/training_pictures.py)."""
 THUMBNAIL = "thumbnail.jpg"
 """A small picture for lists, created at the first request for it."""
 RESUME = "resume.safetensors"

@@ -119,6 +119,7 @@ class NoticeCode(StrEnum):
     TRAINING_SCORE_LOW = "training_score_low"
     # notices about one render
     COARSE = "coarse"
+    DETAIL_MISSING = "detail_missing"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"

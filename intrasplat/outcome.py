@@ -20,16 +20,18 @@ from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
 from intrasplat.splat.metrics import RIGHT_COLOUR
 from intrasplat.train.rate_distortion import QuantizedScene
 from intrasplat.train.run import Run
+from intrasplat.view.recorded import ClipPictures
 
 VERSIONED = ("intrasplat", "torch", "numba")
 """Packages that determine a scene's numbers; the report lists their versions."""
 
 
 def scene_of(run: Run, on_step: Callable[[], None] = lambda: None) -> TrainedScene:
-    """The scene of a trained run. Stray Gaussians are removed from its model first; then on_step is called."""
+    """The scene of a trained run, without pictures. Stray Gaussians are removed from its model first; then on_step is
+    called."""
     drop_strays(run.model, run.eyes)
     on_step()
-    return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)))
+    return dataclasses.replace(snapshot_of(run), seen=torch.from_numpy(trust(run.model, run.eyes)), pictures=None)
 
 
 def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
@@ -38,7 +40,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
     as_it_lies: faster, and enough for rendering (Model.export in intrasplat/splat/model.py).
     """
     gaussians, deformation = run.model.export(as_it_lies=as_it_lies)
-    clip = run.setup.clip
+    clip, keeps = run.setup.clip, run.setup.options.keep_recorded == "on"
     return TrainedScene(
         gaussians=gaussians,
         deformation=deformation,
@@ -51,6 +53,7 @@ def snapshot_of(run: Run, *, as_it_lies: bool = False) -> TrainedScene:
         seen=torch.zeros(len(gaussians)),
         right_eye_mm=_right_eye_mm(run),
         seed=run.seed,
+        pictures=ClipPictures(clip, len(run.eyes), run.setup.split.train) if keeps else None,
         settings={
             "made_iterations": run.iteration,
             "schedule": run.schedule.settings,

@@ -25,7 +25,7 @@ from intrasplat.machine.forecast import TimeEstimate
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from intrasplat.machine.timing import Timings
-from intrasplat.names import CURVE, MASKS, RECORDED, REPORT
+from intrasplat.names import CURVE, DETAIL, MASKS, RECORDED, REPORT
 from intrasplat.notices import Notice
 from intrasplat.outcome import scene_of, snapshot_of, training_of
 from intrasplat.poses import placed, read_poses, with_poses
@@ -37,6 +37,7 @@ from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.compact import compile_coder
 from intrasplat.scene.results import add_scores, without_scores
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.scene.training_pictures import EYES, StoredPictures
 from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.deformation import motion_named
@@ -52,8 +53,9 @@ from intrasplat.train.resume import resume
 from intrasplat.train.run import Run, write_curve
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup, length_of
-from intrasplat.view.recorded import EYES, zipped_frames
-from intrasplat.view.render import SceneRenderer
+from intrasplat.view.recorded import ClipPictures, detail_video, zipped_frames
+from intrasplat.view.renderer import SceneRenderer
+from intrasplat.view.transfer import compile_transfer
 
 SHRINKING = 0.15
 """Share of the training budget after which no coarser quantisation is tried."""
@@ -113,8 +115,12 @@ def make(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, re
             masks, recorded = background.submit(zipped_masks, setup.clip), background.submit(recorded_frames, run)
             scene, quantized = finish(run)
         frames, summary = recorded.result()
-        beside = {name: each for name, each in {MASKS: masks.result(), RECORDED: frames}.items() if each is not None}
+        beside = {name: each for name, each in {MASKS: masks.result(), **frames}.items() if each is not None}
         report = publish(out_dir, run, scene, quantized, warnings.result(), beside, summary)
+    if DETAIL in beside:
+        own = ClipPictures(setup.clip, len(run.eyes), setup.split.train)
+        pictures = StoredPictures(beside[DETAIL], lambda eye, frame: own.picture(eye, frame)[1])
+        scene = dataclasses.replace(scene, pictures=pictures)  # the caller may move the folder
     return Made(setup.clip, setup.split, scene, report, setup.device)
 
 
@@ -127,7 +133,8 @@ def score_scene(made: Made, hooks: Hooks) -> Report:
     """
     renderer = SceneRenderer(made.scene, made.device)
     del made.scene  # the renderer has the weights, and they take much memory
-    return score_model(made.report, made.clip, made.split.train, renderer.seen_from, hooks)
+    detailed = None if renderer.detail is None else partial(renderer.seen_from, detail=True)
+    return score_model(made.report, made.clip, made.split.train, renderer.seen_from, hooks, detailed)
 
 
 def score_stored_scene(request: ReconstructionRequest, directory: Path, hooks: TrainingHooks) -> Report:
@@ -171,7 +178,7 @@ def begin(request: ReconstructionRequest, out_dir: Path, hooks: TrainingHooks, k
     hooks.on_clip(clip)
     split = split_frames(clip, options.holdout)
     keep_free_memory(USUAL_BYTES)
-    timings.add("compile_s", compile_coder())
+    timings.add("compile_s", compile_coder() + compile_transfer())
     if device == CPU:
         timings.add("compile_s", compile_kernels(partial(hooks.report_stage, "compile")))
     by_kernels = motion_named(preset.deformation).has_kernels  # kernels have their own threads, so torch needs one
@@ -252,12 +259,16 @@ def finish(run: Run) -> tuple[TrainedScene, QuantizedScene | None]:
     return quantized.scene, quantized
 
 
-def recorded_frames(run: Run) -> tuple[bytes | None, Recorded | None]:
-    """The zip of recorded frames of the eyes trained on, and the report's entry for it; None, None if turned off."""
+def recorded_frames(run: Run) -> tuple[dict[str, bytes | None], Recorded | None]:
+    """The files of recorded frames of the eyes trained on, and the report's entry for them; {}, None if turned off."""
     if run.setup.options.keep_recorded == "off":
-        return None, None
+        return {}, None
+    clip, eyes = run.setup.clip, len(run.eyes)
     with run.setup.timings.measure("recorded_s"):
-        return zipped_frames(run.setup.clip, EYES[: len(run.eyes)])
+        zipped, summary = zipped_frames(clip, EYES[:eyes])
+        video = detail_video(clip, eyes, run.setup.split.train, summary)
+    size_bytes = summary.size_bytes + len(video or b"")
+    return {RECORDED: zipped, DETAIL: video}, summary.model_copy(update={"size_bytes": size_bytes})
 
 
 def publish(

@@ -25,7 +25,7 @@ from intrasplat.errors import InputError
 from intrasplat.export import export_parts
 from intrasplat.formats import EXPORT_FORMATS, check_export
 from intrasplat.machine.hooks import Progress, ignore, never
-from intrasplat.names import MANIFEST, REPORT, RESUME_STATE, Light, Smoke
+from intrasplat.names import MANIFEST, REPORT, RESUME_STATE, Detail, Light, Smoke
 from intrasplat.options import FIELD_PREFIX, ReconstructionOptions, parse_options
 from intrasplat.picture import MAX_RENDER_PIXELS, IntrinsicsOverride
 from intrasplat.pipeline import reconstruct as run_pipeline
@@ -104,6 +104,7 @@ class Scene:
         highlights: bool = True,
         light: Light = "steady",
         smoke: Smoke = "remove",
+        detail: Detail = "on",
     ) -> View:
         """The scene at model time t from a pose, instruments removed.
 
@@ -116,6 +117,8 @@ class Scene:
             light: "steady": where exposure or white balance change in the clip, or the border is dark, the even light
                 of one frame at all times; "recorded": that in which the moment was recorded.
             smoke: "show": behind the smoke that was found before the tissue; "remove": without it.
+            detail: "on": with what the model misses of the recorded frames nearest in time, if they are kept; "off":
+                the model alone.
 
         Returns:
             A View with rgb [H, W, 3] uint8, depth_mm [H, W] float32 (0: nothing solid), confidence [H, W] float32 in
@@ -142,10 +145,11 @@ class Scene:
                 field, problem = str(first["loc"][0]), f"{first['input']} is not accepted: {first['msg']}."
                 raise InputError(field, problem, "Give 8 to 8192 pixels.") from error
             camera = camera_of(self.intrinsics, wanted, MAX_RENDER_PIXELS)
-        device = choose_device(self._device)
         world_from_camera = self._world_from_camera(pose)
-        own = self.trained
-        return render_frame(own, t, world_from_camera, camera, device, highlights=highlights, light=light, smoke=smoke)
+        return render_frame(
+            self.trained, t, world_from_camera, camera, choose_device(self._device),
+            highlights=highlights, light=light, smoke=smoke, detail=detail,
+        )  # fmt: skip
 
     def _world_from_camera(self, pose: Any) -> NDArray[np.float64] | None:
         if isinstance(pose, np.ndarray):

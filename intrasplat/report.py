@@ -210,6 +210,16 @@ class Imported(BaseModel):
     imported_at_s: float = Field(ge=0, description="when it was imported, UNIX s")
 
 
+class DetailScores(BaseModel):
+    """Scores of a scene's views with detail from the recorded training frames, of the same held-out frames."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    psnr_tissue_db: float | None
+    psnr_right_db: float | None
+    ssim: float | None
+
+
 class Report(BaseModel):
     """Every finished scene has one. A figure is None only if it could not be measured, and then warnings say why; or
     while `scored` is False: a scene is finished before its scores are.
@@ -242,6 +252,11 @@ class Report(BaseModel):
     )
     baseline_warp_clear_db: float | None = Field(default=None, description="the same without highlights")
     ssim: float | None
+    detail: DetailScores | None = Field(
+        default=None,
+        description="scores of views with detail from recorded frames, which callers see by default; the others are of "
+        "the model alone. None: recorded frames are not kept, or version 0.3",
+    )
     baseline_blend_db: float | None = Field(description="psnr_tissue_db of blending the nearest training frames")
     baseline_flow_db: float | None = Field(description="the same, each warped half-way by optical flow first")
     depth_agreement_mm: float | None = Field(description="median |rendered - stereo depth| on held-out tissue")

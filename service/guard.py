@@ -37,7 +37,7 @@ EXPOSED_HEADERS = (
     *(
         f"X-Intrasplat-{name}"
         for name in (
-            *("Scene", "State", "Next", "T", "Iteration", "Unseen", "Camera"),
+            *("Scene", "State", "Next", "T", "Iteration", "Unseen", "Detail", "Camera"),
             *("Depth-Unit", "Depth-Range-Mm", "Warning", "Warning-Codes"),
         )
     ),

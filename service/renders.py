@@ -19,7 +19,7 @@ from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
-from intrasplat.names import Eye, Light, Smoke
+from intrasplat.names import Detail, Eye, Light, Smoke
 from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 from intrasplat.pose import Pose, parse_pose
@@ -41,6 +41,11 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
         "headers": {
             "X-Intrasplat-Unseen": {
                 "description": "share of the view that no training frame saw, hatched unless unseen=guess",
+                "required": True,
+                "schema": {"type": "number", "minimum": 0, "maximum": 1},
+            },
+            "X-Intrasplat-Detail": {
+                "description": "share of the view's tissue whose detail comes from recorded frames",
                 "required": True,
                 "schema": {"type": "number", "minimum": 0, "maximum": 1},
             },
@@ -156,6 +161,11 @@ class RenderQuery(ViewQuery):
         default="remove",
         description="show: layer rgb is drawn behind the smoke that was found before the tissue; remove: without it",
     )
+    detail: Detail = Field(
+        default="on",
+        description="on: layer rgb gets what the model misses of the recorded frames nearest in time; off: the model "
+        "alone. Changes nothing where recorded frames are not kept",
+    )
 
 
 @dataclass(frozen=True)
@@ -195,6 +205,7 @@ async def render(
     is_coarse = NoticeCode.COARSE in [each.code for each in answer.head.warnings]
     response.headers.update(cache_headers(shown, tag, is_coarse=is_coarse))
     response.headers["X-Intrasplat-Unseen"] = f"{answer.head.unseen:.3f}"
+    response.headers["X-Intrasplat-Detail"] = f"{answer.head.detail:.3f}"
     if answer.head.depth_range_mm is not None:
         response.headers["X-Intrasplat-Depth-Range-Mm"] = " ".join(f"{each:.0f}" for each in answer.head.depth_range_mm)
     if answer.head.camera is not None:
@@ -306,6 +317,7 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         highlights=query.highlights,
         light=query.light,
         smoke=query.smoke,
+        detail=query.detail,
         max_pixels=settings.max_render_pixels,
     )
 

@@ -74,6 +74,7 @@ class StreamHead(BaseModel):
     t: float
     iteration: int | None
     unseen: float
+    detail: float
     warnings: tuple[Notice, ...]
     media_type: str
     depth_range_mm: tuple[float, float] | None
@@ -277,6 +278,7 @@ def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float
         t=answer.head.t,
         iteration=answer.head.iteration,
         unseen=round(answer.head.unseen, 3),
+        detail=round(answer.head.detail, 3),
         warnings=answer.head.warnings,
         media_type=answer.head.media_type,
         depth_range_mm=answer.head.depth_range_mm,

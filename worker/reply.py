@@ -21,6 +21,7 @@ class Reply:
 
     iteration: iteration of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
+    detail: share of a render's tissue whose detail comes from recorded frames.
     gaussians, clip_size, camera, depth_range_mm: as in WorkerReply.
     level: level of detail at which it was rendered (intrasplat/view/coarse.py); 0 is full detail.
     is_untimed: the reply comes from the cache or is no render; its time is not used to predict that of renders.
@@ -33,6 +34,7 @@ class Reply:
     warnings: tuple[Notice, ...] = ()
     iteration: int | None = None
     unseen: float = 0.0
+    detail: float = 0.0
     gaussians: int = 0
     clip_size: tuple[int, int] | None = None
     level: int = 0

@@ -184,6 +184,7 @@ def _head(reply: Reply, seconds: float) -> WorkerReply:
         warnings=reply.warnings,
         iteration=reply.iteration,
         unseen=reply.unseen,
+        detail=reply.detail,
         gaussians=reply.gaussians,
         clip_size=reply.clip_size,
         camera=reply.camera,

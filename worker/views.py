@@ -45,13 +45,15 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cpu.threads import beside
 from intrasplat.view.camera import camera_of, endoscope_pose, pose_of, right_eye, seen_through
 from intrasplat.view.coarse import LEVELS, thinned
+from intrasplat.view.detail import detail_bytes
 from intrasplat.view.encode import FOR_EYES, encode_layer
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses
 from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
 from intrasplat.view.recorded import live_frame, stored_frame
-from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts, renderer_of
+from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts
+from intrasplat.view.renderer import renderer_of
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.reply import NotYetError, Reply
@@ -240,6 +242,7 @@ class Views:
         view = ViewRequest(
             drawn, request.t, pose, camera, self._device,
             highlights=highlights, light=request.light, smoke=request.smoke,
+            detail=request.detail if request.layer is Layer.RGB else "off",
             is_coarse=level > 0, max_pixels=request.max_pixels,
         )  # fmt: skip
         with traces.span("draw", **attributes):
@@ -299,7 +302,7 @@ class Views:
         self.cached = tuple(name for name, _ in self._scenes)
 
     def _byte_count(self) -> int:
-        return COPIES * sum(scene.byte_count for scene in self._scenes.values())
+        return sum(COPIES * scene.byte_count + detail_bytes(scene) for scene in self._scenes.values())
 
 
 def _encoded(frame: View, request: RenderRequest, depth_range_mm: tuple[float, float] | None) -> Parts[bytes]:
@@ -329,7 +332,7 @@ def _reply(scene: TrainedScene, frame: View, request: RenderRequest, snapshot: S
     shown, _ = clamped_to_clip(scene, request.t)
     clip_size = scene.intrinsics.width, scene.intrinsics.height
     media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, count, clip_size)
+    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, frame.detail_share, count, clip_size)
 
 
 def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:

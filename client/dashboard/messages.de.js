@@ -41,6 +41,7 @@ export const DE = {
     "depth_jumps": "Die gemessene Tiefe springt von Bild zu Bild.",
     "depth_out_of_range": "Teile liegen außerhalb des Bereichs, in dem nach Tiefe gesucht wurde.",
     "depth_unusual": "Der Abstand zum Gewebe ist für ein Endoskop ungewöhnlich; prüfen Sie die Kalibrierung.",
+    "detail_missing": "Die aufgenommenen Bilder sind beschädigt: Das Modell wird allein gezeigt.",
     "detail_lost": "Ein Teil des Bildes wurde unscharf: durch einen Tropfen auf der Linse oder Blut oder Wasser auf dem Gewebe.",
     "eyes_coloured_apart": "Die beiden Augen hatten verschiedene Farben; das wurde korrigiert.",
     "eyes_disagree": "Die beiden Augen passen nicht zusammen: Aufnahme oder Kalibrierung ist fehlerhaft.",

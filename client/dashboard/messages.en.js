@@ -41,6 +41,7 @@ export const EN = {
     "depth_jumps": "The measured depth jumps from frame to frame.",
     "depth_out_of_range": "Parts lie outside the range in which depth was looked for.",
     "depth_unusual": "The distance to the tissue is unusual for an endoscope; check the calibration.",
+    "detail_missing": "The recorded frames are damaged: the model is shown alone.",
     "detail_lost": "A part of the picture became blurred: a drop on the lens, or blood or water on the tissue.",
     "eyes_coloured_apart": "The two eyes differed in colour; that was corrected.",
     "eyes_disagree": "The two eyes do not fit together: something is wrong with recording or calibration.",

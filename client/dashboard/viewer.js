@@ -204,7 +204,7 @@ export class Viewer extends EventTarget {
       if (!picture.isRecorded) this.clip.follow(picture);
       this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
       this.#tell(name, picture, performance.now() - began);
-      if (isDrawnHere) await this.memory.player?.settled();
+      if (isDrawnHere) await this.#refine(view, visit, name);
       else if (picture.state === "done") this.memory.want(view);
     } catch (error) {
       if (visit !== this.visit) return;
@@ -227,6 +227,24 @@ export class Viewer extends EventTarget {
     clearTimeout(this.resting);
     if (isMoving && !this.timeline.isPlaying) this.resting = setTimeout(() => this.refresh(), 2 * REST_MS);
     return this.memory.draw(view, room, { isMoving, isTimed: this.way.isOpen });
+  }
+
+  /** Show the service's picture of a view that rests: only it has the detail of recorded frames. */
+  async #refine(view, visit, name) {
+    await this.memory.player?.settled();
+    if (this.isMoving || this.isWanted || !this.memory.player?.hasDetail) return;
+    const began = performance.now();
+    try {
+      const picture = judged(await this.pictures.ask(view), view);
+      const image = await createImageBitmap(picture.blob);
+      if (visit !== this.visit || this.isWanted) return;
+      this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
+      this.shown = shownOf(view, picture);
+      this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
+      this.#tell(name, picture, performance.now() - began);
+    } catch {
+      // What is drawn here stays; #confirm() says whether the service still has the scene.
+    }
   }
 
   #view(scene) {

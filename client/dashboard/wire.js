@@ -46,6 +46,13 @@
  *   retry_after_s?: number | null,
  * }} DeliveryTry
  */
+/**
+ * @typedef {{
+ *   psnr_tissue_db: number | null,
+ *   psnr_right_db: number | null,
+ *   ssim: number | null,
+ * }} DetailScores
+ */
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
@@ -194,7 +201,7 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"bit_depth"|"calibration"|"decoding"|"depth_unit"|"field_of_view"|"frame_times"|"imported"|"interlaced"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"pixel_aspect"|"poses"|"rectification"|"rotation"|"splashes"|"synthetic"|"bases"|"early_stopping"|"exposure"|"smoke"|"spacing"|"stored_precision"|"vignetting"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"damaged_frames"|"depth_inverted"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"detail_lost"|"eyes_coloured_apart"|"eyes_disagree"|"eyes_out_of_step"|"few_frames"|"field_of_view_unusual"|"frames_show_nothing"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"mask_levels"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_contradict"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"motion_guessed"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"bit_depth"|"calibration"|"decoding"|"depth_unit"|"field_of_view"|"frame_times"|"imported"|"interlaced"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"pixel_aspect"|"poses"|"rectification"|"rotation"|"splashes"|"synthetic"|"bases"|"early_stopping"|"exposure"|"smoke"|"spacing"|"stored_precision"|"vignetting"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"damaged_frames"|"depth_inverted"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"detail_lost"|"eyes_coloured_apart"|"eyes_disagree"|"eyes_out_of_step"|"few_frames"|"field_of_view_unusual"|"frames_show_nothing"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"mask_levels"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_contradict"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"motion_guessed"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"detail_missing"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   frames: number[],
@@ -229,6 +236,7 @@
  *   baseline_warp_db?: number | null,
  *   baseline_warp_clear_db?: number | null,
  *   ssim: number | null,
+ *   detail?: DetailScores | null,
  *   baseline_blend_db: number | null,
  *   baseline_flow_db: number | null,
  *   depth_agreement_mm: number | null,

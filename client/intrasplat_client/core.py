@@ -195,6 +195,7 @@ class Core:
         highlights: str | None = None,
         light: str | None = None,
         smoke: str | None = None,
+        detail: str | None = None,
         known: Image | None = None,
         **camera: float,
     ) -> Image:
@@ -212,10 +213,11 @@ class Core:
         light: steady (the default) shows rgb in the light of one frame, recorded in that of the moment; they differ
             where exposure or white balance change in the clip, or its border is dark.
         smoke: remove (the default) shows rgb without the smoke that was found before the tissue, show with it.
+        detail: on (the default) adds what the model misses of the recorded frames nearest in time, off does not.
         known: an earlier view; it is returned if it is still what the service would send.
         camera: width, height, fx, fy, cx, cy in pixels.
         """
-        query = view_query(t, scene, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
+        query = view_query(t, scene, pose, layer, format, quality, unseen, highlights, light, smoke, detail, camera)
         return await views.render(self._session, query, known)
 
     async def render_array(
@@ -230,17 +232,18 @@ class Core:
         highlights: str | None = None,
         light: str | None = None,
         smoke: str | None = None,
+        detail: str | None = None,
         **camera: float,
     ) -> NDArray[Any]:
         """One view's exact values: uint8 [H, W, 3] of rgb, float32 [H, W] of depth (mm, 0 invalid) and confidence.
 
         unseen as render has it: marked, rgb shows the hatch, and depth and confidence 0. highlights, light,
-        smoke: as there.
+        smoke, detail: as there.
 
         Raises:
             ImportError: numpy is not installed.
         """
-        query = view_query(t, scene, pose, layer, "npy", None, unseen, highlights, light, smoke, camera)
+        query = view_query(t, scene, pose, layer, "npy", None, unseen, highlights, light, smoke, detail, camera)
         return (await views.render(self._session, query, None)).array()
 
     async def scenes(

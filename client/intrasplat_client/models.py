@@ -146,6 +146,7 @@ class NoticeCode(StrEnum):
     TIME_TOO_SHORT = "time_too_short"
     TRAINING_SCORE_LOW = "training_score_low"
     COARSE = "coarse"
+    DETAIL_MISSING = "detail_missing"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
@@ -253,6 +254,14 @@ class DeliveryTry(Model):
     """why it failed; None: the webhook was delivered"""
     retry_after_s: float | None = None
     """for how long a receiver that answered 429 or 503 asked to be left alone (Retry-After)"""
+
+
+class DetailScores(Model):
+    """Scores of a scene's views with detail from the recorded training frames, of the same held-out frames."""
+
+    psnr_tissue_db: float | None
+    psnr_right_db: float | None
+    ssim: float | None
 
 
 class FieldOfView(Model):
@@ -547,6 +556,10 @@ class Report(Model):
     baseline_warp_clear_db: float | None = None
     """the same without highlights"""
     ssim: float | None
+    detail: DetailScores | None = None
+    """scores of views with detail from recorded frames, which callers see by default; the others are of the model
+    alone. None: recorded frames are not kept, or version 0.3
+    """
     baseline_blend_db: float | None
     """psnr_tissue_db of blending the nearest training frames"""
     baseline_flow_db: float | None

@@ -44,11 +44,14 @@ class StreamMessages:
         highlights: str | None,
         light: str | None,
         smoke: str | None,
+        detail: str | None,
         camera: dict[str, float],
     ) -> str:
         """The message that asks for a view."""
         self._last_id += 1
-        query = view_query(t, self._scene, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
+        query = view_query(
+            t, self._scene, pose, layer, format, quality, unseen, highlights, light, smoke, detail, camera
+        )
         return json.dumps({"id": self._last_id, **query})
 
     def answer(self, message: str | bytes) -> Image | None:
@@ -102,11 +105,14 @@ class Viewer:
         highlights: str | None = None,
         light: str | None = None,
         smoke: str | None = None,
+        detail: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         try:
-            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
+            message = self._messages.request(
+                t, pose, layer, format, quality, unseen, highlights, light, smoke, detail, camera
+            )
             self._socket.send(message)
             while True:
                 image = self._messages.answer(self._socket.recv(ANSWER_TIMEOUT_S))
@@ -148,13 +154,16 @@ class AsyncViewer:
         highlights: str | None = None,
         light: str | None = None,
         smoke: str | None = None,
+        detail: str | None = None,
         **camera: float,
     ) -> Image:
         """One view; arguments as Client.render has them."""
         import asyncio
 
         try:
-            message = self._messages.request(t, pose, layer, format, quality, unseen, highlights, light, smoke, camera)
+            message = self._messages.request(
+                t, pose, layer, format, quality, unseen, highlights, light, smoke, detail, camera
+            )
             await self._socket.send(message)
             async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 while True:

@@ -51,7 +51,8 @@ class Image:
     """A rendered view: the encoded file, and what it shows.
 
     state is "running" for a view of a job that still trains; iteration is then the step of the snapshot. unseen is the
-    share of the view that no training frame saw, and camera the picture's; None: the service is too old to send them.
+    share of the view that no training frame saw, detail that of its tissue whose detail comes from recorded frames, and
+    camera the picture's; None: the service is too old to send them.
     warning_codes are those of docs/codes.md, and warning their texts; they say nothing of the scene itself, as its
     report does.
     """
@@ -63,6 +64,7 @@ class Image:
     state: str = "done"
     iteration: int | None = None
     unseen: float | None = None
+    detail: float | None = None
     warning: str | None = None
     warning_codes: tuple[str, ...] = ()
     etag: str | None = None
@@ -98,11 +100,12 @@ def view_query(
     highlights: str | None,
     light: str | None,
     smoke: str | None,
+    detail: str | None,
     camera: Mapping[str, float],
 ) -> dict[str, Any]:
     """The parameters of a view for GET /render and for messages of the stream."""
     values = {"t": t, "scene": scene, "pose": pose, "layer": layer, "format": format, "quality": quality}
-    shown = {"unseen": unseen, "highlights": highlights, "light": light, "smoke": smoke}
+    shown = {"unseen": unseen, "highlights": highlights, "light": light, "smoke": smoke, "detail": detail}
     return {name: value for name, value in {**values, **shown, **camera}.items() if value is not None}
 
 
@@ -125,6 +128,7 @@ def _image_of(response: httpx.Response) -> Image:
         state=about["state"],
         iteration=int(about["iteration"]) if "iteration" in about else None,
         unseen=float(about["unseen"]) if "unseen" in about else None,
+        detail=float(about["detail"]) if "detail" in about else None,
         warning=about.get("warning"),
         warning_codes=tuple(filter(None, about.get("warning-codes", "").split(", "))),
         etag=about.get("etag"),
@@ -158,6 +162,7 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             state=head["state"],
             iteration=head["iteration"],
             unseen=head.get("unseen"),
+            detail=head.get("detail"),
             warning="; ".join(each["text"] for each in head["warnings"]) or None,
             warning_codes=tuple(each["code"] for each in head["warnings"]),
             render_ms=head["render_ms"],

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from contract.wire.cameras import CamerasRequest, ClipCamera
 from intrasplat.formats import ExportOptions
 from intrasplat.measuring import MAX_POINTS, Point
-from intrasplat.names import JOB_ID_PATTERN, Eye, Light, Smoke
+from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
 from intrasplat.notices import Notice
 from intrasplat.picture import (
     MAX_JUDGED_PIXELS,
@@ -64,7 +64,8 @@ class RenderRequest(BaseModel):
     highlights: Highlights = Highlights.ON
     light: Light = Field(default="steady", exclude_if=lambda light: light == "steady")
     smoke: Smoke = Field(default="remove", exclude_if=lambda smoke: smoke == "remove")
-    """light and smoke are left out of JSON if they are the default: workers of older versions do not know them."""
+    detail: Detail = Field(default="on", exclude_if=lambda detail: detail == "on")
+    """light, smoke and detail are left out of JSON if they are the default: older workers do not know them."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
     """The most that may be drawn for it."""
 
@@ -177,6 +178,8 @@ class WorkerReply(BaseModel):
     """The iteration of the snapshot that is shown; None: the scene is finished."""
     unseen: float = 0.0
     """Share of a render's pixels that no training frame saw, in [0, 1]."""
+    detail: float = 0.0
+    """Share of a render's tissue whose detail comes from recorded frames, in [0, 1]."""
     render_ms: float = 0.0
     gaussians: int = 0
     """Number of Gaussians of the scene that is shown; 0: not known."""

@@ -20,7 +20,7 @@ from intrasplat.commands.exits import ExitCode
 from intrasplat.commands.progress_bar import ProgressBar
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.files.durable import temporary_path
-from intrasplat.names import CURVE, MANIFEST, MASKS, RECORDED, REPORT, RESUME_STATE, SCENE
+from intrasplat.names import CURVE, DETAIL, MANIFEST, MASKS, RECORDED, REPORT, RESUME_STATE, SCENE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.report import Report
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from intrasplat.machine.hooks import Hooks
 
 
-_BEFORE_MANIFEST = (*RESUME_STATE, REPORT, CURVE, MASKS, RECORDED, SCENE)
+_BEFORE_MANIFEST = (*RESUME_STATE, REPORT, CURVE, MASKS, RECORDED, DETAIL, SCENE)
 UNFINISHED = {*_BEFORE_MANIFEST, *(temporary_path(Path(name)).name for name in (*_BEFORE_MANIFEST, MANIFEST))}
 """Files that a stopped or killed run may leave. The manifest is written last: it marks a finished scene."""
 
@@ -107,8 +107,10 @@ def _compile(on_cpu: bool) -> None:
     """Compile the kernels for the CPU, or load them from the cache."""
     from intrasplat.scene.compact import compile_coder
     from intrasplat.splat.cpu import compile_kernels
+    from intrasplat.view.transfer import compile_transfer
 
     compile_coder()
+    compile_transfer()
     if on_cpu:
         compile_kernels()
 

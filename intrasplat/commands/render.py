@@ -13,7 +13,7 @@ from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
-from intrasplat.names import Light, Smoke
+from intrasplat.names import Detail, Light, Smoke
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 SUFFIX_FORMATS = {
@@ -68,6 +68,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         help="show: behind the smoke that was found before the tissue; remove: without it (default: remove)",
     )
     parser.add_argument(
+        "--detail",
+        choices=get_args(Detail),
+        default="on",
+        help="on: with what the model misses of the recorded frames nearest in time, if they are kept; off: the model "
+        "alone (default: on)",
+    )
+    parser.add_argument(
         "--highlights",
         choices=[each.value for each in Highlights],
         default=Highlights.ON.value,
@@ -102,7 +109,8 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
     from intrasplat.view.encode import encode_layer
-    from intrasplat.view.render import render_frame, renderer_of
+    from intrasplat.view.render import render_frame
+    from intrasplat.view.renderer import renderer_of
 
     device = choose_device(options.device)
     check_is_scene(options.scene, "SCENE")
@@ -117,8 +125,10 @@ def run_cli(options: argparse.Namespace) -> int:
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
         frame = render_frame(
-            scene, t, pose, camera, device, highlights=highlights, light=options.light, smoke=options.smoke
-        )
+            scene, t, pose, camera, device,
+            highlights=highlights, light=options.light, smoke=options.smoke,
+            detail=options.detail if layer is Layer.RGB else "off",
+        )  # fmt: skip
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(

@@ -25,6 +25,6 @@ def depth_parts(target: ExportTarget) -> Iterator[bytes]:
     target.check_size(4 * camera.width * camera.height)
     yield npy_head((len(target.frames), camera.height, camera.width))
     for frame in target.frames:
-        shown = render_frame(target.scene, target.time_of(frame), device=target.device)
+        shown = render_frame(target.scene, target.time_of(frame), device=target.device, detail="off")
         yield np.where(shown.unseen, np.float32(0), shown.depth_mm).astype("<f4").tobytes()
         yield b""

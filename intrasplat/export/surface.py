@@ -107,7 +107,7 @@ def _views(target: ExportTarget) -> Iterator[_SurfaceView]:
     for yaw_deg, pitch_deg in ((0, 0), (SIDE_DEG, 0), (-SIDE_DEG, 0), (0, SIDE_DEG), (0, -SIDE_DEG)):
         around = OrbitPose(yaw_deg=yaw_deg, pitch_deg=pitch_deg, zoom=1)
         pose = own @ np.array(world_from_camera(around, pivot_mm))
-        frame = render_frame(scene, t, pose, device=target.device)
+        frame = render_frame(scene, t, pose, device=target.device, detail="off")
         depth_mm = np.where(frame.unseen | _edges(frame.depth_mm), np.float32(0), frame.depth_mm)
         if pivot_mm == 0.0:
             if not depth_mm.any():

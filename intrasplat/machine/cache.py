@@ -23,7 +23,13 @@ import numba
 from numba.core.caching import FunctionCache
 
 
-def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never", error_model: str = "python") -> Any:
+def kernel(
+    function: Callable[..., Any] | None = None,
+    *,
+    inline: str = "never",
+    error_model: str = "python",
+    fuses: bool = False,
+) -> Any:
     """Declare a function as a kernel: compiled by Numba at its first call, cached on disk, and run without the GIL.
 
     The declaration touches no file. Numba's own `cache=True` would choose the folder during import.
@@ -31,10 +37,12 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: str = "never",
     Args:
         inline: "always" copies the kernel into those that call it.
         error_model: "numpy": a division by zero gives inf or NaN instead of an exception.
+        fuses: whether a product and a sum may become one instruction, which rounds once.
     """
     if function is None:
-        return lambda declared: kernel(declared, inline=inline, error_model=error_model)
-    dispatcher = numba.njit(nogil=True, inline=inline, error_model=error_model)(function)
+        return lambda declared: kernel(declared, inline=inline, error_model=error_model, fuses=fuses)
+    fastmath = {"contract"} if fuses else False
+    dispatcher = numba.njit(nogil=True, inline=inline, error_model=error_model, fastmath=fastmath)(function)
     dispatcher._cache = _LateCache(function)
     return dispatcher
 

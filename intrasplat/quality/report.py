@@ -20,7 +20,7 @@ from intrasplat.names import Eyes
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.baselines import CopyBaselines
 from intrasplat.quality.right_eye import RightScores
-from intrasplat.report import FrameScore, LightChanges, Report
+from intrasplat.report import DetailScores, FrameScore, LightChanges, Report
 from intrasplat.splat.metrics import (
     clear_of_highlights,
     coverage,
@@ -179,7 +179,12 @@ def first_report(clip: DepthClip, split: FrameSplit, training: Training, warning
 
 
 def scored_report(
-    first: Report, held_out: Scores, right: RightScores, trained: Scores, baselines: CopyBaselines
+    first: Report,
+    held_out: Scores,
+    right: RightScores,
+    trained: Scores,
+    baselines: CopyBaselines,
+    detail: DetailScores | None = None,
 ) -> Report:
     """The report with its scores.
 
@@ -189,9 +194,11 @@ def scored_report(
         right: measure_right(clip, first.held_out, ...).
         trained: measure(clip, sample_frames(train), ...), for the comparison.
         baselines: copy_baselines(clip, train, first.held_out).
+        detail: detail_scores() of views with detail from recorded frames.
     """
     known = [each for each in first.warnings if each.code is not NoticeCode.SCORES_PENDING]
-    found = score_warnings(held_out, trained, baselines) + right_eye_warnings(held_out, right)
+    shown_db = None if detail is None else detail.psnr_tissue_db
+    found = score_warnings(held_out, trained, baselines, shown_db) + right_eye_warnings(held_out, right)
     scores = {
         "psnr_tissue_db": _mean(held_out.psnr_tissue_db),
         "psnr_clear_db": _mean(held_out.psnr_clear_db),
@@ -201,6 +208,7 @@ def scored_report(
         "baseline_warp_clear_db": _mean(right.warp_clear_db),
         "psnr_paper_db": _mean(held_out.psnr_paper_db),
         "ssim": _mean(held_out.ssim),
+        "detail": detail,
         "baseline_blend_db": _mean(baselines.blend_db),
         "baseline_flow_db": _mean(baselines.flow_db),
         "depth_agreement_mm": _known(held_out.depth_agreement_mm),
@@ -211,12 +219,24 @@ def scored_report(
     return first.model_copy(update={**scores, "scored": True, "warnings": tuple(dict.fromkeys([*known, *found]))})
 
 
-def score_warnings(held_out: Scores, trained: Scores, baselines: CopyBaselines) -> list[Notice]:
-    """Warnings about the model that follow from its scores, and reasons for missing scores."""
+def detail_scores(held_out: Scores, right: RightScores) -> DetailScores:
+    """The report's scores of views with detail from recorded frames."""
+    return DetailScores(
+        psnr_tissue_db=_mean(held_out.psnr_tissue_db), psnr_right_db=_mean(right.psnr_db), ssim=_mean(held_out.ssim)
+    )
+
+
+def score_warnings(
+    held_out: Scores, trained: Scores, baselines: CopyBaselines, detail_db: float | None = None
+) -> list[Notice]:
+    """Warnings about the model that follow from its scores, and reasons for missing scores.
+
+    detail_db: psnr_tissue_db with detail from recorded frames; None: there is none.
+    """
     model_db = _mean(held_out.psnr_tissue_db)
     train_db = _mean(trained.psnr_tissue_db)
     found = _missing(held_out, model_db)
-    found += _worse_than_copying(model_db, baselines)
+    found += _worse_than_copying(model_db if detail_db is None else detail_db, baselines)
     if train_db is not None and train_db < MIN_TRAIN_DB:
         found.append(
             Notice.warning(

@@ -13,7 +13,7 @@ from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.quality.baselines import copy_baselines
-from intrasplat.quality.report import measure, scored_report
+from intrasplat.quality.report import detail_scores, measure, scored_report
 from intrasplat.quality.right_eye import measure_right
 from intrasplat.report import Report
 from intrasplat.train.hooks import RenderedFrame
@@ -22,22 +22,30 @@ from intrasplat.train.scoring import FrameRenderer, Mapping, PoseRenderer, sampl
 STAGE = "score"
 
 
-def score_model(first: Report, clip: DepthClip, train: Sequence[int], render: PoseRenderer, hooks: Hooks) -> Report:
+def score_model(
+    first: Report,
+    clip: DepthClip,
+    train: Sequence[int],
+    render: PoseRenderer,
+    hooks: Hooks,
+    detailed: PoseRenderer | None = None,
+) -> Report:
     """The report with the scores of the model's held-out frames, of the right eye's, and of the copy baselines.
 
     Args:
         first: the report of the model before it was scored.
         train: the frames that the model was trained on.
         render: renders the model; several threads may call it.
+        detailed: the same with detail from recorded frames; None: they are not kept.
 
     Raises:
         TrainingDiverged: a render contains NaN or infinity.
         Cancelled: hooks.should_stop said so.
     """
     started_s, sampled = time.perf_counter(), sample_frames(train)
-    total, done = 2 * len(first.held_out) + len(sampled), 0
+    total, done = (2 if detailed is None else 4) * len(first.held_out) + len(sampled), 0
 
-    def views(eye: DepthClip | Eye) -> FrameRenderer:
+    def views(eye: DepthClip | Eye, render: PoseRenderer = render) -> FrameRenderer:
         """A function that renders the frame with an index from the eye's own pose."""
 
         def view(index: int) -> RenderedFrame:
@@ -58,8 +66,13 @@ def score_model(first: Report, clip: DepthClip, train: Sequence[int], render: Po
         held_out = measure(clip, first.held_out, views(clip), each)
         right = measure_right(clip, first.held_out, views(clip.right or clip), each)
         trained = measure(clip, sampled, views(clip), each, compared=not first.held_out)
+        detail = None
+        if detailed is not None:
+            left_views, right_views = views(clip, detailed), views(clip.right or clip, detailed)
+            shown = measure(clip, first.held_out, left_views, each)
+            detail = detail_scores(shown, measure_right(clip, first.held_out, right_views, each))
         baselines = copied.result()
-    report = scored_report(first, held_out, right, trained, baselines)
+    report = scored_report(first, held_out, right, trained, baselines, detail)
     made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db
     hooks.on_progress(Progress(STAGE, 1.0, made, made, psnr_db=left_db, psnr_right_db=right_db))
     return report.model_copy(update={"seconds": {**first.seconds, "score_s": time.perf_counter() - started_s}})

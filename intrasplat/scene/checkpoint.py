@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,11 @@ from torch import Tensor
 from intrasplat.camera import Intrinsics
 from intrasplat.errors import InputError, SceneError
 from intrasplat.files.durable import FOR_ALL, replace_file
-from intrasplat.names import MANIFEST, SCENE
+from intrasplat.names import DETAIL, MANIFEST, SCENE
 from intrasplat.scene.compact import unpack
 from intrasplat.scene.files import dtype_name, parse_tensors, read_file
 from intrasplat.scene.scene import TrainedScene, check, check_finite
+from intrasplat.scene.training_pictures import pictures_of
 from intrasplat.splat.deformation import MOTIONS, Deformation, restore
 from intrasplat.splat.gaussians import Gaussians
 
@@ -105,7 +107,7 @@ def load_scene(directory: Path) -> TrainedScene:
     except MISFITS as error:
         raise SceneError(f"The scene in {directory} does not fit its manifest: {error!r}.") from error
     check(scene)
-    return scene
+    return replace(scene, pictures=pictures_of(directory)) if (directory / DETAIL).is_file() else scene
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

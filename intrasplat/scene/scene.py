@@ -23,6 +23,7 @@ from intrasplat.motion.veil import Veil
 from intrasplat.motion.vignetting import Vignetting
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.scene.files import dtype_name
+from intrasplat.scene.training_pictures import TrainingPictures
 from intrasplat.splat.deformation import Deformation
 from intrasplat.splat.gaussians import Gaussians
 
@@ -60,6 +61,7 @@ class TrainedScene:
                             decide how much of the Gaussians' gloss a view shows; None: the model has no gloss
     stored                  compact tensors, which are written to disk instead of the model's own, and from which
                             gaussians, deformation and seen were unpacked; None: the scene is exact
+    pictures                recorded pictures of the training frames; None: they are not kept
     """
 
     gaussians: Gaussians
@@ -75,6 +77,7 @@ class TrainedScene:
     seed: int = 0
     settings: dict[str, Any] = field(default_factory=dict)
     stored: Mapping[str, Tensor] | None = None
+    pictures: TrainingPictures | None = None
 
     @property
     def frame_count(self) -> int:

@@ -138,8 +138,11 @@ class Model(Protocol):
         """The same picture, bit-identical, to be blended in bands of rows. The caller closes it."""
         ...
 
-    def blend_values(self, values: Floats) -> Floats:
-        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
+    def blended(self, camera: NDArray[np.float64], t: float, planes: Floats) -> Floats:
+        """Three numbers per Gaussian, planes [3, N], blended in place of R G B: [5, H, W], with Z and A as in render().
+
+        A view that the next render overwrites.
+        """
         ...
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:

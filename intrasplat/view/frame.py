@@ -28,6 +28,7 @@ class View:
     depth_mm   [H, W] float32, camera z; 0 where nothing is solid
     unseen     [H, W] bool: no training frame saw what is shown here; the other layers contain the model's guess
     unseen_share   share of unseen pixels, in [0, 1]
+    detail_share   share of the solid pixels whose detail comes from recorded frames, in [0, 1]
     warnings   notices about this frame: what to distrust, and what to know
 
     Confidence, unseen_share and warnings do not depend on how many pixels show the view (docs/conventions.md, "Size of
@@ -38,6 +39,7 @@ class View:
     depth_mm: NDArray[np.float32]
     unseen: NDArray[np.bool_]
     unseen_share: float
+    detail_share: float
     warnings: tuple[Notice, ...]
     _confidence: Callable[[], NDArray[np.float32]]
     _smoke: Callable[[], NDArray[np.float32]]
@@ -68,7 +70,7 @@ class View:
 
         warnings = (*self.warnings, Notice.info(NoticeCode.COARSE, COARSE))
         likely, smoke = grown(self._confidence), grown(self._smoke)
-        return View(rgb, depth_mm, unseen, self.unseen_share, warnings, likely, smoke)
+        return View(rgb, depth_mm, unseen, self.unseen_share, self.detail_share, warnings, likely, smoke)
 
     def reduced(self, width: int, height: int) -> View:
         """The frame in fewer pixels: each is the mean of those it covers; the majority decides on solid and unseen."""
@@ -86,4 +88,4 @@ class View:
 
         rgb = np.asarray(mean(self.rgb), np.uint8)
         likely, smoke = shrunk(self._confidence), shrunk(self._smoke)
-        return View(rgb, depth_mm, unseen, self.unseen_share, self.warnings, likely, smoke)
+        return View(rgb, depth_mm, unseen, self.unseen_share, self.detail_share, self.warnings, likely, smoke)

@@ -27,7 +27,7 @@ from intrasplat.splat.metrics import COVERED_ALPHA
 from intrasplat.train.targets import solid_depth_mm
 from intrasplat.view.camera import as_recorded, endoscope_pose
 from intrasplat.view.confidence import confidence, evidence, followed
-from intrasplat.view.render import renderer_of
+from intrasplat.view.renderer import renderer_of
 from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
 WINDOW_PX = 64

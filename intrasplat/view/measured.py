@@ -11,7 +11,8 @@ from intrasplat.notices import Notice
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.measure import MIN_CONFIDENCE, Distances, MeasuredPlace, distances, places_at
-from intrasplat.view.render import clamped_to_clip, renderer_of
+from intrasplat.view.render import clamped_to_clip
+from intrasplat.view.renderer import renderer_of
 
 OTHER_PLACE = "Choose another place or another moment."
 EXPANDED = 2.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -25,6 +25,7 @@ from intrasplat.names import Eye as EyeName
 from intrasplat.picture import RecordedMasks
 from intrasplat.report import Recorded
 from intrasplat.scene.recorded_file import MASK, PICTURE, name_of, nearest, read_frame
+from intrasplat.scene.training_pictures import EYES, RecordedEye, encoded
 
 MAX_MOMENTS = 120
 """Most moments of a clip whose frames are stored."""
@@ -39,10 +40,36 @@ AFTER_HEADER = 33
 """Byte offset of a PNG's second chunk."""
 BLACK_IS_CLEAR = b"\x00\x00\x00\x02tRNS\x00\x00\x76\x93\xcd\x38"
 """PNG chunk that makes grey level 0 transparent."""
-EYES: tuple[EyeName, EyeName] = ("left", "right")
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+
+
+class ClipPictures:
+    """The TrainingPictures of an opened clip."""
+
+    def __init__(self, clip: DepthClip, eyes: int, frames: Sequence[int]) -> None:
+        """eyes: number of eyes that train the model. frames: those that train it, rising."""
+        self._eyes, self.frames = clip.eyes[:eyes], tuple(frames)
+        left = clip.world_from_camera[0]
+        self.eyes = tuple(
+            RecordedEye(each.intrinsics.resized(*_shown_size(each)), np.linalg.inv(left) @ each.world_from_camera[0])
+            for each in self._eyes
+        )
+
+    def picture(self, eye: int, frame: int) -> tuple[Picture, Mask]:
+        """See TrainingPictures."""
+        rgb, tool = _picture(self._eyes[eye], frame)
+        return rgb, ~tool
+
+
+def detail_video(clip: DepthClip, eyes: int, trained: Iterable[int], recorded: Recorded) -> bytes | None:
+    """The video of the recorded training frames; None: there are none, or no encoder is installed."""
+    chosen = set(trained)
+    pictures = ClipPictures(clip, eyes, [frame for frame in recorded.frames if frame in chosen])
+    if not pictures.frames:
+        return None
+    return encoded(pictures.frames, pictures.eyes, lambda eye, frame: pictures.picture(eye, frame)[0])
 
 
 def zipped_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
@@ -131,13 +158,18 @@ def _picture(eye: Eye, index: int) -> tuple[Picture, Mask]:
     rgb, tool = eye.rgb[index].copy(), ~eye.tissue[index]
     let_go(eye.rgb[index])
     let_go(eye.tissue[index])
-    height, width = tool.shape
-    factor = -(-width // MAX_WIDTH)
-    if factor > 1:
-        size = width // factor, max(1, height // factor)
+    size = _shown_size(eye)
+    if size != tool.shape[::-1]:
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         tool = cv2.resize(tool.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     return rgb, tool
+
+
+def _shown_size(eye: Eye) -> tuple[int, int]:
+    """Width and height of its pictures, px."""
+    height, width = eye.tissue.shape[1:]
+    factor = -(-width // MAX_WIDTH)
+    return (width // factor, max(1, height // factor)) if factor > 1 else (width, height)
 
 
 def _marked(rgb: Picture, tool: Mask) -> Picture:

@@ -1,44 +1,41 @@
 """Render a stored scene at any time, from any pose, through any pinhole camera: colour, depth and confidence.
 
-Symbols: N Gaussians, H W pixels. A scene reuses its kernels' buffers, so the second frame of a size is fast.
+Symbols: H W pixels.
 """
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import Lock
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.camera import Intrinsics
+from intrasplat.errors import SceneError
 from intrasplat.machine.parts import Parts, whole
+from intrasplat.names import Detail as DetailSwitch
 from intrasplat.names import Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MAX_JUDGED_PIXELS
-from intrasplat.scene.model import model_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
-from intrasplat.splat.constants import SH_C0
-from intrasplat.splat.layout import COLOUR_ROW
+from intrasplat.splat.cpu.threads import run
 from intrasplat.splat.metrics import COVERED_ALPHA
 from intrasplat.splat.model import ProjectedPicture
-from intrasplat.train.hooks import RenderedFrame
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
-from intrasplat.view.camera import endoscope_pose, view_camera
+from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.confidence import confidence, evidence, followed, seen_from_endoscope
-from intrasplat.view.depth_range import DepthRange
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses, pixel_count
-from intrasplat.view.out_of_view import OutOfView
 from intrasplat.view.recorded_light import EndoscopeLight
+from intrasplat.view.renderer import renderer_of
 from intrasplat.view.smoky import smoke_share, with_smoke
-from intrasplat.view.unseen import blended_values, missing_pixels, unseen_pixels
+from intrasplat.view.transfer import in_levels
+from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
 FAR_POSE = 0.35
 """Distance from the nearest trained pose, in median depths, beyond which the frame carries a warning, because it shows
@@ -56,106 +53,6 @@ ROUNDING = 1e-6
 """Model time by which t may exceed the last frame's without a warning: a caller may have rounded i / T."""
 
 
-class SceneRenderer:
-    """A scene ready to be rendered on a device. It serialises its threads, because the kernels share buffers.
-
-    scene: the scene without its motion's weights, which the model contains.
-    """
-
-    def __init__(self, scene: TrainedScene, device: Device = CPU) -> None:
-        self.scene = scene.without_motion()
-        self._model = model_of(scene, device)
-        self._values = blended_values(scene.seen.numpy())
-        self._out_of_view = None if self._values is None else OutOfView.of(self.scene, self._model)
-        self._lock = Lock()
-
-    @cached_property
-    def depth_range(self) -> DepthRange:
-        """The range of the false colours of depth, the same for the whole clip."""
-        with self._lock:
-            return DepthRange.of(self.scene, self._model)
-
-    def layers(
-        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Copies of R G B Z A [5, H, W], with Z unnormalised in units, and of the blended blended_values [H, W]."""
-        camera = view_camera(self.scene, t, world_from_camera, intrinsics)
-        values = self.values(t)
-        with self._lock:
-            image = self._model.render(camera, t, values).copy()
-        return image[:5], None if values is None else image[5]
-
-    @contextmanager
-    def projected(
-        self,
-        t: float,
-        world_from_camera: NDArray[np.float64],
-        intrinsics: Intrinsics,
-        *,
-        highlights: bool = True,
-    ) -> Iterator[ProjectedPicture]:
-        """The projected picture, to be sorted and blended in bands: planes R G B Z A, and blended_values if known.
-
-        Other pictures of the scene may be rendered meanwhile.
-        """
-        camera = view_camera(self.scene, t, world_from_camera, intrinsics, highlights=highlights)
-        values = self.values(t)
-        with self._lock:
-            picture = self._model.projected(camera, t, values)
-        try:
-            yield picture
-        finally:
-            with self._lock:
-                picture.close()
-
-    def seen_from(self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics) -> RenderedFrame:
-        """The scene's colour in the light of the recording, depth in mm and alpha at model time t."""
-        image, _ = self.layers(t, world_from_camera, intrinsics)
-        depth_mm = solid_depth_mm(image[3], image[4], self.scene.units_per_mm)
-        rgb = image[:3].transpose(1, 2, 0)
-        light = EndoscopeLight(self.scene, t, world_from_camera, intrinsics).factors(depth_mm)
-        rgb = rgb if light is None else rgb * light
-        camera = (intrinsics, world_from_camera)
-        return RenderedFrame(with_smoke(self.scene, t, rgb, depth_mm, camera), depth_mm, image[4])
-
-    def values(self, t: float) -> NDArray[np.float32] | None:
-        """blended_values [N] at model time t: trust where positive. None: not known."""
-        if self._values is None or self._out_of_view is None:
-            return self._values
-        times_s = self.scene.frame_times_s
-        time_s = float(np.interp(t * self.scene.frame_count, np.arange(len(times_s)), times_s))
-        return self._out_of_view.faded(self._values, time_s)
-
-    def blending_weights(
-        self, t: float, world_from_camera: NDArray[np.float64], intrinsics: Intrinsics, i: int, j: int
-    ) -> NDArray[np.float32]:
-        """[N] blending weights of the Gaussians at pixel (i, j)."""
-        camera = view_camera(self.scene, t, world_from_camera, intrinsics)
-        cotangents = np.zeros((5, intrinsics.height, intrinsics.width), np.float32)
-        cotangents[0, i, j] = 1  # the gradient of a pixel's red with respect to each Gaussian's red is its weight
-        with self._lock:
-            gradient = self._model.image_gradient(camera, t, cotangents)
-        return np.asarray(gradient[COLOUR_ROW] / np.float32(SH_C0), np.float32)
-
-    def means_mm(self, t: float) -> NDArray[np.float64]:
-        """[N, 3] centres of the Gaussians at model time t, in the world."""
-        with self._lock:
-            return self._model.deformed_mean(t).T.astype(np.float64) / self.scene.units_per_mm
-
-
-_renderers: weakref.WeakKeyDictionary[TrainedScene, dict[Device, SceneRenderer]] = weakref.WeakKeyDictionary()
-_renderers_lock = Lock()
-
-
-def renderer_of(scene: TrainedScene, device: Device = CPU) -> SceneRenderer:
-    """The scene's renderer on a device, created at its first frame there and cached as long as the scene exists."""
-    with _renderers_lock:
-        made = _renderers.setdefault(scene, {})
-        if device not in made:
-            made[device] = SceneRenderer(scene, device)
-        return made[device]
-
-
 @dataclass(frozen=True, eq=False)
 class ViewRequest:
     """What a frame shows, and how it is rendered.
@@ -167,6 +64,7 @@ class ViewRequest:
     highlights         True: as the endoscope's eyes saw them, and their mean away from both; False: without highlights
     light              "steady": that of one frame, at all times; "recorded": that of the time
     smoke              whether to draw the smoke of the recording
+    detail             whether to add what the model misses of the recorded frames, if those are kept; not if is_coarse
     is_coarse          draw and judge no more pixels than asked for, because time is short
     max_pixels         limit of the pixels in which a smaller picture is drawn and judged
     """
@@ -179,6 +77,7 @@ class ViewRequest:
     highlights: bool = True
     light: Light = "steady"
     smoke: Smoke = "remove"
+    detail: DetailSwitch = "on"
     is_coarse: bool = False
     max_pixels: int = MAX_JUDGED_PIXELS
 
@@ -220,9 +119,10 @@ def render_frame(
     highlights: bool = True,
     light: Light = "steady",
     smoke: Smoke = "remove",
+    detail: DetailSwitch = "on",
 ) -> View:
     """Render the scene at model time t from a pose through a camera. The arguments are those of ViewRequest."""
-    view = ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights, light, smoke)
+    view = ViewRequest(scene, t, world_from_camera, intrinsics, device, highlights, light, smoke, detail)
     return whole(frame_in_parts(view))
 
 
@@ -234,7 +134,8 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     lenses, scene = view.lenses, view.scene
     renderer_of(scene, view.device)  # takes long for the first frame of a scene
     yield
-    picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn)
+    picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn or _has_detail(view))
+    picture, detail_share, of_detail = yield from _detailed(view, picture)
     unseen = unseen_pixels(picture.missing)
     rgb, drawn = picture.rgb, (lenses.drawn, view.pose)
     if view.smoke == "show":
@@ -245,7 +146,7 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     outside = clamped_to_clip(scene, view.t)[1]
     if followed(scene, view.shown_t) < MIN_FOLLOWED:
         outside = (*outside, Notice.warning(NoticeCode.MOTION_GUESSED, GUESSED))
-    warnings = (*outside, *scene.pose_warnings, *_warnings_of_pose(view, picture.trust, unseen))
+    warnings = (*outside, *of_detail, *scene.pose_warnings, *_warnings_of_pose(view, picture.trust, unseen))
     if not view.highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     yield
@@ -257,7 +158,7 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     def smoke() -> NDArray[np.float32]:
         return smoke_share(scene, view.shown_t, picture.depth_mm, drawn)
 
-    frame = View(rgb, picture.depth_mm, unseen, _share(unseen), warnings, likely, smoke)
+    frame = View(rgb, picture.depth_mm, unseen, _share(unseen), detail_share, warnings, likely, smoke)
     is_as_asked = pixel_count(lenses.drawn) == pixel_count(lenses.asked)
     return frame if is_as_asked else frame.reduced(lenses.asked.width, lenses.asked.height)
 
@@ -270,7 +171,7 @@ class _Picture:
     depth_mm  [H, W] float32, camera z; 0 where nothing is solid
     missing   [H, W] bool (missing_pixels)
     trust     [H, W] float32 in [0, 1]; 0 everywhere if it is not known, as for a snapshot
-    colours   [3, H, W] float32, unclipped; None: not needed
+    colours   [3, H, W] float32, unclipped, of the model alone; None: not needed
     """
 
     rgb: NDArray[np.uint8]
@@ -319,13 +220,37 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Par
     return picture
 
 
+def _has_detail(view: ViewRequest) -> bool:
+    return view.detail == "on" and not view.is_coarse and view.scene.pictures is not None
+
+
+def _detailed(view: ViewRequest, picture: _Picture) -> Parts[tuple[_Picture, float, tuple[Notice, ...]]]:
+    """The picture with what the model misses of the recorded frames, the share that gets it, and a warning, if any."""
+    if picture.colours is None or not _has_detail(view):
+        return picture, 0.0, ()
+    renderer, lens = renderer_of(view.scene, view.device), view.lenses.drawn
+    try:
+        detail = renderer.detail
+        assert detail is not None
+        added = yield from detail.added(renderer, view.shown_t, view.pose, lens, picture.depth_mm)
+    except SceneError as error:
+        return picture, 0.0, (Notice.warning(NoticeCode.DETAIL_MISSING, f"The model is shown alone: {error}"),)
+    yield
+    factors, levels = None, np.empty_like(picture.rgb)
+    if view.light == "recorded":
+        factors = EndoscopeLight(view.scene, view.shown_t, view.pose, lens).factors(picture.depth_mm)
+    light = np.broadcast_to(np.float32(1) if factors is None else factors, levels.shape)
+    run(in_levels, picture.colours, added.rgb, light, levels)
+    return replace(picture, rgb=levels), added.share, ()
+
+
 def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float32]]:
     """[H, W] the confidence of a view's picture; 0 where nothing solid is drawn or trust is 0.
 
     If the picture has more pixels than it is judged in, it is rendered again in those, and its confidence is enlarged.
     """
     lenses, judged = view.lenses, picture
-    if picture.colours is None:
+    if lenses.judged != lenses.drawn:
         judged = yield from _rendered(view, lenses.judged, with_colours=True)
     assert judged.colours is not None
     known_rgb = judged.colours

@@ -107,7 +107,8 @@ def evidence_of(run: Trained, rng: np.random.Generator) -> tuple[NDArray[np.floa
         own_pose = scene.world_from_camera[expected.frame]
         own, image = (model.render(view_camera(scene, t, pose, k), t).copy() for pose in (own_pose, expected.pose))
         alpha = np.maximum(image[4], 1e-3)
-        blended = [model.blend_values(np.ascontiguousarray(each, np.float32)) / alpha for each in found]
+        planes = np.stack([*found, np.zeros_like(found[0])]).astype(np.float32)
+        blended = model.blended(view_camera(scene, t, expected.pose, k), t, planes)[:2] / alpha
         known = seen_from_endoscope(own[:3], shown.depth_mm, (k, expected.pose), (k, own_pose))
         seen = evidence(np.full_like(alpha, 0.5), image[:3], known)[1:]
         depth_right = np.abs(shown.depth_mm - expected.depth_mm) < RIGHT_DEPTH * expected.depth_mm

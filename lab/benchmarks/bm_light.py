@@ -5,7 +5,7 @@
 
 Each clip is matched once as it is, which gives the truth: its frames, masks and depth. Then each of LIGHTS is put on
 both eyes, and the result is read, matched and trained on like any recording. Scores of held-out frames over tissue,
-each in dB, of the left eye and (right_) of the right:
+of the model alone, each in dB, of the left eye and (right_) of the right:
 
 plain     the view in the model's steady light against the clean frames
 fitted    the same after one fit of gain and offset by channel over all held-out frames
@@ -112,8 +112,8 @@ def scores(scene: isp.Scene, clean: Eye, spoilt: Eye, *, is_right: bool = False)
             pose = pose @ np.reshape(eye.left_from_right, (4, 4))
             camera = replace(camera, fx=eye.fx_px, fy=eye.fy_px, cx=eye.cx_px, cy=eye.cy_px)
         t, tissue = index / clean.frame_count, clean.tissue[index]
-        clear = scene.render(t, pose, intrinsics=camera)
-        as_recorded = scene.render(t, pose, intrinsics=camera, light="recorded", smoke="show")
+        clear = scene.render(t, pose, intrinsics=camera, detail="off")
+        as_recorded = scene.render(t, pose, intrinsics=camera, light="recorded", smoke="show", detail="off")
         views = [clear.rgb, as_recorded.rgb]
         steady.append((views[0], clean.rgb[index], tissue))
         recorded.append((views[1], spoilt.rgb[index], tissue))

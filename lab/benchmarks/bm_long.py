@@ -36,7 +36,7 @@ from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
-from intrasplat.view.render import SceneRenderer
+from intrasplat.view.renderer import SceneRenderer
 from lab.benchmarks.bm_memory import StageMemory
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, write_rows
 from lab.phantom import PhantomSettings, make_phantom

@@ -143,17 +143,19 @@ class Truth:
         held_out: Sequence[int],
         tissue_right: NDArray[np.bool_] | None = None,
         step_px: int = 1,
+        angles_deg: Sequence[float] = ANGLES_DEG,
     ) -> None:
         """tissue [T, H, W]: exact, of the left eye; tissue_right: of a stereo clip's right eye, which shows it too.
 
         step_px: candidates draw, and are judged on, that lattice of pixels alone (lab/evaluate/thinned.py).
+        angles_deg: of the views beside the endoscope; score() needs ANGLES_DEG.
         """
         self._phantom, self._lattice = phantom, lattice(step_px)
         self._tissue, self._tissue_of_tracks = tissue[(slice(None), *self._lattice)], tissue[0]
         self._judged_frames = sample_frames(held_out, JUDGED_FRAMES)
         self._seen, pivot_mm = _seen_by(phantom, train, tissue, tissue_right)
         self._tracks = phantom.trajectories(TRACK_STRIDE_PX)
-        self._views = {angle: list(self._off_axis(angle, pivot_mm)) for angle in ANGLES_DEG}
+        self._views = {angle: list(self._off_axis(angle, pivot_mm)) for angle in angles_deg}
         self._own = [self._expected(frame, phantom.world_from_camera(frame)) for frame in self._judged_frames]
         self._right = [self._expected(frame, phantom.world_from_right(frame)) for frame in self._judged_frames]
         self._bounds_db = [_mean_psnr([each.baked for each in views], views) for views in self._views.values()]
@@ -164,7 +166,6 @@ class Truth:
         views10, views15 = self._views.values()
         shown, expected = at10 + at15, views10 + views15
         own = self._shown(candidate, self._own)
-        hidden = [self._behind_instrument(each) for each in self._own]
         error_mm, moving_error_mm, moving_mm = self._motion(candidate)
         return TruthScores(
             psnr_view10_db=_mean_psnr(_pictures(at10), views10),
@@ -173,7 +174,7 @@ class Truth:
             psnr_baked15_db=_mean_psnr(_pictures(at15), views15, "baked"),
             bound10_db=self._bounds_db[0],
             bound15_db=self._bounds_db[1],
-            psnr_hidden_db=_mean_psnr(_pictures(own), hidden),
+            psnr_hidden_db=_mean_psnr(_pictures(own), self.hidden),
             depth_error_mm=self._depth(own),
             motion_error_mm=error_mm,
             moving_error_mm=moving_error_mm,
@@ -188,6 +189,11 @@ class Truth:
     def off_axis(self) -> dict[float, list[Expected]]:
         """The views by their angle in degrees."""
         return self._views
+
+    @property
+    def hidden(self) -> list[Expected]:
+        """The left eye's views, judged where an instrument hides tissue."""
+        return [self._behind_instrument(each) for each in self._own]
 
     @property
     def expected(self) -> dict[str, list[Expected]]:
@@ -255,17 +261,17 @@ class SceneCandidate:
 
     def motion_mm(self, frame: int) -> NDArray[np.floating]:
         start, end = (self._model.deformed_mean(each / self._scene.frame_count) for each in (0, frame))
-        alpha = self._image(0, self._scene.world_from_camera[0])[4]
         moved_mm = (end - start) / np.float32(self._scene.units_per_mm)
-        blended = np.stack([self._model.blend_values(np.ascontiguousarray(axis)).copy() for axis in moved_mm], -1)
-        solid = (alpha >= COVERED_ALPHA)[..., None]
-        return np.where(solid, blended / np.maximum(alpha, COVERED_ALPHA)[..., None], np.nan)
+        image = self._model.blended(self._camera(0, self._scene.world_from_camera[0]), 0.0, moved_mm)
+        blended, alpha = image[:3].transpose(1, 2, 0), image[4, ..., None]
+        return np.where(alpha >= COVERED_ALPHA, blended / np.maximum(alpha, COVERED_ALPHA), np.nan)
+
+    def _camera(self, frame: int, pose: Pose) -> NDArray[np.float64]:
+        return view_camera(self._scene, frame / self._scene.frame_count, pose, self._scene.intrinsics)
 
     def _image(self, frame: int, pose: Pose) -> NDArray[np.float32]:
         """R G B Z A [5, H, W], a copy."""
-        scene = self._scene
-        camera = view_camera(scene, frame / scene.frame_count, pose, scene.intrinsics)
-        return self._model.render(camera, frame / scene.frame_count).copy()
+        return self._model.render(self._camera(frame, pose), frame / self._scene.frame_count).copy()
 
 
 def _seen_by(

@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -231,13 +231,20 @@ class Site:
             claim, progress.model_copy(update={"seconds_left": seconds_left, "psnr_right_db": psnr_right_db})
         )
 
-    def finish(self, claim: Claim, *, scored: bool = True, model: TrainedScene | None = None) -> str:
-        """The job's scene; model: as it is stored, for those who read it."""
+    def finish(
+        self,
+        claim: Claim,
+        *,
+        scored: bool = True,
+        model: TrainedScene | None = None,
+        beside: Mapping[str, bytes] | None = None,
+    ) -> str:
+        """The job's scene; model and the files beside it: as they are stored, for those who read them."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
         if model is None:
             (folder / MANIFEST).write_text('{"files": {}}')
         else:
-            save_scene(folder, model)
+            save_scene(folder, model, beside)
         report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
         (folder / REPORT).write_text(report.model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
@@ -246,10 +253,12 @@ class Site:
         self.announce()
         return claim.job_id
 
-    def scene(self, mark: str = "", model: TrainedScene | None = None) -> str:
+    def scene(
+        self, mark: str = "", model: TrainedScene | None = None, beside: Mapping[str, bytes] | None = None
+    ) -> str:
         """A finished scene whose id begins with the mark."""
         self.queued_job(mark)
-        return self.finish(self.claim(), model=model)
+        return self.finish(self.claim(), model=model, beside=beside)
 
 
 @contextmanager

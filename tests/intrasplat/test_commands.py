@@ -16,7 +16,7 @@ import torch
 
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
-from intrasplat.names import CURVE, RECORDED, REPORT
+from intrasplat.names import CURVE, DETAIL, RECORDED, REPORT
 from intrasplat.notices import NoticeCode
 from intrasplat.report import Report
 from intrasplat.scene.resume_file import RESUME_FILE, load_resume
@@ -189,7 +189,14 @@ def test_a_run_killed_while_it_wrote_a_state_or_its_results_starts_again_in_its_
     for name in (f".{RESUME_FILE}.new", REPORT, CURVE, f".{RECORDED}.new", ".manifest.json.new"):
         (tmp_path / name).write_bytes(b"cut off")
     assert main(["reconstruct", str(clip), "--iterations", "5", "--out", str(tmp_path)]) == ExitCode.OK
-    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "scene.safetensors", REPORT, CURVE, RECORDED}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "manifest.json",
+        "scene.safetensors",
+        REPORT,
+        CURVE,
+        DETAIL,
+        RECORDED,
+    }
 
 
 def test_a_finished_scene_is_not_replaced(clip: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:

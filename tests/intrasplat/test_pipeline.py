@@ -26,7 +26,7 @@ from intrasplat.errors import Cancelled, InputError, SceneError, TrainingDiverge
 from intrasplat.machine.hooks import Progress
 from intrasplat.methods.method import Preset
 from intrasplat.methods.registry import PRESETS
-from intrasplat.names import LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME, RESUME_STATE
+from intrasplat.names import DETAIL, LABORATORY_PRESETS, MANIFEST, RECORDED, REPORT, RESUME, RESUME_STATE
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions, parse_options
 from intrasplat.outcome import scene_of
@@ -48,7 +48,7 @@ from intrasplat.view.render import render_frame
 from lab.phantom import PhantomSettings, make_phantom, write_endonerf, write_stereo_video
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared_on, trained, view
 
-SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv", RECORDED}
+SCENE_FILES = {"manifest.json", "scene.safetensors", "report.json", "curve.csv", DETAIL, RECORDED}
 ITERATIONS = 20
 STEREO = PhantomSettings(width=128, height=112, frames=10, period_frames=12)
 Drawn = Callable[..., Path]
@@ -498,11 +498,11 @@ def test_recorded_frames_of_the_eyes_that_taught_are_kept_with_the_scene(
     told = report.recorded
     assert told is not None
     assert (told.eyes, told.frames, told.masks) == (kept, tuple(range(STEREO.frames)), True)
-    assert told.size_bytes == (tmp_path / RECORDED).stat().st_size
+    assert told.size_bytes == sum((tmp_path / name).stat().st_size for name in (DETAIL, RECORDED))
     assert Report.model_validate_json((tmp_path / REPORT).read_bytes()).recorded == told
     listed = json.loads((tmp_path / MANIFEST).read_bytes())["beside"][RECORDED]
     assert listed == {
-        "bytes": told.size_bytes,
+        "bytes": (tmp_path / RECORDED).stat().st_size,
         "sha256": hashlib.sha256((tmp_path / RECORDED).read_bytes()).hexdigest(),
     }
     for eye, name in zip(shown[0].eyes, told.eyes, strict=False):
@@ -518,7 +518,7 @@ def test_recorded_frames_of_the_eyes_that_taught_are_kept_with_the_scene(
 def test_nothing_of_the_recording_is_kept_where_that_is_off(opened: Opened, tmp_path: Path) -> None:
     report = run(opened(), tmp_path, iterations=2, keep_recorded="off")
     assert report.recorded is None
-    assert files(tmp_path) == SCENE_FILES - {RECORDED}
+    assert files(tmp_path) == SCENE_FILES - {DETAIL, RECORDED}
     assert json.loads((tmp_path / MANIFEST).read_bytes())["beside"] == {}
     with pytest.raises(InputError, match="keep_recorded"):
         request(opened(), keep_recorded="perhaps")

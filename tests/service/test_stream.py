@@ -108,6 +108,7 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
             "t": 0.5,
             "iteration": None,
             "unseen": 0.123,
+            "detail": 0.0,
             "warnings": [LOOK_OUT.model_dump()],
             "media_type": "image/jpeg",
             "depth_range_mm": None,

@@ -14,6 +14,8 @@ const ROUNDING = 1e-6;
 /** What a scene stores of the light and the smoke in which it was recorded, where the model's differ; not drawn here. */
 const RECORDED_LIGHT = ["log_gains", "vignetting", "veil"];
 const SCENE = "scene.safetensors";
+/** The recorded frames from which the service takes detail (intrasplat/names.py). */
+const DETAIL = "detail.mkv";
 
 /**
  * What is shown: pose is world_from_camera, rows, in mm. isMoving: draw at once, sorted as the view before, if need be.
@@ -63,6 +65,8 @@ export class Player {
     this.canvas = drawing.canvas;
     this.cameras = new Cameras(manifest);
     this.poseWarnings = manifest.settings?.pose_warnings ?? [];
+    /** Whether the service's pictures have more detail than those drawn here. */
+    this.hasDetail = manifest.beside?.[DETAIL] !== undefined;
     this.hasRecordedLight = RECORDED_LIGHT.some((name) => manifest.settings?.[name] !== undefined);
     this.isClosed = false;
     /** Broken when the scene is let go of: a worker that has ended answers nobody. */

@@ -134,6 +134,10 @@ class CpuModel:
             run(harmonics.colour_from_gloss, camera, self.state, self.colour)
         else:
             run(harmonics.colour_from_sh, sh_degree, camera_centre(camera), self.state, self.sh_rest, self.colour)
+        self._project_coloured(camera, rasterizer)
+
+    def _project_coloured(self, camera: NDArray[np.float64], rasterizer: Rasterizer) -> None:
+        """Project the Gaussians of the state in the colours that are set."""
         rasterizer.project(camera, self.state, self.opacity_logit, self.colour)
         self.rasterizer = rasterizer
 
@@ -152,10 +156,13 @@ class CpuModel:
             rasterizer.set_values(values)
         return _Projected(rasterizer, values is not None, self._cached)
 
-    def blend_values(self, values: Floats) -> Floats:
-        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
-        blended: Floats = self.rasterizer.render(values)[5]
-        return blended
+    def blended(self, camera: NDArray[np.float64], t: float, planes: Floats) -> Floats:
+        """planes [3, N], blended in place of R G B: [5, H, W]; a view the next render overwrites."""
+        self.motion.deform(self.canonical, t, self.state)
+        self.colour[:, : self.count] = planes
+        self._project_coloured(camera, self._rasterizer(*image_size(camera)))
+        self.rasterizer.sort()
+        return self.rasterizer.render()
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * render(camera, t)) to the Gaussians as they are at t, [VALUES, N]."""

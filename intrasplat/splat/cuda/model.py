@@ -294,14 +294,17 @@ class CudaModel:
         """The picture of render(), already blended: a GPU does not divide it into bands."""
         return Blended(self.render_times(camera, [t], values)[0].to("cpu", copy=True).numpy())
 
-    def blend_values(self, values: Floats) -> Floats:
-        """Further values [N], blended as colour was in the last render: [H, W]; a view."""
-        view = self._shown
-        if view is None:
-            raise ValueError("nothing has been rendered")
-        view.values[: self.count] = torch.from_numpy(np.asarray(values, np.float32))
-        image: Floats = view.rasterizer.render(view.values)[0, 5].cpu().numpy()
-        return image
+    def blended(self, camera: NDArray[np.float64], t: float, planes: Floats) -> Floats:
+        """planes [3, N], blended in place of R G B: [5, H, W]; a view the next render overwrites."""
+        view = self._steer(camera, [t])
+        control, wanted = view.control.values, torch.from_numpy(np.ascontiguousarray(planes, np.float32))
+        while True:
+            self.motion.deform(self._values, control, view.state, view.colour)
+            view.colour[0, :, : self.count] = wanted.to(self.device)
+            view.rasterizer.project_and_sort(control["camera"], view.state, self._values[OPACITY_ROW], view.colour)
+            image: Floats = view.rasterizer.render(None)[0].cpu().numpy()
+            if self._fitted(view):
+                return image
 
     def image_gradient(self, camera: NDArray[np.float64], t: float, cotangents: Floats) -> Floats:
         """Gradient of sum(cotangents * image), cotangents [5, H, W], to the Gaussians as they are at t, [VALUES, N]."""

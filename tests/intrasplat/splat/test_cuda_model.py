@@ -161,8 +161,8 @@ def test_what_was_trained_on_the_device_renders_on_the_cpu_within_an_8_bit_step(
     wanted = cpu.render(CAMERA, 0.6, values)
     assert_close(image, wanted, relative=0.0, absolute=1 / 255, name="image")
     assert np.abs(image[[0, 1, 2, 4]] - wanted[[0, 1, 2, 4]]).mean() < 1e-5
-    cuda.render(CAMERA, 0.6)
-    assert_close(cuda.blend_values(values[::-1].copy()), cpu.blend_values(values[::-1].copy()), absolute=1e-3)
+    planes = np.stack([values[::-1], -values, 2 * values])
+    assert_close(cuda.blended(CAMERA, 0.6, planes), cpu.blended(CAMERA, 0.6, planes), absolute=1e-3, name="planes")
     assert_close(cuda.deformed_mean(0.6), cpu.deformed_mean(0.6), relative=1e-6)
 
 

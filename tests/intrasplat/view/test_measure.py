@@ -25,7 +25,8 @@ from intrasplat.view.measure import (
     uncertainty_mm,
 )
 from intrasplat.view.measured import EXPANDED, measured
-from intrasplat.view.render import render_frame, renderer_of
+from intrasplat.view.render import render_frame
+from intrasplat.view.renderer import renderer_of
 from lab.phantom import Phantom, PhantomSettings, make_phantom, orbit_pose
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained
 

@@ -25,7 +25,8 @@ from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.confidence import followed
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import judged_camera
-from intrasplat.view.render import FAR_POSE, ViewRequest, frame_in_parts, render_frame, renderer_of
+from intrasplat.view.render import FAR_POSE, ViewRequest, frame_in_parts, render_frame
+from intrasplat.view.renderer import renderer_of
 from lab.phantom import orbit_pose
 from tests.helpers import assert_close
 from tests.intrasplat.phantoms import FRAMES, HEIGHT, WIDTH, phantom_clip, prepared, trained, view

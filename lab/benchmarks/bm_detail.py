@@ -1,0 +1,169 @@
+"""What detail from the recorded training frames adds to views, and what it costs.
+
+    python -m lab.benchmarks.bm_detail [--clips d4d_stereo phantom:pull:60frames:stereo ...] [--preset fast]
+        [--iterations 300 | --budget-s 60] [--holdout every8] [--seeds 0 1 2] [--out lab/rows/detail.csv]
+
+A row for each view: `left` and `right`, held-out frames of the eyes over tissue, and of a phantom at rest or with a
+fixed camera `off5` to `off20`, that many degrees beside the endoscope, over tissue that some training frame saw, and
+`hidden`, what an instrument hides from the left eye. model_db and detail_db: mean psnr_tissue without and with detail,
+of views as the service renders them. The rows of the left eye also have ssim without and with detail, the two scores of
+copying (docs/conventions.md), bytes of the scene, of recorded.zip and of detail.mkv, seconds until the scene was done,
+and milliseconds of a view without detail, with it, and with it in a clip that is played frame by frame (medians).
+
+A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from intrasplat.clip import DepthClip, split_frames
+from intrasplat.machine.hooks import Hooks
+from intrasplat.names import DETAIL, RECORDED
+from intrasplat.options import ReconstructionOptions
+from intrasplat.pipeline import reconstruct
+from intrasplat.report import Report
+from intrasplat.scene.checkpoint import load_scene
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.metrics import psnr_tissue
+from intrasplat.train.hooks import TrainingHooks
+from intrasplat.train.request import ReconstructionRequest
+from intrasplat.train.scoring import judged_pixels
+from intrasplat.view.render import render_frame
+from lab.evaluate.rows import adding_alone, commit, machine, read_rows, texts_of, write_rows
+from lab.evaluate.sources import DATA_VARIABLE, OpenClip, open_source, source_of
+from lab.evaluate.truth import Expected, Truth
+
+CLIPS = ("d4d_stereo", *(f"phantom:{motion}:60frames:stereo" for motion in ("still", "breathing", "pull", "cut")))
+ANGLES_DEG = (5.0, 10.0, 15.0, 20.0)
+TIMED = 25
+KEY = ("clip", "preset", "limit", "holdout", "seed", "view")
+FIELDS = (
+    *KEY, "model_db", "detail_db", "ssim", "detail_ssim", "copy_blend_db", "copy_flow_db", "scene_bytes",
+    "recorded_bytes", "detail_bytes", "t_post_s", "view_ms", "detail_ms", "played_ms", "machine", "commit",
+)  # fmt: skip
+
+Pair = tuple[float, float]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = _parser().parse_args(arguments)
+    os.environ.setdefault(DATA_VARIABLE, "../shared/data")
+    limit = {"iterations": options.iterations} if options.budget_s is None else {"budget_s": options.budget_s}
+    spelt = f"{options.iterations} steps" if options.budget_s is None else f"{options.budget_s:g} s"
+    with adding_alone(options.out.parent):
+        for source in map(source_of, options.clips):
+            opened = open_source(source, options.holdout, Hooks())
+            for seed in options.seeds:
+                named = {"clip": source.name, "preset": options.preset, "limit": spelt, "holdout": options.holdout}
+                asked = ReconstructionOptions(preset=options.preset, seed=seed, holdout=options.holdout, **limit)
+                for found in measured(opened, asked):
+                    row = {**named, "seed": seed, **found, "machine": machine(), "commit": commit()}
+                    text = texts_of(row, FIELDS)
+                    others = [each for each in read_rows(options.out) if any(each[name] != text[name] for name in KEY)]
+                    write_rows(options.out, FIELDS, [*others, text])
+                    print("  ".join(f"{name} {text[name]}" for name in FIELDS[:-2] if text[name]), flush=True)
+
+
+def measured(opened: OpenClip, options: ReconstructionOptions) -> Iterator[dict[str, object]]:
+    """The rows of one run."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder)
+        request = ReconstructionRequest(clip=opened.clip, options=options)
+        report, scene = reconstruct(request, path, TrainingHooks()), load_scene(path)
+        left = _row("left", list(_recorded(scene, opened.clip, report)))
+        yield left | _costs(scene, path, report)
+        if opened.clip.right is not None:
+            yield _row("right", list(_recorded(scene, opened.clip, report, is_right=True)))
+        if opened.phantom is not None and not opened.phantom.settings.camera:
+            yield from _off_axis(scene, opened)
+
+
+def _row(view: str, pairs: Sequence[Pair]) -> dict[str, object]:
+    model, detail = np.nanmean(np.array(pairs), axis=0)
+    return {"view": view, "model_db": round(model, 2), "detail_db": round(detail, 2)}
+
+
+def _recorded(scene: TrainedScene, clip: DepthClip, report: Report, *, is_right: bool = False) -> Iterator[Pair]:
+    """Scores of the held-out frames of an eye, without and with detail."""
+    eye = clip.right if is_right and clip.right is not None else clip
+    for index in report.held_out:
+        pixels = judged_pixels(eye, index) if is_right else eye.tissue[index]
+        shown = (
+            render_frame(
+                scene, index / scene.frame_count, eye.world_from_camera[index], eye.intrinsics,
+                light="recorded", smoke="show", detail=detail,
+            ).rgb
+            for detail in ("off", "on")
+        )  # fmt: skip
+        model_db, detail_db = (psnr_tissue(rgb, eye.rgb[index], pixels) for rgb in shown)
+        yield model_db, detail_db
+
+
+def _off_axis(scene: TrainedScene, opened: OpenClip) -> Iterator[dict[str, object]]:
+    """Rows of a phantom's views beside the endoscope, and of what an instrument hides."""
+    assert opened.phantom is not None
+    split = split_frames(opened.clip, "every8")
+    truth = Truth(
+        opened.phantom, opened.tissue, split.train, split.held_out, opened.tissue_right, angles_deg=ANGLES_DEG
+    )
+    for angle_deg, views in truth.off_axis.items():
+        yield _row(f"off{angle_deg:g}", [_scores(scene, each) for each in views])
+    yield _row("hidden", [_scores(scene, each) for each in truth.hidden])
+
+
+def _scores(scene: TrainedScene, expected: Expected) -> Pair:
+    t = expected.frame / scene.frame_count
+    model, detail = (render_frame(scene, t, expected.pose, detail=each).rgb for each in ("off", "on"))
+    return psnr_tissue(model, expected.rgb, expected.judged), psnr_tissue(detail, expected.rgb, expected.judged)
+
+
+def _costs(scene: TrainedScene, folder: Path, report: Report) -> dict[str, object]:
+    middle = (scene.frame_count // 2 + 0.5) / scene.frame_count
+    return {
+        "ssim": report.ssim,
+        "detail_ssim": None if report.detail is None else report.detail.ssim,
+        "copy_blend_db": report.baseline_blend_db,
+        "copy_flow_db": report.baseline_flow_db,
+        "scene_bytes": report.scene_bytes,
+        "recorded_bytes": (folder / RECORDED).stat().st_size,
+        "detail_bytes": (folder / DETAIL).stat().st_size,
+        "t_post_s": report.seconds["t_post_s"],
+        "view_ms": _median_ms(scene, [middle] * TIMED, is_detailed=False),
+        "detail_ms": _median_ms(scene, [middle] * TIMED, is_detailed=True),
+        "played_ms": _median_ms(scene, [i / scene.frame_count for i in range(scene.frame_count)], is_detailed=True),
+    }
+
+
+def _median_ms(scene: TrainedScene, times: Sequence[float], *, is_detailed: bool) -> float:
+    found = []
+    for t in [times[0], *times]:
+        start_s = time.perf_counter()
+        render_frame(scene, t, detail="on" if is_detailed else "off")
+        found.append(1e3 * (time.perf_counter() - start_s))
+    return round(median(found[1:]), 1)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=list(CLIPS))
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--holdout", default="every8")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--iterations", type=int, default=300)
+    length.add_argument("--budget-s", type=float)
+    parser.add_argument("--out", type=Path, default=Path("lab/rows/detail.csv"))
+    return parser
+
+
+if __name__ == "__main__":
+    main()
