@@ -101,6 +101,11 @@ class Added:
     rgb: Floats
     share: float
 
+    @classmethod
+    def nothing(cls, size: tuple[int, ...]) -> Added:
+        """For a view of size [H, W]."""
+        return cls(np.zeros((*size, 3), np.float32), 0.0)
+
 
 class Detail:
     """The residuals of a scene's training frames. Several threads may use it."""
@@ -147,7 +152,7 @@ class Detail:
                 view.carry(residuals[eye, frame], way_mm, weight, total)
                 yield
         if not used:
-            return Added(np.zeros((*depth_mm.shape, 3), np.float32), 0.0)
+            return Added.nothing(depth_mm.shape)
         found = {eye: (total[..., :3], total[..., 3]) for eye, total in totals.items()}
         rgb, seen = found[nearest] if is_own else _together(found, list(map(view.finer, own)), view.finer(shared))
         return Added(rgb, float(seen.sum()) / max(int(np.count_nonzero(depth_mm)), 1))

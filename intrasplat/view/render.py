@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -29,6 +29,7 @@ from intrasplat.splat.model import ProjectedPicture
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
 from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.confidence import confidence, evidence, followed, seen_from_endoscope
+from intrasplat.view.detail import Added
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses, pixel_count
 from intrasplat.view.recorded_light import EndoscopeLight
@@ -134,8 +135,10 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     lenses, scene = view.lenses, view.scene
     renderer_of(scene, view.device)  # takes long for the first frame of a scene
     yield
-    picture = yield from _rendered(view, lenses.drawn, with_colours=lenses.judged == lenses.drawn or _has_detail(view))
-    picture, detail_share, of_detail = yield from _detailed(view, picture)
+    has_detail = view.detail == "on" and not view.is_coarse and scene.pictures is not None
+    with_colours = has_detail or lenses.judged == lenses.drawn
+    picture = yield from _rendered(view, lenses.drawn, with_colours=with_colours, with_rgb=not has_detail)
+    detail_share, of_detail = (yield from _add_detail(view, picture)) if has_detail else (0.0, ())
     unseen = unseen_pixels(picture.missing)
     rgb, drawn = picture.rgb, (lenses.drawn, view.pose)
     if view.smoke == "show":
@@ -188,10 +191,18 @@ class _Picture:
         colours = np.empty((3, *size), np.float32) if with_colours else None
         return cls(rgb, depth_mm, missing, np.zeros(size, np.float32), colours)
 
-    def fill(self, rows: slice, band: NDArray[np.float32], units_per_mm: float, light: EndoscopeLight | None) -> None:
+    def fill(
+        self,
+        rows: slice,
+        band: NDArray[np.float32],
+        units_per_mm: float,
+        light: EndoscopeLight | None,
+        *,
+        with_rgb: bool,
+    ) -> None:
         """Set these rows from the blended planes R G B Z A and, if known, blended_values: [5 or 6, h, W].
 
-        light: that rgb is shown in; None: the model's.
+        light: that rgb is shown in; None: the model's. with_rgb: whether to set rgb.
         """
         alpha, blended = band[4], band[5] if len(band) > 5 else None
         solid = alpha >= COVERED_ALPHA
@@ -201,12 +212,14 @@ class _Picture:
         if self.colours is not None:
             self.colours[:, rows] = band[:3]
         self.depth_mm[rows] = solid_depth_mm(band[3], alpha, units_per_mm)
+        if not with_rgb:
+            return
         factors = None if light is None else light.factors(self.depth_mm[rows], rows)
         levels = np.float32(255) if factors is None else 255 * factors
         self.rgb[rows] = np.clip(band[:3].transpose(1, 2, 0) * levels + 0.5, 0, 255)
 
 
-def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Parts[_Picture]:
+def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool, with_rgb: bool = True) -> Parts[_Picture]:
     """The view's picture through a lens: two parts for the projection and one for each band."""
     with view.projected(view.pose, lens) as projected:
         yield
@@ -215,33 +228,31 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool) -> Par
         picture = _Picture.empty(lens.height, lens.width, with_colours=with_colours)
         recorded = EndoscopeLight(view.scene, view.shown_t, view.pose, lens) if view.light == "recorded" else None
         for rows in projected.bands:
-            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm, recorded)
+            picture.fill(rows, projected.blend(rows), view.scene.units_per_mm, recorded, with_rgb=with_rgb)
             yield
     return picture
 
 
-def _has_detail(view: ViewRequest) -> bool:
-    return view.detail == "on" and not view.is_coarse and view.scene.pictures is not None
+def _add_detail(view: ViewRequest, picture: _Picture) -> Parts[tuple[float, tuple[Notice, ...]]]:
+    """Set the picture's rgb: its colours and what they miss of the recorded frames.
 
-
-def _detailed(view: ViewRequest, picture: _Picture) -> Parts[tuple[_Picture, float, tuple[Notice, ...]]]:
-    """The picture with what the model misses of the recorded frames, the share that gets it, and a warning, if any."""
-    if picture.colours is None or not _has_detail(view):
-        return picture, 0.0, ()
+    Returns the share of the tissue whose detail comes from those, and a warning if they cannot be read.
+    """
+    assert picture.colours is not None
     renderer, lens = renderer_of(view.scene, view.device), view.lenses.drawn
+    added, warnings = Added.nothing(picture.depth_mm.shape), tuple[Notice, ...]()
     try:
-        detail = renderer.detail
-        assert detail is not None
-        added = yield from detail.added(renderer, view.shown_t, view.pose, lens, picture.depth_mm)
+        if (detail := renderer.detail) is not None:
+            added = yield from detail.added(renderer, view.shown_t, view.pose, lens, picture.depth_mm)
     except SceneError as error:
-        return picture, 0.0, (Notice.warning(NoticeCode.DETAIL_MISSING, f"The model is shown alone: {error}"),)
+        warnings = (Notice.warning(NoticeCode.DETAIL_MISSING, f"The model is shown alone: {error}"),)
     yield
-    factors, levels = None, np.empty_like(picture.rgb)
+    factors = None
     if view.light == "recorded":
         factors = EndoscopeLight(view.scene, view.shown_t, view.pose, lens).factors(picture.depth_mm)
-    light = np.broadcast_to(np.float32(1) if factors is None else factors, levels.shape)
-    run(in_levels, picture.colours, added.rgb, light, levels)
-    return replace(picture, rgb=levels), added.share, ()
+    light = np.broadcast_to(np.float32(1) if factors is None else factors, picture.rgb.shape)
+    run(in_levels, picture.colours, added.rgb, light, picture.rgb)
+    return added.share, warnings
 
 
 def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float32]]:
