@@ -65,9 +65,9 @@ CACHED = 6
 """Residuals in memory for a scene: of three moments with two eyes."""
 EDGE_PX = 5
 """Residuals fade over half as many pixels towards what is masked, so that none appears at once where its edge moves."""
-NOISE = 0.1
-"""Correlation of neighbouring pixels below which a residual fades, as it is noise of the camera: that of a model that
-misses nothing has up to 0.03, others 0.13 and more."""
+NOISE = 1.75 / 255
+"""A residual of this root mean square or less is noise of the camera and loss of the coding, and fades: a model that
+misses nothing leaves 1.5 to 1.75 levels of 255, others 2.6 and more."""
 MIN_TRANSMISSION, MIN_LIGHT = 0.3, 0.2
 """Residuals behind smoke, or in a dark border, are noise where less of the light is left."""
 
@@ -205,7 +205,8 @@ class Detail:
             steady = steady / np.maximum(factors, np.float32(MIN_LIGHT))
         valid = _faded(tissue & is_lit & (depth_mm > 0))
         missed = np.clip(steady - image[:3].transpose(1, 2, 0), -1, 1) * valid[..., None]
-        shown = min(max(_correlation(missed) / NOISE, 0.0), 1.0)
+        power = float(np.vdot(missed, missed)) / max(3 * float(np.vdot(valid, valid)), 1.0)
+        shown = min(max(power / NOISE**2 - 1, 0.0), 1.0)
         planes = np.zeros((height + 2, width + 2, 4), np.int16)
         planes[1:-1, 1:-1, :3] = np.rint(missed * np.float32(shown * ONE))
         planes[1:-1, 1:-1, 3] = valid * np.float32(ONE)
@@ -284,11 +285,6 @@ def _faded(valid: NDArray[np.bool_]) -> Floats:
     """[h, w] 1 where pixels are valid, falling to 0 within EDGE_PX of those that are not."""
     inner = cv2.erode(valid.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     return np.asarray(np.maximum(2 * cv2.blur(inner, (EDGE_PX, EDGE_PX)) - 1, 0) * inner, np.float32)
-
-
-def _correlation(missed: Floats) -> float:
-    """Correlation of neighbours along the rows of a residual [h, w, 3], 0 where it is not valid."""
-    return float(np.vdot(missed[:, 1:], missed[:, :-1]) / max(float(np.vdot(missed, missed)), 1e-9))
 
 
 def _centres_mm(renderer: SceneRenderer, t: float) -> Floats:
