@@ -205,6 +205,8 @@ def _clear_rows(key: Cells, airlight: Floats) -> list[int]:
         covered = np.where(fit.cover > MIN_COVER, np.float32(1), np.float32(np.nan))
         compared.append((covered * np.stack([fit.offset, np.maximum(fit.factor, MIN_FACTOR)]))[:, ::THINNED, ::THINNED])
         darkest.append(float(np.percentile(seen.rgb[seen.trust > 0].min(-1), LOW_PERCENTILE)))
+    if not rows:
+        return []
     offset, factor = np.stack(compared, axis=1)
     known = np.isfinite(offset)
     implied = np.sort(np.where(known, offset / factor, np.inf), axis=0)  # less the keyframe's share if there is none
@@ -235,9 +237,7 @@ def _offset(offset: Floats, factor: Floats, even: Floats, mean: float) -> Floats
 
 def _mean_thickness(keys: Sequence[Cells], evens: Sequence[Floats], airlight: Floats) -> float:
     """Thickness of the mean over time: the most with which the darkest tissue is dark and not darker, or the least
-    with which no view has less than no smoke; 0 without keyframes."""
-    if not keys:
-        return 0.0
+    with which no view has less than no smoke; 0 where no frame shows enough of a keyframe."""
     rgb, offset, factor, even = list[Floats](), list[Floats](), list[Floats](), list[Floats]()
     for key, means in zip(keys, evens, strict=True):
         for seen in key.all_seen(key.sampled):
@@ -247,6 +247,8 @@ def _mean_thickness(keys: Sequence[Cells], evens: Sequence[Floats], airlight: Fl
             offset.append(fit.offset.ravel()[trusted])
             factor.append(fit.factor.ravel()[trusted])
             even.append(means.reshape(3, -1)[:, trusted])
+    if not rgb:
+        return 0.0
     colours, offsets, factors = (np.concatenate(each) for each in (rgb, offset, factor))
     mean_values = np.concatenate(even, axis=1)
 

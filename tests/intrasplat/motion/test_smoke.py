@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from intrasplat.clip import DepthClip, Eye, split_frames
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.smoke import find_veils
+from intrasplat.motion.tracks import Tracks
 from intrasplat.motion.veil import MIN_TRANSMISSION, Veil, warnings_of, without_veils
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.outcome import snapshot_of, training_of
@@ -148,6 +149,15 @@ def test_clear_clips_and_changing_light_have_no_smoke() -> None:
     splashed = with_splash(steady, 0.1, np.random.default_rng(0))
     for clip in (steady, drifting(1.5)[0], drifting(0.0, 1.8)[0], dataclasses.replace(steady, rgb=blurred), splashed):
         assert found_in(clip) == ()
+
+
+def test_a_keyframe_that_no_track_leaves_says_nothing() -> None:
+    clip = behind(clear_clip(), veil_in(clear_clip(), 0.35 * LATER, EVERYWHERE))
+    train = split_frames(clip).train
+    (tracks,) = track_keyframes(clip, train)
+    lost = Tracks.empty(tracks.followed.tolist(), tracks.confidence.shape[1:], tracks.step_px, reference=3)
+    alone, with_lost = (find_veils(clip, train, each, clip)[0] for each in ([tracks], [tracks, lost]))
+    np.testing.assert_allclose(with_lost.share_taken(), alone.share_taken(), atol=0.02)
 
 
 def test_tracks_of_other_tissue_show_no_smoke() -> None:
