@@ -95,11 +95,12 @@ def _row(view: str, pairs: Sequence[Pair]) -> dict[str, object]:
 def _recorded(scene: TrainedScene, clip: DepthClip, report: Report, *, is_right: bool = False) -> Iterator[Pair]:
     """Scores of the held-out frames of an eye, without and with detail."""
     eye = clip.right if is_right and clip.right is not None else clip
+    left_from_eye = np.linalg.inv(clip.world_from_camera[0]) @ eye.world_from_camera[0]
     for index in report.held_out:
         pixels = judged_pixels(eye, index) if is_right else eye.tissue[index]
         shown = (
             render_frame(
-                scene, index / scene.frame_count, eye.world_from_camera[index], eye.intrinsics,
+                scene, index / scene.frame_count, scene.world_from_camera[index] @ left_from_eye, eye.intrinsics,
                 light="recorded", smoke="show", detail=detail,
             ).rgb
             for detail in ("off", "on")
