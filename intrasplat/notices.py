@@ -79,6 +79,7 @@ class NoticeCode(StrEnum):
     FRAMES_WITHOUT_TISSUE = "frames_without_tissue"
     FRAME_COUNT_UNKNOWN = "frame_count_unknown"
     HIDDEN_AT_FIRST = "hidden_at_first"
+    LIGHT_FLICKERS = "light_flickers"
     LITTLE_DEPTH = "little_depth"
     LITTLE_STEREO_DEPTH = "little_stereo_depth"
     LITTLE_TISSUE = "little_tissue"

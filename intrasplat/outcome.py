@@ -92,7 +92,7 @@ def training_of(run: Run, scene: TrainedScene, quantized: QuantizedScene | None)
         seconds=dict(run.setup.timings.seconds),
         light=light,
         assumptions=(
-            *run.light.notices(light),
+            *run.light.notices(run.setup.clip, light),
             *run.chosen,
             *run.schedule.notices,
             *(quantized.notices if quantized else (_floats(scene),)),
@@ -111,7 +111,7 @@ def _floats(scene: TrainedScene) -> Notice:
 
 def _warnings(run: Run) -> tuple[Notice, ...]:
     """The warnings of the run itself."""
-    found = list(run.light.warnings)
+    found = list(run.light.warnings(run.setup.clip, run.setup.split.train))
     least = max(run.schedule.epoch, run.schedule.opening)
     if run.setup.fixed_iterations is None and run.schedule.planned == least:
         text = (

@@ -52,6 +52,7 @@ export const DE = {
     "frames_without_tissue": "Einige Masken verdecken das ganze Bild.",
     "frame_count_unknown": "Der Clip nennt die Zahl seiner Bilder nicht.",
     "hidden_at_first": "Instrumente verdecken viel vom ersten Bild.",
+    "light_flickers": "Das Licht flackert; zwischen den Bildern kann die Szene zu hell oder zu dunkel sein.",
     "little_depth": "Die Tiefenbilder enthalten wenig Tiefe.",
     "little_stereo_depth": "Nur auf wenig Gewebe ließ sich Tiefe messen.",
     "little_tissue": "Wenig vom Bild gilt als Gewebe; die Masken sind vielleicht vertauscht.",

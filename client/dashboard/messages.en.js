@@ -52,6 +52,7 @@ export const EN = {
     "frames_without_tissue": "Some masks cover the whole picture.",
     "frame_count_unknown": "The clip does not tell how many frames it has.",
     "hidden_at_first": "Instruments hide much of the first frame.",
+    "light_flickers": "The light flickers, so moments between the frames may be too bright or too dark.",
     "little_depth": "The depth pictures hold little depth.",
     "little_stereo_depth": "Depth could be measured on little of the tissue.",
     "little_tissue": "Little of the picture counts as tissue; the masks may be the wrong way round.",

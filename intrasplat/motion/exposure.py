@@ -38,6 +38,9 @@ MIN_LEVEL, MAX_LEVEL = 0.08, 0.95
 MIN_CHANGE, MIN_TINT = 0.2, 0.12
 """Least range of the log gains' mean (one stop is 0.32, `d4d_stereo` drifts by 0.16), and of red or blue against green,
 that is corrected. The bases follow smaller changes as well, and lamps change with the place, which one gain cannot."""
+MAX_UNEVEN, MAX_UNEVEN_SHARE = 0.06, 0.1
+"""Difference of a training frame's mean log gain from that between its neighbours (0.005 in videos, 0.04 in stills 3 s
+apart), and the share of the frames that may differ by more: one step of the light is not a flicker."""
 TONE_POWER = 2.2
 """Light is about this power of recorded values."""
 
@@ -59,15 +62,46 @@ class Exposure:
         """[T, 3] logarithms of the gains of R G B against that of G."""
         return np.asarray(self.log_gains - self.log_gains[:, 1:2])
 
-    @property
-    def notice(self) -> Notice:
-        """The report's sentence on the light."""
+    def notice(self, times_s: Reals) -> Notice:
+        """The report's sentence on the light. times_s: [T]."""
         stops, tint = np.ptp(self.stops), np.exp(np.ptp(self.log_tints, axis=0).max())
+        extremes = [int(self.stops.argmin()), int(self.stops.argmax())]
+        dark, bright = (f"frame {index} ({times_s[index]:.1f} s)" for index in extremes)
         text = (
-            f"light: exposure changes by {stops:.1f} stops and white balance by {tint:.2f} times; the model has the "
-            f"light of frame {self.reference}"
+            f"light: exposure changes by {stops:.1f} stops, from {dark}, the darkest, to {bright}, the brightest, and "
+            f"white balance by {tint:.2f} times; the model has the light of frame {self.reference}"
         )
         return Notice.info(NoticeCode.EXPOSURE, text)
+
+    def warnings(self, train: Sequence[int], times_s: Reals) -> tuple[Notice, ...]:
+        """A warning if the gains of the training frames do not tell those of frames between them. times_s: [T]."""
+        uneven = unevenness(self.log_gains[train], times_s[train])
+        if not _flickers(uneven):
+            return ()
+        worst = int(uneven.argmax())
+        text = (
+            f"The light of {(uneven > MAX_UNEVEN).sum()} of {len(train)} training frames is not between that of the "
+            f"frames around them, most of all in frame {train[worst]}, by {np.expm1(uneven[worst]):.0%}: it flickers, "
+            "or changes faster than the frames show. The light between training frames is a guess: with light=recorded "
+            "such moments may be too bright or too dark, and the scores of held-out frames are too low for that."
+        )
+        return (Notice.warning(NoticeCode.LIGHT_FLICKERS, text),)
+
+
+def unevenness(log_gains: Reals, times_s: Reals) -> Reals:
+    """[K] by how much a frame's mean log gain differs from that between its neighbours; 0 for the first and the last.
+
+    log_gains: [K, 3]. times_s: [K], rising.
+    """
+    level = log_gains.mean(axis=1)
+    share = (times_s[1:-1] - times_s[:-2]) / (times_s[2:] - times_s[:-2])
+    uneven = np.zeros(len(level))
+    uneven[1:-1] = np.abs(level[1:-1] - (1 - share) * level[:-2] - share * level[2:])
+    return uneven
+
+
+def _flickers(uneven: Reals) -> bool:
+    return bool((uneven > MAX_UNEVEN).sum() > MAX_UNEVEN_SHARE * len(uneven))
 
 
 def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks]) -> Exposure | None:
@@ -89,12 +123,12 @@ def find_exposure(clip: DepthClip, train: Sequence[int], tracks: Sequence[Tracks
     steady = STEADY * (np.eye(known.sum())[1:] - np.eye(known.sum())[:-1])  # joins frames that no track joins
     targets = np.concatenate([values, np.zeros((len(steady), 3))])
     found, *_ = np.linalg.lstsq(np.concatenate([system[:, known], steady]), targets, rcond=None)
-    if np.ptp(found.mean(axis=1)) < MIN_CHANGE and np.ptp(found - found[:, 1:2], axis=0).max() < MIN_TINT:
+    measured, times_s = np.asarray(train)[known], clip.frame_times_s
+    drifts = np.ptp(found.mean(axis=1)) >= MIN_CHANGE or np.ptp(found - found[:, 1:2], axis=0).max() >= MIN_TINT
+    if not drifts and not _flickers(unevenness(found, times_s[measured])):
         return None
-    measured = np.asarray(train)[known]
     usual = int(np.abs(found - np.median(found, axis=0)).sum(axis=1).argmin())
     found -= found[usual]
-    times_s = clip.frame_times_s
     log_gains = np.stack([np.interp(times_s, times_s[measured], channel) for channel in found.T], axis=1)
     return Exposure(log_gains, int(measured[usual]))
 

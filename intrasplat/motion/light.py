@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,19 +49,19 @@ class RecordedLight:
             entry["vignetting"] = round(share, REPORTED_DIGITS)
         return LightChanges(**entry) if entry else None
 
-    def notices(self, changes: LightChanges | None) -> Iterator[Notice]:
+    def notices(self, clip: DepthClip, changes: LightChanges | None) -> Iterator[Notice]:
         """What the report says about it. changes: as changes() found it."""
         if self.veils:
             yield notice_of(self.veils[0])
         if changes is not None and changes.vignetting is not None:
             yield notice_of_border(changes.vignetting)
         if self.exposure is not None:
-            yield self.exposure.notice
+            yield self.exposure.notice(clip.frame_times_s)
 
-    @property
-    def warnings(self) -> tuple[Notice, ...]:
-        """What makes the result less right."""
-        return warnings_of(self.veils[0]) if self.veils else ()
+    def warnings(self, clip: DepthClip, train: Sequence[int]) -> tuple[Notice, ...]:
+        """What makes the result less right. train: the frames of the clip in which it was measured."""
+        thick = warnings_of(self.veils[0]) if self.veils else ()
+        return thick if self.exposure is None else (*thick, *self.exposure.warnings(train, clip.frame_times_s))
 
     def removed(self, clip: DepthClip) -> DepthClip:
         """The clip to train on: without smoke, in even and steady light. The clip itself where none was found."""

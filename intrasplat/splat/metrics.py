@@ -41,6 +41,13 @@ def psnr_tissue(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> flo
     return _decibel(_squared(rendered, truth, tissue, _unit), 3 * int(np.count_nonzero(tissue)))
 
 
+def relit(rendered: Image, truth: Image, tissue: NDArray[np.bool_]) -> Image:
+    """The render with the gain, one for all colours, that brings its tissue closest to the truth."""
+    _check_shapes(rendered, truth, tissue)
+    shown, true = (_unit(image)[tissue].astype(np.float64) for image in (rendered, truth))
+    return np.asarray(_unit(rendered) * ((shown * true).sum() / max((shown**2).sum(), 1e-9)))
+
+
 def clear_of_highlights(rendered: Image, truth: Image) -> NDArray[np.bool_]:
     """[H, W] pixels at least HIGHLIGHT_PX / 2 away from a highlight in either image.
 

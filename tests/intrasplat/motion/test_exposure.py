@@ -85,6 +85,35 @@ def test_frames_that_no_track_joins_have_the_gain_of_their_neighbours() -> None:
     assert np.abs(exposure.log_gains - true[:, None]).max() < 0.08
 
 
+@pytest.mark.parametrize(
+    ("log_gains", "flickers"),
+    [
+        (0.1 * (np.arange(FRAMES) % 3 == 0), True),
+        (0.4 * (np.arange(FRAMES) % 5 == 0), True),
+        (0.05 * np.arange(FRAMES), False),
+        (0.4 * (np.arange(FRAMES) >= FRAMES - 1), False),
+    ],
+    ids=["small", "large", "drift", "once"],
+)
+def test_light_that_changes_faster_than_frames_show_is_corrected_and_named(
+    log_gains: NDArray[np.float64], flickers: bool
+) -> None:
+    clip, train = grey_clip(log_gains), range(FRAMES)
+    exposure = find_exposure(clip, train, [still(clip, 0, train)])
+    assert exposure is not None
+    assert np.abs(exposure.log_gains - (log_gains - log_gains[exposure.reference])[:, None]).max() < 0.02
+    codes = [each.code for each in RecordedLight(exposure).warnings(clip, train)]
+    assert codes == [NoticeCode.LIGHT_FLICKERS] * flickers
+
+
+def test_the_notice_says_when_it_is_darkest_and_brightest() -> None:
+    logs = np.array([0.0, 0.1, 0.4, -0.3, 0.0])[:, None].repeat(3, axis=1)
+    assert (
+        "from frame 3 (0.3 s), the darkest, to frame 2 (0.2 s), the brightest"
+        in Exposure(logs, 0).notice(np.arange(5) * 0.1).text
+    )
+
+
 def test_a_few_cells_do_not_tell_a_frames_gain() -> None:
     clip = grey_clip(np.zeros(FRAMES))
     tracks = still(clip, 0, range(FRAMES))

@@ -77,7 +77,15 @@ def report_of(clip: DepthClip, holdout: str = "every8", noise: float = 0.01) -> 
 def scores(psnr_db: float = 35.0, *, covered: float = 1.0, depth_agreement_mm: float = 0.5, frames: int = 3) -> Scores:
     same = (psnr_db,) * frames
     return Scores(
-        tuple(range(1, 1 + frames)), same, same, same, (0.9,) * frames, (covered,) * frames, depth_agreement_mm, 60.0
+        tuple(range(1, 1 + frames)),
+        same,
+        same,
+        same,
+        same,
+        (0.9,) * frames,
+        (covered,) * frames,
+        depth_agreement_mm,
+        60.0,
     )
 
 
@@ -200,6 +208,25 @@ def test_a_view_that_is_not_finite_stops_the_scene(broken: str) -> None:
 )
 def test_every_failure_is_told(held_out: Scores, trained: Scores, baselines: CopyBaselines, said: str) -> None:
     assert any(said in each.text for each in score_warnings(held_out, trained, baselines))
+
+
+def test_motion_is_not_blamed_for_light_that_flickers() -> None:
+    clip = long_clip()
+
+    def dimmed(index: int) -> RenderedFrame:
+        view = views(clip)(index)
+        return dataclasses.replace(view, rgb=view.rgb * np.float32(0.6))
+
+    split, trained = split_frames(clip), measure(clip, [10, 18], views(clip))
+    dark = measure(clip, split.held_out, dimmed)
+    moved = dataclasses.replace(dark, relit_db=(20.0,) * 3)
+    flicker = (Notice.warning(NoticeCode.LIGHT_FLICKERS, "It flickers."),)
+    blamed = {NoticeCode.HELD_OUT_SCORE_LOW, NoticeCode.GENERALISATION_GAP}
+    for held_out, warnings, fires in ((dark, (), True), (dark, flicker, False), (moved, flicker, True)):
+        first = first_report(clip, split, dataclasses.replace(TRAINING, warnings=warnings))
+        report = scored_report(first, held_out, RightScores(), trained, BELOW)
+        assert report.psnr_tissue_db == pytest.approx(np.mean(dark.psnr_tissue_db))
+        assert blamed & {each.code for each in report.warnings} == (blamed if fires else set())
 
 
 def test_good_scores_are_not_complained_about() -> None:

@@ -91,6 +91,6 @@ def test_highlights_of_either_picture_are_left_out_with_their_surroundings() -> 
 @pytest.mark.parametrize(("right_db", "warned"), [(33.0, False), (30.0, True)])
 def test_a_right_eye_far_below_the_left_is_told(right_db: float, warned: bool) -> None:
     same = (35.0, 35.0)
-    held_out = Scores((1, 9), same, same, same, (0.9,) * 2, (1.0,) * 2, 0.5, 60.0)
+    held_out = Scores((1, 9), same, same, same, same, (0.9,) * 2, (1.0,) * 2, 0.5, 60.0)
     found = right_eye_warnings(held_out, RightScores((right_db,) * 2, same, same, same))
     assert [each.code for each in found] == [NoticeCode.RIGHT_EYE_LOW] * warned
