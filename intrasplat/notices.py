@@ -73,6 +73,7 @@ class NoticeCode(StrEnum):
     EYES_COLOURED_APART = "eyes_coloured_apart"
     EYES_DISAGREE = "eyes_disagree"
     EYES_OUT_OF_STEP = "eyes_out_of_step"
+    EYES_UNLIKE = "eyes_unlike"
     FEW_FRAMES = "few_frames"
     FIELD_OF_VIEW_UNUSUAL = "field_of_view_unusual"
     FRAMES_SHOW_NOTHING = "frames_show_nothing"
@@ -98,6 +99,7 @@ class NoticeCode(StrEnum):
     POSE_JITTER = "pose_jitter"
     REPEATED_FRAMES = "repeated_frames"
     ROWS_MISALIGNED = "rows_misaligned"
+    SHARPNESS_CHANGES = "sharpness_changes"
     STEREO_UNSURE = "stereo_unsure"
     VEILED = "veiled"
     # warnings about the training and its scores

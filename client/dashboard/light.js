@@ -13,13 +13,14 @@ const WEIGHTS = {
   ],
   "care": [
     "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "camera_or_tissue", "colour_changes",
-    "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "detail_lost", "detail_missing",
-    "eyes_out_of_step", "few_frames", "first_picture", "frames_show_nothing", "frames_without_tissue",
+    "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "detail_lost",
+    "detail_missing", "eyes_out_of_step", "eyes_unlike", "few_frames", "first_picture", "frames_show_nothing",
+    "frames_without_tissue",
     "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "light_flickers", "little_depth", "mask_gaps",
     "mask_levels", "masks_mark_nothing", "masks_unsure", "motion_guessed", "no_instrument_masked", "no_texture",
     "out_of_focus", "outlier_frames", "pose_far", "pose_jitter", "poses_contradict", "poses_unsure", "repeated_frames",
-    "right_eye_low", "stereo_unsure", "time_outside_clip", "time_too_short", "training_goes_on", "unclassified",
-    "unseen", "veiled"
+    "right_eye_low", "sharpness_changes", "stereo_unsure", "time_outside_clip", "time_too_short", "training_goes_on",
+    "unclassified", "unseen", "veiled"
   ],
   "fine": [
     "calibration_scaled", "colours_unknown", "eyes_coloured_apart", "frame_count_unknown", "gpu_idle",

@@ -8,6 +8,7 @@ Symbols: H W pixels, K blocks of BLOCK_PX squared pixels, P patches of some bloc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -86,6 +87,22 @@ def detail_of(grey: Grey, inside: NDArray[np.bool_] | None = None) -> Detail | N
         whole = cv2.resize(inside[used].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1 - 1e-4
     fine, coarse = squares[0] - squares[FINE_STEPS], squares[FINE_STEPS] - squares[STEPS]
     return Detail(_patch_means(fine, whole), _patch_means(coarse, whole), np.where(whole, means, np.nan).ravel())
+
+
+def sharpness_and_contrast(eye: Eye, index: int) -> tuple[float, float]:
+    """Logarithms of a frame's fine over coarse detail and of its coarse detail, levels: medians over patches.
+
+    NaN in a picture that is too small to be judged, or without detail.
+    """
+    found = detail_of(*_analysed(eye, index))
+    eye.let_go(index)
+    if found is None or found.means.size < MIN_BLOCKS:
+        return math.nan, math.nan
+    textured = np.isfinite(found.fine) & (np.nan_to_num(found.coarse) > MIN_COARSE_LEVELS**2) & (found.fine > 0)
+    if not textured.any():
+        return math.nan, math.nan
+    fine, coarse = np.log(found.fine[textured]) / 2, np.log(found.coarse[textured]) / 2
+    return float(np.median(fine - coarse)), float(np.median(coarse))
 
 
 def relative_sharpness(details: Mapping[int, Detail], train: Sequence[int]) -> dict[int, float]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from pydantic import ValidationError
 
@@ -14,7 +15,11 @@ from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError
 from intrasplat.names import Detail, Light, Smoke
+from intrasplat.notices import Notice, NoticeCode, Severity
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+
+if TYPE_CHECKING:  # imported when needed, as it imports torch
+    from intrasplat.scene.scene import TrainedScene
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -120,6 +125,7 @@ def run_cli(options: argparse.Namespace) -> int:
     wanted = _camera(options)
     camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
     pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
+    shown = dict[NoticeCode, list[tuple[str, Notice]]]()
     for t, path in _targets(options, scene.frame_count):
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
@@ -136,8 +142,22 @@ def run_cli(options: argparse.Namespace) -> int:
         )
         print(path)
         for notice in frame.warnings:
-            print(f"{notice.severity}: {notice.text}", file=sys.stderr)
+            shown.setdefault(notice.code, []).append((path.name, notice))
+    for pictures in shown.values():
+        (name, notice), many = pictures[0], len(pictures) - 1
+        where = f" ({many + 1} images, the first is {name}, the last {pictures[-1][0]})" if many else ""
+        print(f"{notice.severity}: {notice.text}{where}", file=sys.stderr)
+    for text in _without_effect(options, scene):
+        print(f"{Severity.INFO}: {text}", file=sys.stderr)
     return ExitCode.OK
+
+
+def _without_effect(options: argparse.Namespace, scene: TrainedScene) -> Iterator[str]:
+    """Why an option changes nothing."""
+    if options.smoke == "show" and scene.veil is None:
+        yield "No smoke was found in the clip of this scene: --smoke show changes nothing."
+    if options.light == "recorded" and scene.log_gains is None and scene.vignetting is None:
+        yield "The light of the clip of this scene hardly changes: --light recorded changes nothing."
 
 
 def _camera(options: argparse.Namespace) -> IntrinsicsOverride:

@@ -132,12 +132,13 @@ def notice_of(veil: Veil) -> Notice:
 
 def warnings_of(veil: Veil) -> tuple[Notice, ...]:
     """A warning if much of the tissue's light is lost."""
-    thick = int((veil.share_taken() > MAX_TAKEN).sum())
-    if thick < MAX_THICK_SHARE * len(veil.thickness):
+    thick = np.flatnonzero(veil.share_taken() > MAX_TAKEN)
+    if len(thick) < MAX_THICK_SHARE * len(veil.thickness):
         return ()
     text = (
-        f"In {thick} of {len(veil.thickness)} frames smoke takes more than {MAX_TAKEN:.0%} of the light: what is left "
-        "behind it is noisy, and its colours are less right. Take a part of the clip with less smoke."
+        f"In {len(thick)} of {len(veil.thickness)} frames, between {thick[0]} and {thick[-1]}, smoke takes more than "
+        f"{MAX_TAKEN:.0%} of the light: what is left behind it is noisy, and its colours are less right. Take a part "
+        "of the clip with less smoke."
     )
     return (Notice.warning(NoticeCode.VEILED, text),)
 

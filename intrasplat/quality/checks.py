@@ -18,6 +18,7 @@ from intrasplat.clip.split import REPEAT_LEVELS
 from intrasplat.clip.types import DepthClip
 from intrasplat.fusion import CLEAR_CONFIDENCE
 from intrasplat.notices import Notice, NoticeCode
+from intrasplat.quality.lenses import lens_warnings
 from intrasplat.train.scoring import sample_frames
 
 MIN_FRAMES = 16
@@ -100,9 +101,10 @@ def clip_warnings(clip: DepthClip, train: Sequence[int]) -> list[Notice]:
                 f"{smooth:.0%} of the tissue has no texture, so stereo and motion are guessed there.",
             )
         )
-    return (
-        found + _brightness_warnings(clip, sampled) + picture_warnings(clip, sampled) + sequence_warnings(clip, train)
-    )
+    of_pictures = picture_warnings(clip, sampled)
+    if all(each.code is not NoticeCode.BLOOD for each in of_pictures):  # blood is dark
+        found += _brightness_warnings(clip, sampled)
+    return found + of_pictures + lens_warnings(clip, train) + sequence_warnings(clip, train)
 
 
 def picture_warnings(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
@@ -111,13 +113,15 @@ def picture_warnings(clip: DepthClip, sampled: Sequence[int]) -> list[Notice]:
     if not seen:
         return []
     found = []
-    dark = [_darkest(clip, index) for index in clip.one_by_one(seen)]
-    if sum(each > MAX_DARK_LEVEL for each in dark) >= min(MIN_DOUBTFUL_FRAMES, len(seen)):
+    dark = {index: _darkest(clip, index) for index in clip.one_by_one(seen)}
+    pale = [index for index, level in dark.items() if level > MAX_DARK_LEVEL]
+    if len(pale) >= min(MIN_DOUBTFUL_FRAMES, len(seen)):
         found.append(
             Notice.warning(
                 NoticeCode.VEILED,
-                f"Even the dark tissue is pale, {max(dark):.0f} of 255 in every colour: smoke, a fogged lens or too "
-                "much light takes its contrast, and the model shows the veil as if it were tissue.",
+                f"Even the dark tissue is pale about frames {pale[0]} to {pale[-1]}, up to {max(dark.values()):.0f} of "
+                "255 in every colour: smoke, a fogged lens or too much light takes its contrast, and the model shows "
+                "the veil as if it were tissue.",
             )
         )
     return found + _focus_warnings(clip, seen) + _colour_warnings(clip, seen)

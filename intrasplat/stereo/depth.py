@@ -170,7 +170,7 @@ def estimate_depth(
         + empty.notices(clip.frame_count)
         + (() if lag is None else (lag.notice(unpaired),))
         + mask_warnings
-        + registration.notices
+        + registration.notices(drops=bool(splashes.notices))
         + _warnings(sure_share)
         + _range_warnings(outside, depth_range_mm),
         measurements={

@@ -176,9 +176,8 @@ class Registration:
             colour_correlation=self.colours.correlation,
         )
 
-    @property
-    def notices(self) -> tuple[Notice, ...]:
-        """Warnings about calibration and colours."""
+    def notices(self, *, drops: bool = False) -> tuple[Notice, ...]:
+        """Warnings about calibration and colours. drops: whether drops on a lens may be why colours differ."""
         found, moved_px = [], self.turn.moved_px(self.calibrated)
         if self.matches == 0:
             text = (
@@ -205,9 +204,9 @@ class Registration:
                 "corrected"
             )
             found.append(Notice.warning(NoticeCode.EYES_COLOURED_APART, text))
-        return (*found, *self._disagreement())
+        return (*found, *self._disagreement(drops=drops))
 
-    def _disagreement(self) -> tuple[Notice, ...]:
+    def _disagreement(self, *, drops: bool) -> tuple[Notice, ...]:
         """Warnings about differences that neither rotation nor colours correct."""
         found, correlation = [], self.colours.correlation
         if self.residual_px > MAX_RESIDUAL_PX * max(self.calibrated.width / FEATURE_WIDTH, 1.0):
@@ -216,10 +215,10 @@ class Registration:
                 "check that the frames of the eyes are of the same moment, that both are in focus, and that the "
                 "calibration's distortion is that of this endoscope"
             )
-        if correlation is not None and correlation < MIN_CORRELATION:
+        if correlation is not None and correlation < MIN_CORRELATION and not drops:
             found.append(
                 f"the eyes' colours correlate by {correlation:.2f} where they match: check that both have the same "
-                "channels and that neither is burnt out"
+                "channels, and that neither is burnt out, fogged, or behind smoke or drops"
             )
         return tuple(Notice.warning(NoticeCode.EYES_DISAGREE, text) for text in found)
 

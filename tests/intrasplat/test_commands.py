@@ -94,6 +94,19 @@ def test_render_writes_one_picture_a_frame(scene: Path, tmp_path: Path) -> None:
     assert picture.shape == (HEIGHT, WIDTH, 3)
 
 
+def test_render_says_a_warning_of_many_pictures_once_and_what_has_no_effect(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = ["--frames", "1,4,9", "--pose", "orbit:60,0,1", "--smoke", "show", "--light", "recorded"]
+    assert main(["render", str(scene), *far, "--out", str(tmp_path / "frames")]) == ExitCode.OK
+    said = capsys.readouterr().err.splitlines()
+    (pose,) = (each for each in said if "viewing distances" in each)
+    assert pose.startswith("warning: ")
+    assert pose.endswith("(3 images, the first is 000001.png, the last 000009.png)")
+    assert len(said) == len(set(said))
+    assert sum("changes nothing" in each for each in said) == 2
+
+
 def test_render_writes_any_layer_from_any_pose(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "depth.npy"
     view = ["--t", "0.4", "--pose", "orbit:5,0,1", "--width", "48", "--layer", "depth", "--out", str(out)]

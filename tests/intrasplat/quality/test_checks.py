@@ -11,7 +11,7 @@ import pytest
 
 from intrasplat.clip import DepthClip, open_clip, split_frames
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.quality.checks import picture_warnings, sequence_warnings
+from intrasplat.quality.checks import clip_warnings, picture_warnings, sequence_warnings
 from intrasplat.train.scoring import sample_frames
 from lab.conditions import CONDITIONS, CleanClip, clean_clip
 from lab.phantom import MOTIONS, Motion, PhantomSettings, make_phantom
@@ -66,6 +66,22 @@ def test_what_harms_a_scene_is_told(clean: CleanClip, condition: str, severity: 
     found = doubts(given.clip)
     assert sum(said in each.text for each in found) == 1
     assert len(found) == 1
+
+
+def test_a_veil_is_named_with_its_frames(clean: CleanClip) -> None:
+    rgb = clean.clip.rgb.copy()
+    rgb[10:] = (0.5 * rgb[10:] + 100).astype(np.uint8)
+    clip = dataclasses.replace(clean.clip, rgb=rgb)
+    (warning,) = (each for each in picture_warnings(clip, [0, 4, 10, 14, 18]) if each.code is NoticeCode.VEILED)
+    assert "about frames 10 to 18" in warning.text
+
+
+def test_blood_is_not_told_as_changing_light_as_well(clean: CleanClip) -> None:
+    clip = CONDITIONS["blood"].apply(clean, 5, 0).clip
+    assert isinstance(clip, DepthClip)
+    codes = {each.code for each in clip_warnings(clip, split_frames(clip).train)}
+    assert NoticeCode.BLOOD in codes
+    assert NoticeCode.BRIGHTNESS_CHANGES not in codes
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,7 @@ def test_colours_that_do_not_follow_each_other_are_left_alone(change: Callable[[
 def test_too_little_to_compare_colours_by_is_told() -> None:
     assert colours_of([dataclasses.replace(pair, sure=np.zeros_like(pair.sure)) for pair in [matched()]]) == Colours()
     unknown = Registration(drawn().intrinsics, 4.0, matches=200)
-    assert [notice.code for notice in unknown.notices] == [NoticeCode.COLOURS_UNKNOWN]
+    assert [notice.code for notice in unknown.notices()] == [NoticeCode.COLOURS_UNKNOWN]
 
 
 def matched() -> MatchedPair:

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from intrasplat.clip import DepthClip
 from intrasplat.clip.calibration import RectifiedClip
 from intrasplat.clip.splashes import falls, lost_detail
+from intrasplat.machine.hooks import Hooks
+from intrasplat.machine.timing import Timings
 from intrasplat.notices import NoticeCode
-from intrasplat.stereo import estimate_depth
+from intrasplat.stereo import estimate_depth, match_eyes
+from intrasplat.stereo.registration import MIN_CORRELATION
+from lab.conditions import CONDITIONS, Recording, clean_clip
+from lab.phantom import PhantomSettings
 from tests.intrasplat.stereo.test_stereo import HEIGHT, WIDTH, clip_of, draw_pair, slanted, texture
 
 FRAMES, FIRST, DISPARITY_PX = 24, 8, 12
@@ -75,6 +80,19 @@ def test_clean_lenses_and_tissue_that_changes_for_both_eyes_have_no_drops(left: 
     clip = estimate_depth(recorded(left, right))
     assert not notices(clip)
     assert clip.tissue.all()
+
+
+def test_a_drop_does_not_make_the_eyes_colours_disagree() -> None:
+    clean = clean_clip(PhantomSettings(width=320, height=256, frames=16, motion="still", tools=()))
+    wet = CONDITIONS["splash_stereo"].apply(clean, 4, 0).clip
+    assert isinstance(wet, Recording)
+    drawn = wet.stereo_recording()
+    clip = match_eyes(drawn.clip, drawn.calibration, "every8", Hooks(), Timings())
+    assert notices(clip)
+    assert clip.registration is not None
+    assert clip.registration.colour_correlation is not None
+    assert clip.registration.colour_correlation < MIN_CORRELATION
+    assert NoticeCode.EYES_DISAGREE not in {each.code for each in clip.warnings}
 
 
 def test_held_out_frames_do_not_decide_where_drops_are() -> None:
