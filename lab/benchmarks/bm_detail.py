@@ -38,7 +38,8 @@ from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.scoring import judged_pixels
 from intrasplat.view.render import render_frame
-from lab.evaluate.rows import adding_alone, commit, machine, read_rows, texts_of, write_rows
+from lab.evaluate.length import add_length, length_of
+from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, OpenClip, open_source, source_of
 from lab.evaluate.truth import Expected, Truth
 
@@ -57,8 +58,7 @@ Pair = tuple[float, float]
 def main(arguments: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     os.environ.setdefault(DATA_VARIABLE, "../shared/data")
-    limit = {"iterations": options.iterations} if options.budget_s is None else {"budget_s": options.budget_s}
-    spelt = f"{options.iterations} steps" if options.budget_s is None else f"{options.budget_s:g} s"
+    limit, spelt = length_of(options)
     with adding_alone(options.out.parent):
         for source in map(source_of, options.clips):
             opened = open_source(source, options.holdout, Hooks())
@@ -68,8 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for found in measured(opened, asked):
                     row = {**named, "seed": seed, **found, "machine": machine(), "commit": commit()}
                     text = texts_of(row, FIELDS)
-                    others = [each for each in read_rows(options.out) if any(each[name] != text[name] for name in KEY)]
-                    write_rows(options.out, FIELDS, [*others, text])
+                    replace_row(options.out, FIELDS, KEY, text)
                     print("  ".join(f"{name} {text[name]}" for name in FIELDS[:-2] if text[name]), flush=True)
 
 
@@ -159,9 +158,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--holdout", default="every8")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--iterations", type=int, default=300)
-    length.add_argument("--budget-s", type=float)
+    add_length(parser)
     parser.add_argument("--out", type=Path, default=Path("lab/rows/detail.csv"))
     return parser
 

@@ -35,7 +35,8 @@ from lab.conditions.exposure import with_drift, with_tint
 from lab.conditions.lens import with_splash
 from lab.conditions.smoke import with_haze, with_smoke
 from lab.evaluate.fitted import fitted_db, plain_db
-from lab.evaluate.rows import adding_alone, commit, machine, read_rows, texts_of, write_rows
+from lab.evaluate.length import add_length, length_of
+from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, Source, open_source, source_of
 
 HOLDOUT = "every8"
@@ -60,8 +61,7 @@ FIELDS = (
 def main(arguments: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     os.environ.setdefault(DATA_VARIABLE, "../shared/data")
-    limit = {"iterations": options.iterations} if options.budget_s is None else {"budget_s": options.budget_s}
-    spelt = f"{options.iterations} steps" if options.budget_s is None else f"{options.budget_s:g} s"
+    limit, spelt = length_of(options)
     with adding_alone(options.out.parent):
         for source in map(source_of, options.clips):
             clean = open_source(source, HOLDOUT, Hooks()).clip
@@ -69,8 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 row = {"clip": source.name, "light": light, "level": LIGHTS[light][0], "limit": spelt}
                 row |= measured(source, clean, light, limit) | {"machine": machine(), "commit": commit()}
                 text = texts_of(row, FIELDS)
-                others = [each for each in read_rows(options.out) if any(each[name] != text[name] for name in KEY)]
-                write_rows(options.out, FIELDS, [*others, text])
+                replace_row(options.out, FIELDS, KEY, text)
                 print("  ".join(f"{name} {text[name]}" for name in FIELDS[:-2]), flush=True)
 
 
@@ -126,9 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", nargs="+", default=list(CLIPS))
     parser.add_argument("--lights", nargs="+", choices=list(LIGHTS), default=list(LIGHTS))
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--iterations", type=int, default=300)
-    length.add_argument("--budget-s", type=float)
+    add_length(parser)
     parser.add_argument("--out", type=Path, default=Path("lab/rows/light.csv"))
     return parser
 

@@ -135,6 +135,12 @@ def write_rows(path: Path, fields: Iterable[str], rows: Iterable[Mapping[str, ob
     replace_file(path, text.getvalue().encode(), FOR_ALL)
 
 
+def replace_row(path: Path, fields: Iterable[str], key: Sequence[str], row: Mapping[str, str]) -> None:
+    """Add a row of texts to a CSV file, in place of one with the same values of `key`."""
+    others = [each for each in read_rows(path) if any(each[name] != row[name] for name in key)]
+    write_rows(path, fields, [*others, row])
+
+
 def machine(device: str = "cpu") -> str:
     """Processor, cores, another device if there is one, and the date."""
     name = platform.processor() or platform.machine()
