@@ -198,12 +198,9 @@ export class Viewer extends EventTarget {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
       const image = picture.image ?? (await createImageBitmap(picture.blob));
       if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
-      this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
       this.pace.note();
-      this.shown = shownOf(view, picture);
       if (!picture.isRecorded) this.clip.follow(picture);
-      this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
-      this.#tell(name, picture, performance.now() - began);
+      this.#present(picture, image, view, name, began);
       if (isDrawnHere) await this.#refine(view, visit, name);
       else if (picture.state === "done") this.memory.want(view);
     } catch (error) {
@@ -229,6 +226,14 @@ export class Viewer extends EventTarget {
     return this.memory.draw(view, room, { isMoving, isTimed: this.way.isOpen });
   }
 
+  /** Put a view's picture on the screen, and say what it shows. began: when it was asked for. */
+  #present(picture, image, view, name, began) {
+    this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
+    this.shown = shownOf(view, picture);
+    this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
+    this.#tell(name, picture, performance.now() - began);
+  }
+
   /** Show the service's picture of a view that rests: only it has the detail of recorded frames. */
   async #refine(view, visit, name) {
     await this.memory.player?.settled();
@@ -238,10 +243,7 @@ export class Viewer extends EventTarget {
       const picture = judged(await this.pictures.ask(view), view);
       const image = await createImageBitmap(picture.blob);
       if (visit !== this.visit || this.isWanted) return;
-      this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
-      this.shown = shownOf(view, picture);
-      this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
-      this.#tell(name, picture, performance.now() - began);
+      this.#present(picture, image, view, name, began);
     } catch {
       // What is drawn here stays; #confirm() says whether the service still has the scene.
     }
