@@ -235,9 +235,9 @@ class Views:
         own = endoscope_pose(scene, clamped_to_clip(scene, request.t)[0]) if pose is None else pose
         pose_rows = tuple(own[:3].flatten().tolist())
         picture_camera = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
-        detail = LEVELS[level]
-        camera = camera.resized(-(-camera.width // detail.pixels), -(-camera.height // detail.pixels))
-        drawn = thinned(scene, detail.gaussians)
+        coarse = LEVELS[level]
+        camera = camera.resized(-(-camera.width // coarse.pixels), -(-camera.height // coarse.pixels))
+        drawn = thinned(scene, coarse.gaussians)
         attributes = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
         view = ViewRequest(
             drawn, request.t, pose, camera, self._device,

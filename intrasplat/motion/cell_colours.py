@@ -110,6 +110,13 @@ class Split:
 
 
 def split(start: Floats, there: Floats, trust: Floats, airlight: Floats, over: float) -> Split:
+    """Fit factor and offset of colours `there` [h, w, 3] against those at the start of the tracks [h, w, 3].
+
+    Args:
+        trust: [h, w] of the cells.
+        airlight: [3] the offset's colour.
+        over: standard deviation of the windows, cells.
+    """
     by_start, by_air = (there * start).sum(-1), there @ airlight
     starts, mixed, air = (start * start).sum(-1), start @ airlight, np.float32(airlight @ airlight)
     cover = smooth(trust, over)
@@ -133,5 +140,5 @@ def usable(rgb: Floats) -> NDArray[np.bool_]:
 
 
 def smooth(values: Floats, over: float) -> Floats:
-    """Gaussian mean with this standard deviation in cells."""
+    """[h, w] Gaussian mean with this standard deviation, cells."""
     return np.asarray(cv2.GaussianBlur(values, (0, 0), over, borderType=cv2.BORDER_REFLECT), np.float32)

@@ -19,14 +19,14 @@ much as all Gaussians; less is sharper, by 1.0 dB."""
 
 
 @dataclass(frozen=True)
-class Detail:
-    """A level of detail: draw one of `pixels` pixels along each side, and one of `gaussians` Gaussians."""
+class Level:
+    """A level of coarseness: draw one of `pixels` pixels along each side, and one of `gaussians` Gaussians."""
 
     pixels: int
     gaussians: int
 
 
-LEVELS = (Detail(1, 1), Detail(2, 2), Detail(4, 6))
+LEVELS = (Level(1, 1), Level(2, 2), Level(4, 6))
 """From full detail to the coarsest level."""
 
 _thinned: WeakKeyDictionary[TrainedScene, dict[int, TrainedScene]] = WeakKeyDictionary()

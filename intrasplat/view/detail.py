@@ -80,7 +80,7 @@ class _Residual:
               where the recorded picture shows tissue, and falls to 0 towards what it does not
     depth_mm  [h + 2, w + 2] of the model in that eye
     lens, world_from_eye   its camera; [4, 4] mm
-    means     [3, N] the Gaussians' centres at that frame, units
+    means_mm  [3, N] the Gaussians' centres at that frame, world
     """
 
     planes: NDArray[np.int16]
@@ -301,9 +301,11 @@ def _median(values: Floats) -> np.float32:
 
 
 def _together(means: dict[int, tuple[Floats, Floats]], own: list[Floats], shared: Floats) -> tuple[Floats, Floats]:
-    """R G B and weight of all eyes together.
+    """R G B [H, W, 3], times weight, and weight [H, W] of all eyes together.
 
-    means: R G B [H, W, 3], times weight, and weight [H, W] of each eye.
+    Args:
+        means: the same of each eye.
+        own, shared: [H, W] weights of what each eye misses alone, and of what both miss.
     """
     if len(means) == 1:
         ((rgb, weight),) = means.values()

@@ -1,4 +1,4 @@
-"""The kernel that carries a residual to a view (intrasplat/view/detail.py).
+"""The kernels of a view's detail: motion, carried residuals and the picture's levels (intrasplat/view/detail.py).
 
 Symbols: H W pixels of the view, h w of the recorded picture, m n of the coarse view.
 """
