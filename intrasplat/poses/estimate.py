@@ -9,11 +9,14 @@ Symbols: T frames of the clip, K frames that are fitted together, S time courses
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from intrasplat.clip import DepthClip, spread
+from intrasplat.machine.cores import cores
+from intrasplat.machine.hooks import ignore
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.poses.beside import place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
@@ -83,26 +86,28 @@ class FoundPath:
         return any(sure) or self.alone_mm > MOVED_MM or self.alone_deg > MOVED_DEG
 
 
-def find_path(
-    clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None
-) -> FoundPath:
+def find_path(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = ignore) -> FoundPath:
     """The path of the clip's camera.
 
     Args:
         train: the frames, rising, that determine the path. All others are aligned with them.
         on_progress: gets the share done.
     """
-    with one_opencv_thread():
-        return _found(clip, train, on_progress)
+    with one_opencv_thread(), ThreadPoolExecutor(cores(), thread_name_prefix="poses") as pool:
+        return _found(clip, train, pool, on_progress)
 
 
-def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None]) -> FoundPath:
+def _found(
+    clip: DepthClip, train: Sequence[int], pool: ThreadPoolExecutor, on_progress: Callable[[float], None]
+) -> FoundPath:
     frames = Frames(clip)
-    chain = chained(frames, spread(train, MAX_FITTED), lambda share: on_progress(CHAINING * share))
+    followed = spread(train, MAX_FITTED)
+    list(pool.map(frames.frame, followed))
+    chain = chained(frames, followed, pool, lambda share: on_progress(CHAINING * share))
     if not chain.links:
         return _unknown(clip.frame_count)
     used = chain.frames
-    fit = fitted(frames.camera, chain, clip.frame_s, lambda share: on_progress(CHAINING + FITTING * share))
+    fit = fitted(frames.camera, chain, clip.frame_s, pool, lambda share: on_progress(CHAINING + FITTING * share))
     on_progress(CHAINING + FITTING)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics
@@ -112,10 +117,14 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     path[list(used)] = gauge.poses
     unsure = _apart(used, fit, chain.links)
     others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
-    for done, i in enumerate(others):
-        pose, share = place_beside(frames, used, fit, gauge, i)
-        path[i] = pose
+
+    def beside(i: int) -> tuple[Reals, float]:
+        placed = place_beside(frames, used, fit, gauge, i)
         frames.forget(i)
+        return placed
+
+    for done, (i, (pose, share)) in enumerate(zip(others, pool.map(beside, others), strict=True)):
+        path[i] = pose
         unsure += [i] if share < MIN_AGREEING else []
         on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
     known = sorted({*used, *others})

@@ -6,6 +6,7 @@ Symbols: h w cells of the coarse grid, M matches.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from threading import local
 
 import cv2
 import numpy as np
@@ -90,7 +91,10 @@ class FrameLink:
 
 
 class Frames:
-    """The clip's frames on the coarse grid, computed on demand and cached, and links between them."""
+    """The clip's frames on the coarse grid, computed on demand and cached, and links between them.
+
+    Threads may share it.
+    """
 
     def __init__(self, clip: DepthClip) -> None:
         k = clip.intrinsics
@@ -103,7 +107,7 @@ class Frames:
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
         self._cache: dict[int, TrackedFrame] = {}
         self._landmarks: dict[int, Landmarks] = {}
-        self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._thread = local()
 
     def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
@@ -155,7 +159,7 @@ class Frames:
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""
         one, two = self.frame(a), self.frame(b)
-        flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
+        flow = self._solver().calc(one.grey, two.grey, None if start is None else start.copy())
         columns, rows = self._matched(one)
         if not columns.size:  # OpenCV refuses to move no points
             nowhere = np.empty((0, 3))
@@ -206,6 +210,13 @@ class Frames:
         shift = (there - seen)[:, :2].reshape(-(-height // 8), -(-width // 8), 2).astype(np.float32)
         flow: Floats = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
         return flow, float((inside & known).sum() / known.sum())
+
+    def _solver(self) -> cv2.DISOpticalFlow:
+        """The calling thread's solver: it has buffers."""
+        if not hasattr(self._thread, "solver"):
+            self._thread.solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        solver: cv2.DISOpticalFlow = self._thread.solver
+        return solver
 
     def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns and rows [M'] of the frame's cells that are matched: those with confident depth."""
