@@ -18,7 +18,7 @@ from intrasplat.clip import DepthClip, spread
 from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import ignore
 from intrasplat.machine.opencv import one_opencv_thread
-from intrasplat.poses.beside import place_beside
+from intrasplat.poses.beside import Beside, place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
 from intrasplat.poses.chain import MIN_AGREEING, chained, tied
 from intrasplat.poses.common_motion import RIGID_PER_BENT, Gauged, gauged
@@ -109,6 +109,14 @@ def _found(
     used = chain.frames
     fit = fitted(frames.camera, chain, clip.frame_s, pool, lambda share: on_progress(CHAINING + FITTING * share))
     on_progress(CHAINING + FITTING)
+    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
+
+    def beside(i: int) -> Beside:
+        placed = place_beside(frames, used, fit, i)
+        frames.forget(i)
+        return placed
+
+    placed = pool.map(beside, others)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics
     half_mm = fit.middle_mm[2] * k.width / k.fx / 2
@@ -116,16 +124,9 @@ def _found(
     path = np.tile(np.eye(4), (clip.frame_count, 1, 1))
     path[list(used)] = gauge.poses
     unsure = _apart(used, fit, chain.links)
-    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
-
-    def beside(i: int) -> tuple[Reals, float]:
-        placed = place_beside(frames, used, fit, gauge, i)
-        frames.forget(i)
-        return placed
-
-    for done, (i, (pose, share)) in enumerate(zip(others, pool.map(beside, others), strict=True)):
-        path[i] = pose
-        unsure += [i] if share < MIN_AGREEING else []
+    for done, (i, each) in enumerate(zip(others, placed, strict=True)):
+        path[i] = gauge.tissue_at(each.course) @ each.pose
+        unsure += [i] if each.share < MIN_AGREEING else []
         on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
     known = sorted({*used, *others})
     for i in clip.skipped:

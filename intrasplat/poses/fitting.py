@@ -79,8 +79,9 @@ def fitted(
         on_progress(done / rounds)
         fitting.improve(scale_px)
     best, periodic = fitting, fitting.find_period(FINE_PX[0])
+    fitting.improve(FINE_PX[0])
     free = copy(fitting)  # a shallow copy is enough: no step changes an array in place
-    for place, scale_px in enumerate(FINE_PX):
+    for place, scale_px in enumerate(FINE_PX[1:], start=1):
         on_progress((len(ROUGH_PX) + place) / rounds)
         (fitting.tune if periodic and place in TUNED else fitting.improve)(scale_px)
         if periodic:
