@@ -160,9 +160,7 @@ def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Frame
     return found
 
 
-def _loops(
-    frames: Frames, keys: Sequence[int], poses: dict[int, Reals], pool: ThreadPoolExecutor
-) -> list[FrameLink]:
+def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals], pool: ThreadPoolExecutor) -> list[FrameLink]:
     """Links between non-adjacent keyframes that see the same tissue, those of the largest predicted overlap."""
     some = spread(keys, MAX_LOOKS)
     pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]

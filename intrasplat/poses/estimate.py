@@ -15,9 +15,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from intrasplat.clip import DepthClip, spread
-from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import ignore
 from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.machine.pool import thread_a_core
 from intrasplat.poses.beside import Beside, place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
 from intrasplat.poses.chain import MIN_AGREEING, chained, tied
@@ -93,7 +93,7 @@ def find_path(clip: DepthClip, train: Sequence[int], on_progress: Callable[[floa
         train: the frames, rising, that determine the path. All others are aligned with them.
         on_progress: gets the share done.
     """
-    with one_opencv_thread(), ThreadPoolExecutor(cores(), thread_name_prefix="poses") as pool:
+    with one_opencv_thread(), thread_a_core("poses") as pool:
         return _found(clip, train, pool, on_progress)
 
 

@@ -19,7 +19,7 @@ from intrasplat.poses.field import DeformationField, waves
 from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, inverse, weighted_median
 
-INDEPENDENT, NOISE_PX = 0.05, 0.35
+INDEPENDENT, NOISE_PX = 0.1, 0.35
 """Share of matches that count as independent, because errors of flow and depth are correlated over some pixels; noise
 of a match."""
 MIN_SCALE_PX = 0.5
@@ -75,7 +75,7 @@ def link_gram(
     squares = total * np.stack([across * across, across * ax, down * down, down * ay, ax * ax + ay * ay + az * az])
     pulls = total * np.stack([across * off[:, 0], down * off[:, 1], (slopes[:, 2] * off.T).sum(0)])
     size = len(functions)
-    products = ((squares[:, None] * functions).reshape(-1, len(there)) @ functions.T).reshape(5, size, size)
+    products = ((squares[:, None] * functions).reshape(5 * size, len(there)) @ functions.T).reshape(5, size, size)
     inner = np.zeros((size, size, 3, 3))  # in the second camera's axes
     for product, (one, two) in zip(products, ((0, 0), (0, 2), (1, 1), (1, 2), (2, 2)), strict=True):
         inner[:, :, one, two] = inner[:, :, two, one] = product
