@@ -189,7 +189,7 @@ def without_gains(tracks: Tracks, clip: DepthClip, train: Sequence[int], log_gai
     Only the changes of colour are new.
     """
     gains = np.exp(-log_gains[list(train)]).astype(np.float32)
-    start = cell_means(clip.rgb[train[tracks.reference]], tracks.step_px) / np.float32(255)
+    start = np.asarray(cell_means(clip.rgb[train[tracks.reference]], tracks.step_px) / np.float32(255), np.float32)
     colour = mapped_zeros(tracks.colour.shape, np.float32)
 
     def recolour(row: int) -> None:
