@@ -10,8 +10,8 @@ of views as the service renders them. The rows of the left eye also have ssim wi
 copying (docs/conventions.md), bytes of the scene, of recorded.zip and of detail.mkv, seconds until the scene was done,
 and milliseconds of a view without detail, with it, and with it in a clip that is played frame by frame (medians).
 
-A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view; then the chart is
-drawn beside them.
+A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view; then the chart
+is drawn beside them.
 """
 
 from __future__ import annotations

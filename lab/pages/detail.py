@@ -30,8 +30,8 @@ disk.
 _COLUMNS = {
     "model_db": ("model, dB", 2), "detail_db": ("detail, dB", 2), "detail_ssim": ("SSIM", 3),
     "copy_flow_db": ("copying by flow, dB", 2), "scene_bytes": ("scene, bytes", 0),
-    "recorded_bytes": ("JPEGs, bytes", 0), "detail_bytes": ("video, bytes", 0), "t_post_s": ("seconds", 1), "view_ms": ("view, ms", 1),
-    "detail_ms": ("with detail, ms", 1),
+    "recorded_bytes": ("JPEGs, bytes", 0), "detail_bytes": ("video, bytes", 0),
+    "t_post_s": ("seconds", 1), "view_ms": ("view, ms", 1), "detail_ms": ("with detail, ms", 1),
 }  # fmt: skip
 """By column: its name and digits."""
 
