@@ -23,8 +23,8 @@ Floats = NDArray[np.float32]
 FLOW_WIDTH = 320
 """Maximum width in px of the field of view at which flow is computed: the clip is reduced by the smallest whole factor
 that fits."""
-MATCH_STEP = 7
-"""Cells of the grid between neighbouring matches of a path: patches overlap, and steps of 5 find no path better."""
+MATCH_STEP = 5
+"""Cells of the grid between neighbouring matches."""
 PATCH_PX = 11
 """Side of the patches that refine the flow. Dense flow is smoother than the true motion, and attributes 4 % of the
 parallax to a rotation of the camera. Wider patches are too smooth as well."""
@@ -96,11 +96,10 @@ class Frames:
     Threads may share it.
     """
 
-    def __init__(self, clip: DepthClip, match_step: int = MATCH_STEP) -> None:
-        """match_step: cells of the grid between neighbouring matches."""
+    def __init__(self, clip: DepthClip) -> None:
         k = clip.intrinsics
         step = -(-_field_width(clip) // FLOW_WIDTH)
-        self._clip, self._step, self._match_step = clip, step, match_step
+        self._clip, self._step = clip, step
         right = clip.right
         baseline_mm = PSEUDO_BASELINE_MM
         if right is not None:
@@ -221,8 +220,8 @@ class Frames:
 
     def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns and rows [M'] of the frame's cells that are matched: those with confident depth."""
-        (height, width), step = frame.grey.shape, self._match_step
-        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+        height, width = frame.grey.shape
+        rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
         known = frame.trust[rows, columns] > MIN_TRUST
         return columns[known], rows[known]
 
