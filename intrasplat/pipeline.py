@@ -25,7 +25,7 @@ from intrasplat.machine.forecast import TimeEstimate
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.memory import LITTLE_BYTES, USUAL_BYTES, keep_free_memory
 from intrasplat.machine.timing import Timings
-from intrasplat.names import CURVE, DETAIL, MASKS, RECORDED, REPORT
+from intrasplat.names import CURVE, DETAIL, MASKS, REPORT
 from intrasplat.notices import Notice
 from intrasplat.outcome import scene_of, snapshot_of, training_of
 from intrasplat.poses import placed, read_poses, with_poses
@@ -35,9 +35,10 @@ from intrasplat.quality.score import score_model
 from intrasplat.report import Recorded, Report
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.compact import compile_coder
+from intrasplat.scene.recorded_file import EYES
 from intrasplat.scene.results import add_scores, without_scores
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.scene.training_pictures import EYES, StoredPictures
+from intrasplat.scene.training_pictures import StoredPictures
 from intrasplat.splat.backend import CPU, Device, choose_device, device_for, examine
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.deformation import motion_named
@@ -53,7 +54,7 @@ from intrasplat.train.resume import resume
 from intrasplat.train.run import Run, write_curve
 from intrasplat.train.scoring import held_out_score
 from intrasplat.train.setup import Setup, length_of
-from intrasplat.view.recorded import ClipPictures, detail_video, zipped_frames
+from intrasplat.view.recorded import ClipPictures, recorded_files
 from intrasplat.view.renderer import SceneRenderer
 from intrasplat.view.transfer import compile_transfer
 
@@ -263,12 +264,8 @@ def recorded_frames(run: Run) -> tuple[dict[str, bytes | None], Recorded | None]
     """The files of recorded frames of the eyes trained on, and the report's entry for them; {}, None if turned off."""
     if run.setup.options.keep_recorded == "off":
         return {}, None
-    clip, eyes = run.setup.clip, len(run.eyes)
     with run.setup.timings.measure("recorded_s"):
-        zipped, summary = zipped_frames(clip, EYES[:eyes])
-        video = detail_video(clip, eyes, run.setup.split.train, summary)
-    size_bytes = summary.size_bytes + len(video or b"")
-    return {RECORDED: zipped, DETAIL: video}, summary.model_copy(update={"size_bytes": size_bytes})
+        return recorded_files(run.setup.clip, EYES[: len(run.eyes)], run.setup.split.train)
 
 
 def publish(

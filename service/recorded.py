@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from contract.wire.rendering import RecordedRequest, WorkerReply
-from intrasplat.names import RECORDED, Eye
+from intrasplat.names import Eye
 from intrasplat.picture import MEDIA_TYPES, ImageFormat, RecordedMasks
 from intrasplat.scene.recorded_file import MASK, PICTURE, read_frame
 from service.bodies import BINARY
@@ -60,12 +60,12 @@ def _as_stored(services: Deps, request: RecordedRequest, attempt: int) -> Answer
     """A stored frame or mask of a finished scene, read from disk: a worker that trains has little time.
 
     Raises:
-        SceneError: the scene has no recorded frames, or the file is damaged.
+        SceneError: the scene has no recorded frames, or a file is damaged.
         InputError: it has none of this eye, or no masks.
     """
     is_mask = request.masks is RecordedMasks.ONLY
-    path = services.store.scene_folder(request.scene_id, attempt) / RECORDED
+    folder = services.store.scene_folder(request.scene_id, attempt)
     count = services.store.newest_report(request.scene_id, attempt).frame_count
-    index, body = read_frame(path, count, request.t, request.eye, MASK if is_mask else PICTURE)
+    index, body = read_frame(folder, count, request.t, request.eye, MASK if is_mask else PICTURE)
     media_type = MEDIA_TYPES[ImageFormat.PNG if is_mask else ImageFormat.JPEG]
     return Answer(WorkerReply(media_type=media_type, t=index / count), body)

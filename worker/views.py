@@ -36,7 +36,6 @@ from intrasplat.errors import InputError
 from intrasplat.export import DRAWN, export_parts
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.machine.parts import Parts, whole
-from intrasplat.names import RECORDED
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, ImageFormat, Layer, RecordedMasks
 from intrasplat.scene.checkpoint import load_scene
@@ -183,9 +182,9 @@ class Views:
         media_type = MEDIA_TYPES[ImageFormat.PNG if request.masks is RecordedMasks.ONLY else ImageFormat.JPEG]
         wanted = request.t, request.eye, request.masks
         if request.attempt is not None:
-            path = self._store.scene_folder(request.scene_id, request.attempt) / RECORDED
+            folder = self._store.scene_folder(request.scene_id, request.attempt)
             count = self._store.newest_report(request.scene_id, request.attempt).frame_count
-            index, picture = stored_frame(path, count, *wanted)
+            index, picture = stored_frame(folder, count, *wanted)
             return Reply(picture, media_type, index / count, is_untimed=True)
         clip, snapshot = self._snapshots.clip(request.scene_id), self._snapshots.shown(request.scene_id)
         if clip is None:

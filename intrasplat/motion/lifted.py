@@ -53,6 +53,8 @@ class PointGrid:
         rays = unproject(pixels, np.ones(pixels.size, np.float32), clip.intrinsics, np.eye(4))
         self.rays = rays.reshape(*rows.shape, 3).astype(np.float32)
         """[h, w, 3] points at depth 1, camera axes."""
+        self.cells = np.stack(np.meshgrid(np.arange(self.size[0]), np.arange(self.size[1])), axis=-1).astype(np.float32)
+        """[h, w, 2] column and row of every cell."""
 
     def cells_at(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Column and row in the grid, not rounded, of points (x, y, 1) in camera axes."""
@@ -92,9 +94,7 @@ class CoarseFrame:
         """Flow [h, w, 2] to the other frame for tissue at rest, smoothed because depth is noisy."""
         x, y, z = np.moveaxis((self.points_mm - other.place_mm) @ other.axes, -1, 0)
         z = np.maximum(z, MIN_DEPTH_MM)
-        column, row = self.grid.cells_at(x / z, y / z)
-        rows, columns = np.mgrid[0 : row.shape[0], 0 : row.shape[1]]
-        exact = np.stack([column - columns, row - rows], axis=-1).astype(np.float32)
+        exact = np.stack(self.grid.cells_at(x / z, y / z), axis=-1) - self.grid.cells
         return np.asarray(cv2.GaussianBlur(exact, (0, 0), PARALLAX_SMOOTH_PX), np.float32)
 
 
@@ -117,49 +117,40 @@ class Flows:
         if target.stands_at(start):
             self._left = self._solver.calc(start.grey, target.grey, last)
             return self._left, self._solver.calc(target.grey, start.grey, -self._left)
+        cells = start.grid.cells
         there, back = start.parallax(target), target.parallax(start)
-        self._left = self._solver.calc(start.grey, _seen_along(target.grey, there, start.grey), last)
-        left = self._solver.calc(target.grey, _seen_along(start.grey, back, target.grey), -_at_end(self._left, back))
-        return _joined(self._left, there), _joined(left, back)
+        self._left = self._solver.calc(start.grey, _seen_at(target.grey, cells + there, start.grey), last)
+        to_start = cells + back
+        first = -_sampled(self._left, to_start)
+        left = self._solver.calc(target.grey, _seen_at(start.grey, to_start, target.grey), first)
+        return self._left + _sampled(there, cells + self._left), left + _sampled(back, cells + left)
 
 
-def _seen_along(grey: NDArray[np.uint8], flow: Floats, outside: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture [h, w] sampled at the ends of the flow; beyond its edges, `outside`."""
-    height, width = grey.shape
-    inside = ((_ends(flow) >= 0) & (_ends(flow) <= (width - 1, height - 1))).all(-1)
-    return np.where(inside, _at_end(grey, flow), outside)
+def _seen_at(grey: NDArray[np.uint8], places: Floats, outside: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture [h, w] at columns and rows [h, w, 2]; beyond its edges, `outside`."""
+    (height, width), column, row = grey.shape, places[..., 0], places[..., 1]
+    inside = (column >= 0) & (row >= 0) & (column <= width - 1) & (row <= height - 1)
+    return np.where(inside, _sampled(grey, places), outside)
 
 
-def _joined(left: Floats, parallax: Floats) -> Floats:
-    """The total flow [h, w, 2] from the parallax and the remaining flow `left`."""
-    return np.asarray(left + _at_end(parallax, left), np.float32)
-
-
-def _at_end(values: NDArray[Any], flow: Floats) -> NDArray[Any]:
-    """values [h, w, ...] sampled at the ends of the flow."""
-    return np.asarray(cv2.remap(values, _ends(flow), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def _ends(flow: Floats) -> Floats:
-    """Column and row [h, w, 2] to which the flow leads."""
-    height, width = flow.shape[:2]
-    return flow + np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+def _sampled(values: NDArray[Any], places: Floats) -> NDArray[Any]:
+    """values [h, w, ...] at columns and rows [h, w, 2]; beyond their edges, those of the edge."""
+    return np.asarray(cv2.remap(values, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def lifted(
     reference: CoarseFrame, target: CoarseFrame, forward: Floats, backward: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Displacement (mm), change of colour and confidence of every reference cell, from forward and backward flow."""
-    rows, columns = np.mgrid[0 : forward.shape[0], 0 : forward.shape[1]].astype(np.float32)
-    x, y = columns + forward[..., 0], rows + forward[..., 1]
+    places = reference.grid.cells + forward
 
     def at_target(values: Floats) -> Floats:
-        moved: Floats = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        moved: Floats = cv2.remap(values, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return moved
 
-    round_trip = forward + at_target(backward)
+    round_trip = np.square(forward + at_target(backward))
     trust = at_target(target.trust)
-    agree = 1 / (1 + (np.square(round_trip).sum(-1) / ROUND_TRIP_PX**2) ** 2)
+    agree = 1 / (1 + ((round_trip[..., 0] + round_trip[..., 1]) / ROUND_TRIP_PX**2) ** 2)
     confidence = reference.trust * trust * (trust > 0.5) * agree
     point_mm = at_target(target.points_mm * target.trust[..., None]) / np.maximum(trust, 1e-3)[..., None]
     displacement = averaged(np.subtract(point_mm, reference.points_mm), confidence, SMOOTH_PX)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock, Semaphore
 from typing import Any
 
@@ -181,6 +181,27 @@ class _Helpers:
         self._pool.shutdown()
         for job in self._jobs if error is None else ():
             job.result()
+
+
+def without_gains(tracks: Tracks, clip: DepthClip, train: Sequence[int], log_gains: NDArray[np.float64]) -> Tracks:
+    """The tracks as if every picture of the clip had been divided by its gains: exp of log_gains [T of the clip, 3].
+
+    Only the changes of colour are new.
+    """
+    gains = np.exp(-log_gains[list(train)]).astype(np.float32)
+    start = np.asarray(cell_means(clip.rgb[train[tracks.reference]], tracks.step_px) / np.float32(255), np.float32)
+    colour = mapped_zeros(tracks.colour.shape, np.float32)
+
+    def recolour(row: int) -> None:
+        there, here = gains[tracks.followed[row]], gains[tracks.reference]
+        mean = averaged(start, tracks.confidence[row], COLOUR_SMOOTH_PX)
+        colour[row] = tracks.colour[row] * there + mean * (there - here)
+        let_go(colour[row])
+        tracks.let_go(row)
+
+    with one_opencv_thread(), ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(recolour, range(len(colour))))
+    return replace(tracks, colour=colour)
 
 
 def moved_along(tracks: Tracks, train: Sequence[int], width: int) -> Moved:

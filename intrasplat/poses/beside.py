@@ -1,5 +1,7 @@
 """Places a frame beside the fitted ones, and changes nothing else.
 
+The pose is that of the fit: the tissue's part of it is not split off (common_motion.py).
+
 Symbols: K fitted frames, S time courses of the tissue's deformation.
 """
 
@@ -12,7 +14,6 @@ import numpy as np
 
 from intrasplat.clip import spread
 from intrasplat.poses.chain import MAX_LOOKS, MIN_AGREEING, MIN_OVERLAP
-from intrasplat.poses.common_motion import Gauged
 from intrasplat.poses.fitting import FINE_PX, Fit
 from intrasplat.poses.grams import DAMPED, LinkGram, link_gram
 from intrasplat.poses.links import FrameLink, Frames
@@ -28,8 +29,17 @@ MIN_COURSE, MAX_COURSE = 0.003, 1.0
 """Limits of a course's expected error."""
 
 
-def place_beside(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, index: int) -> tuple[Reals, float]:
-    """A frame's camera pose [4, 4], aligned with fitted frames, and the share of their tissue that agrees.
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A frame's camera pose [4, 4], the tissue's courses [S] there, and the share of the tissue that agrees."""
+
+    pose: Reals
+    course: Reals
+    share: float
+
+
+def place_beside(frames: Frames, used: Sequence[int], fit: Fit, index: int) -> Beside:
+    """A frame, aligned with fitted frames.
 
     The nearest fitted frames are tried first. Where the flow from those finds too little, features say which fitted
     frames show the same tissue. used: the K fitted frames, rising.
@@ -52,9 +62,9 @@ def place_beside(frames: Frames, used: Sequence[int], fit: Fit, gauge: Gauged, i
             found.append(_aligned(frames.camera, fit, number, link, expected, motion.motion))
     best = max(found, key=lambda each: each.share)
     if not len(expected):
-        return gauge.tissue_at(expected) @ best.pose, best.share
+        return Beside(best.pose, expected, best.share)
     agreeing = [each for each in found if each.share > MIN_AGREEING] or [best]
-    return _refined(frames.camera, fit, gauge, agreeing, best, expected, error)
+    return _refined(frames.camera, fit, agreeing, best, expected, error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +93,12 @@ def _aligned(camera: StereoCamera, fit: Fit, number: int, link: FrameLink, cours
 def _refined(
     camera: StereoCamera,
     fit: Fit,
-    gauge: Gauged,
     found: Sequence[_Aligned],
     best: _Aligned,
     expected: Reals,
     error: Reals,
-) -> tuple[Reals, float]:
-    """The pose by all links, fitted together with the frame's own courses, and the share of tissue that agrees.
+) -> Beside:
+    """The pose by all links, fitted together with the frame's own courses.
 
     expected, error [S]: the courses that the frame probably has.
     """
@@ -109,7 +118,7 @@ def _refined(
         step = np.linalg.solve(gram[:-1, :-1] + np.diag(usual), right)
         pose, course = exp(np.asarray(step[:6])) @ pose, course + step[6:]
     share = max(each.link.agreeing(measured(each, FINE_PX[-1]).residual_px) for each in found)
-    return gauge.tissue_at(course) @ pose, share
+    return Beside(pose, course, share)
 
 
 def _expected(fit: Fit, used: Sequence[int], index: int) -> tuple[Reals, Reals]:

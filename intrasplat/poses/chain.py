@@ -11,6 +11,7 @@ nothing ties to the largest set of linked frames are left out of the chain.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -19,6 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from intrasplat.clip import spread
+from intrasplat.machine.hooks import ignore
 from intrasplat.poses.links import FrameLink, Frames
 from intrasplat.poses.rigid import Reals, align, exp, inverse, log
 
@@ -49,9 +51,12 @@ class Chain:
     links: list[FrameLink]
 
 
-def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None) -> Chain:
-    """Follow the training frames, link by link."""
+def chained(
+    frames: Frames, train: Sequence[int], pool: ThreadPoolExecutor, on_progress: Callable[[float], None] = ignore
+) -> Chain:
+    """Follow the training frames, link by link. Links that no pose depends on are left to the pool."""
     poses, links, keys = {train[0]: np.eye(4)}, list[FrameLink](), [train[0]]
+    behind = list[Future[list[FrameLink]]]()
     parts = [[train[0]]]
     flow = None
 
@@ -65,7 +70,7 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
 
     def turn_to(i: int) -> None:
         """Make frame i the current keyframe."""
-        links.extend(_from_behind(frames, i, [each for each in train if keys[-1] < each < i]))
+        behind.append(pool.submit(_from_behind, frames, i, [each for each in train if keys[-1] < each < i]))
         keys.append(i)
 
     for last, i in pairwise(train):
@@ -91,13 +96,14 @@ def chained(frames: Frames, train: Sequence[int], on_progress: Callable[[float],
         if link.overlap < KEY_OVERLAP or train.index(i) - train.index(keys[-1]) == KEY_FRAMES:
             turn_to(i)
             flow = None
+    links += [link for job in behind for link in job.result()]
     if len(parts) > 1:
         links += _joined(frames, parts, poses)
         main: list[int] = max(parts, key=len)
         train = sorted(main)
         keys = [key for key in keys if key in train]
         links = [link for link in links if link.a in train and link.b in train]
-    links = [link for link in (*links, *_loops(frames, keys, poses)) if link.overlap >= MIN_OVERLAP]
+    links = [link for link in (*links, *_loops(frames, keys, poses, pool)) if link.overlap >= MIN_OVERLAP]
     train = tied(train, links)
     links = [link for link in links if link.a in train]
     return Chain(train, np.stack([inverse(poses[train[0]]) @ poses[i] for i in train]), links)
@@ -154,14 +160,15 @@ def _from_behind(frames: Frames, key: int, between: Sequence[int]) -> list[Frame
     return found
 
 
-def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals]) -> list[FrameLink]:
+def _loops(frames: Frames, keys: Sequence[int], poses: dict[int, Reals], pool: ThreadPoolExecutor) -> list[FrameLink]:
     """Links between non-adjacent keyframes that see the same tissue, those of the largest predicted overlap."""
     some = spread(keys, MAX_LOOKS)
     pairs = [(a, b) for later, b in enumerate(some) for a in some[:later] if keys.index(b) - keys.index(a) > 1]
     shares = {(a, b): frames.predicted(a, inverse(poses[b]) @ poses[a])[1] for a, b in pairs}
     chosen = sorted((pair for pair in pairs if shares[pair] > LOOP_OVERLAP), key=lambda pair: -shares[pair])
-    found = []
-    for a, b in sorted(chosen[:MAX_LOOPS], key=pairs.index):
-        flow, _ = frames.predicted(a, inverse(poses[b]) @ poses[a])
-        found.append(frames.link(a, b, flow))
-    return found
+
+    def linked(pair: tuple[int, int]) -> FrameLink:
+        a, b = pair
+        return frames.link(a, b, frames.predicted(a, inverse(poses[b]) @ poses[a])[0])
+
+    return list(pool.map(linked, sorted(chosen[:MAX_LOOPS], key=pairs.index)))

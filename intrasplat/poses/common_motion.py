@@ -22,6 +22,8 @@ from intrasplat.poses.rigid import Reals, cross, exp, log
 RIGID_PER_BENT = 3.0
 """Prior standard deviation of the tissue's rigid motion, relative to its deformation of the same course."""
 NOISE_MM = 0.05
+ANYWHERE_MM2 = 1e4
+"""Prior variance of a constant offset: where the path lies as a whole does not matter."""
 SLOW, QUICK = 0.6, 0.25
 """Minimum length scale of the trend and maximum of the shake, as a share of the deformation's period."""
 USUAL_MM, USUAL_SHAKE_MM, USUAL_QUICK = 5.0, 0.3, 0.12
@@ -139,22 +141,27 @@ def _likeliest(path: Reals, frames: Reals, sized: Reals, period: float) -> Reals
     tissue, path = sized[some] @ sized[some].T, path[some] - path[some].mean()
     usual = np.log([USUAL_MM, period, USUAL_SHAKE_MM, USUAL_QUICK * period])
 
-    def covariance(logs: Reals, at: Reals) -> Reals:
-        apart = np.abs(at[:, None] - at)
+    def covariance(logs: Reals, apart: Reals) -> Reals:
         size, slow, shake, quick = np.exp(logs)
         slow, quick = max(slow, SLOW * period), min(quick, QUICK * period)
-        trend = size**2 * np.exp(-np.square(apart / slow) / 2)
-        near = np.sqrt(3) * apart / quick
-        anywhere = 1e4  # mm^2, the variance of a constant offset: where the path lies as a whole does not matter
-        found = trend + shake**2 * (1 + near) * np.exp(-near) + NOISE_MM**2 * np.eye(len(at)) + anywhere
+        trend = size**2 * np.exp(np.square(apart) * (-0.5 / slow**2))
+        near = apart * (np.sqrt(3) / quick)
+        found = trend + shake**2 * (1 + near) * np.exp(-near)
+        found += ANYWHERE_MM2
+        found[np.diag_indices(len(apart))] += NOISE_MM**2
         return np.asarray(found)
 
+    apart = np.abs(frames[some, None] - frames[some])
+    bordered = np.empty((len(some) + 1, len(some) + 1))
+    bordered[-1, :-1], bordered[-1, -1] = path, 1 + path @ path / NOISE_MM**2
+
     def unlikely(logs: Reals) -> float:
-        root = np.linalg.cholesky(covariance(logs, frames[some]) + tissue)
-        white = np.linalg.solve(root, path)
+        bordered[:-1, :-1] = covariance(logs, apart) + tissue
+        root = np.linalg.cholesky(bordered)  # its last row solves root[:-1, :-1] white = path
+        white = root[-1, :-1]
         unusual = np.square((logs - usual) / UNUSUAL).sum()
-        return float(white @ white / 2 + np.log(np.diag(root)).sum() + unusual / 2)
+        return float(white @ white / 2 + np.log(np.diag(root)[:-1]).sum() + unusual / 2)
 
     starts = [usual + np.log([1, length, shake, 1]) for length, shake in STARTS]
     ends = [minimize(unlikely, start, method="Nelder-Mead", options={"maxiter": TRIALS}) for start in starts]
-    return covariance(min(ends, key=lambda end: end.fun).x, frames)
+    return covariance(min(ends, key=lambda end: end.fun).x, np.abs(frames[:, None] - frames))

@@ -9,13 +9,16 @@ Symbols: T frames of the clip, K frames that are fitted together, S time courses
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from intrasplat.clip import DepthClip, spread
+from intrasplat.machine.hooks import ignore
 from intrasplat.machine.opencv import one_opencv_thread
-from intrasplat.poses.beside import place_beside
+from intrasplat.machine.pool import thread_a_core
+from intrasplat.poses.beside import Beside, place_beside
 from intrasplat.poses.certainty import aligned_sigma, by_place_and_turn
 from intrasplat.poses.chain import MIN_AGREEING, chained, tied
 from intrasplat.poses.common_motion import RIGID_PER_BENT, Gauged, gauged
@@ -83,27 +86,37 @@ class FoundPath:
         return any(sure) or self.alone_mm > MOVED_MM or self.alone_deg > MOVED_DEG
 
 
-def find_path(
-    clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = lambda share: None
-) -> FoundPath:
+def find_path(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None] = ignore) -> FoundPath:
     """The path of the clip's camera.
 
     Args:
         train: the frames, rising, that determine the path. All others are aligned with them.
         on_progress: gets the share done.
     """
-    with one_opencv_thread():
-        return _found(clip, train, on_progress)
+    with one_opencv_thread(), thread_a_core("poses") as pool:
+        return _found(clip, train, pool, on_progress)
 
 
-def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float], None]) -> FoundPath:
+def _found(
+    clip: DepthClip, train: Sequence[int], pool: ThreadPoolExecutor, on_progress: Callable[[float], None]
+) -> FoundPath:
     frames = Frames(clip)
-    chain = chained(frames, spread(train, MAX_FITTED), lambda share: on_progress(CHAINING * share))
+    followed = spread(train, MAX_FITTED)
+    list(pool.map(frames.frame, followed))
+    chain = chained(frames, followed, pool, lambda share: on_progress(CHAINING * share))
     if not chain.links:
         return _unknown(clip.frame_count)
     used = chain.frames
-    fit = fitted(frames.camera, chain, clip.frame_s, lambda share: on_progress(CHAINING + FITTING * share))
+    fit = fitted(frames.camera, chain, clip.frame_s, pool, lambda share: on_progress(CHAINING + FITTING * share))
     on_progress(CHAINING + FITTING)
+    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
+
+    def beside(i: int) -> Beside:
+        placed = place_beside(frames, used, fit, i)
+        frames.forget(i)
+        return placed
+
+    placed = pool.map(beside, others)
     t = np.asarray(used, np.float64)
     k = clip.intrinsics
     half_mm = fit.middle_mm[2] * k.width / k.fx / 2
@@ -111,12 +124,9 @@ def _found(clip: DepthClip, train: Sequence[int], on_progress: Callable[[float],
     path = np.tile(np.eye(4), (clip.frame_count, 1, 1))
     path[list(used)] = gauge.poses
     unsure = _apart(used, fit, chain.links)
-    others = sorted(set(range(clip.frame_count)) - set(used) - set(clip.skipped))
-    for done, i in enumerate(others):
-        pose, share = place_beside(frames, used, fit, gauge, i)
-        path[i] = pose
-        frames.forget(i)
-        unsure += [i] if share < MIN_AGREEING else []
+    for done, (i, each) in enumerate(zip(others, placed, strict=True)):
+        path[i] = gauge.tissue_at(each.course) @ each.pose
+        unsure += [i] if each.share < MIN_AGREEING else []
         on_progress(1 - (1 - CHAINING - FITTING) * (1 - done / len(others)))
     known = sorted({*used, *others})
     for i in clip.skipped:

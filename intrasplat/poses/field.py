@@ -72,7 +72,7 @@ class DeformationField:
         across, down = np.ones((2, self.degree + 1, len(places_mm)))
         for power in range(1, self.degree + 1):
             across[power], down[power] = across[power - 1] * x, down[power - 1] * y
-        return np.stack([across[i] * down[j] for i, j in all_of], axis=1)
+        return np.stack([across[i] * down[j] for i, j in all_of]).T
 
     def displacement(self, places_mm: Reals, change: Reals) -> Reals:
         """[M, 3] mm by which tissue moves while the courses change by [S]."""

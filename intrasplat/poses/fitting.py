@@ -10,14 +10,16 @@ Symbols: K frames, L links, M matches of a link.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from intrasplat.machine.hooks import ignore
 from intrasplat.poses.chain import Chain
 from intrasplat.poses.field import HARMONICS, DeformationField, waves
-from intrasplat.poses.grams import Grams, link_gram
+from intrasplat.poses.grams import Grams, LinkGram, link_gram
 from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, exp
 
@@ -64,20 +66,22 @@ def fitted(
     camera: StereoCamera,
     chain: Chain,
     frame_s: float,
-    on_progress: Callable[[float], None] = lambda share: None,
+    pool: ThreadPoolExecutor,
+    on_progress: Callable[[float], None] = ignore,
 ) -> Fit:
     """Cameras and the tissue's motion.
 
-    frame_s: seconds from frame to frame of the clip. on_progress gets the share of rounds done; its exceptions pass
-    through.
+    frame_s: seconds from frame to frame of the clip. pool: measures the links. on_progress gets the share of rounds
+    done; its exceptions pass through.
     """
-    fitting, rounds = _Fitting(camera, chain, frame_s), len(ROUGH_PX) + len(FINE_PX) + SETTLING
+    fitting, rounds = _Fitting(camera, chain, frame_s, pool), len(ROUGH_PX) + len(FINE_PX) + SETTLING
     for done, scale_px in enumerate(ROUGH_PX):
         on_progress(done / rounds)
         fitting.improve(scale_px)
     best, periodic = fitting, fitting.find_period(FINE_PX[0])
+    fitting.improve(FINE_PX[0])
     free = copy(fitting)  # a shallow copy is enough: no step changes an array in place
-    for place, scale_px in enumerate(FINE_PX):
+    for place, scale_px in enumerate(FINE_PX[1:], start=1):
         on_progress((len(ROUGH_PX) + place) / rounds)
         (fitting.tune if periodic and place in TUNED else fitting.improve)(scale_px)
         if periodic:
@@ -93,7 +97,8 @@ def fitted(
 class _Fitting:
     """A fit in progress."""
 
-    def __init__(self, camera: StereoCamera, chain: Chain, frame_s: float) -> None:
+    def __init__(self, camera: StereoCamera, chain: Chain, frame_s: float, pool: ThreadPoolExecutor) -> None:
+        self.pool = pool
         self.shortest = max(MIN_PERIOD_S / frame_s, MIN_PERIOD_FRAMES)
         self.camera, self.links, self.poses = camera, chain.links, chain.world_from_camera
         place = {index: k for k, index in enumerate(chain.frames)}
@@ -175,18 +180,13 @@ class _Fitting:
     def _measured(self, scale_px: float) -> Grams:
         """The links' Gram matrices at the current solution; updates residuals, weights and rigidity."""
         courses = self.field.courses
-        found = [
-            link_gram(
-                self.camera,
-                link,
-                (self.poses[a], self.poses[b]),
-                self.field,
-                courses[b] - courses[a],
-                scale_px,
-                self.rigidity.get(link.a),
-            )
-            for link, (a, b) in zip(self.links, self.ends, strict=True)
-        ]
+
+        def measured(link: FrameLink, ends: tuple[int, int]) -> LinkGram:
+            a, b = ends
+            poses, change = (self.poses[a], self.poses[b]), courses[b] - courses[a]
+            return link_gram(self.camera, link, poses, self.field, change, scale_px, self.rigidity.get(link.a))
+
+        found = list(self.pool.map(measured, self.links, self.ends))
         self.residual_px, self.weight = [each.residual_px for each in found], [each.weight for each in found]
         self.rigidity = rigidity(self.links, self.weight)
         return Grams(np.stack([each.gram for each in found]), self.incidence, self.frames)

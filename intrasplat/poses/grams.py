@@ -19,7 +19,7 @@ from intrasplat.poses.field import DeformationField, waves
 from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, inverse, weighted_median
 
-INDEPENDENT, NOISE_PX = 0.05, 0.35
+INDEPENDENT, NOISE_PX = 0.1, 0.35
 """Share of matches that count as independent, because errors of flow and depth are correlated over some pixels; noise
 of a match."""
 MIN_SCALE_PX = 0.5
@@ -68,16 +68,21 @@ def link_gram(
     if rigidity is not None:
         total = total * rigidity[link.cells]
     there = camera.points_mm(link.after)
-    by_point = camera.slopes_by_point(there) @ back[:3, :3]
     world = there @ from_b[:3, :3].T + from_b[:3, 3]
-    functions = np.concatenate([field.powers(world), world[:, 2:]], axis=1)  # [M, F + 1]
-    weighted = by_point * total[:, None, None]
-    size = functions.shape[1]
-    pairs = (functions[:, :, None] * functions[:, None]).reshape(len(world), size * size)
-    points = np.matmul(weighted.transpose(0, 2, 1), by_point).reshape(len(world), 9)
+    functions = np.concatenate([field.powers(world).T, world[:, 2:].T])  # [F + 1, M]
+    slopes = camera.slopes_by_point(there).transpose(1, 2, 0)
+    (across, down), (ax, ay, az) = (slopes[0, 0], slopes[1, 1]), slopes[:, 2]
+    squares = total * np.stack([across * across, across * ax, down * down, down * ay, ax * ax + ay * ay + az * az])
+    pulls = total * np.stack([across * off[:, 0], down * off[:, 1], (slopes[:, 2] * off.T).sum(0)])
+    size = len(functions)
+    products = ((squares[:, None] * functions).reshape(5 * size, len(there)) @ functions.T).reshape(5, size, size)
+    inner = np.zeros((size, size, 3, 3))  # in the second camera's axes
+    for product, (one, two) in zip(products, ((0, 0), (0, 2), (1, 1), (1, 2), (2, 2)), strict=True):
+        inner[:, :, one, two] = inner[:, :, two, one] = product
+    turned = from_b[:3, :3] @ inner @ from_b[:3, :3].T
     gram = np.empty((3 * size + 1, 3 * size + 1))
-    gram[:-1, :-1] = (pairs.T @ points).reshape(size, size, 3, 3).transpose(0, 2, 1, 3).reshape(3 * size, 3 * size)
-    gram[:-1, -1] = gram[-1, :-1] = (functions.T @ np.einsum("mki,mk->mi", weighted, off)).ravel()
+    gram[:-1, :-1] = turned.transpose(0, 2, 1, 3).reshape(3 * size, 3 * size)
+    gram[:-1, -1] = gram[-1, :-1] = (functions @ pulls.T @ from_b[:3, :3].T).ravel()
     gram[-1, -1] = (total * squared).sum()
     columns = _columns(field)
     return LinkGram(columns.T @ gram @ columns, np.sqrt(squared), weight)

@@ -6,6 +6,7 @@ Symbols: h w cells of the coarse grid, M matches.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from threading import local
 
 import cv2
 import numpy as np
@@ -22,8 +23,8 @@ Floats = NDArray[np.float32]
 FLOW_WIDTH = 320
 """Maximum width in px of the field of view at which flow is computed: the clip is reduced by the smallest whole factor
 that fits."""
-MATCH_STEP = 5
-"""Cells of the grid between neighbouring matches."""
+MATCH_STEP = 7
+"""Cells of the grid between neighbouring matches of a path: patches overlap, and steps of 5 find no path better."""
 PATCH_PX = 11
 """Side of the patches that refine the flow. Dense flow is smoother than the true motion, and attributes 4 % of the
 parallax to a rotation of the camera. Wider patches are too smooth as well."""
@@ -90,12 +91,16 @@ class FrameLink:
 
 
 class Frames:
-    """The clip's frames on the coarse grid, computed on demand and cached, and links between them."""
+    """The clip's frames on the coarse grid, computed on demand and cached, and links between them.
 
-    def __init__(self, clip: DepthClip) -> None:
+    Threads may share it.
+    """
+
+    def __init__(self, clip: DepthClip, match_step: int = MATCH_STEP) -> None:
+        """match_step: cells of the grid between neighbouring matches."""
         k = clip.intrinsics
         step = -(-_field_width(clip) // FLOW_WIDTH)
-        self._clip, self._step = clip, step
+        self._clip, self._step, self._match_step = clip, step, match_step
         right = clip.right
         baseline_mm = PSEUDO_BASELINE_MM
         if right is not None:
@@ -103,7 +108,7 @@ class Frames:
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
         self._cache: dict[int, TrackedFrame] = {}
         self._landmarks: dict[int, Landmarks] = {}
-        self._solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._thread = local()
 
     def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
@@ -155,7 +160,7 @@ class Frames:
     def link(self, a: int, b: int, start: Floats | None = None) -> FrameLink:
         """Matches from frame a to frame b. start: an initial flow [h, w, 2], which is not changed."""
         one, two = self.frame(a), self.frame(b)
-        flow = self._solver.calc(one.grey, two.grey, None if start is None else start.copy())
+        flow = self._solver().calc(one.grey, two.grey, None if start is None else start.copy())
         columns, rows = self._matched(one)
         if not columns.size:  # OpenCV refuses to move no points
             nowhere = np.empty((0, 3))
@@ -207,10 +212,17 @@ class Frames:
         flow: Floats = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
         return flow, float((inside & known).sum() / known.sum())
 
+    def _solver(self) -> cv2.DISOpticalFlow:
+        """The calling thread's solver: it has buffers."""
+        if not hasattr(self._thread, "solver"):
+            self._thread.solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        solver: cv2.DISOpticalFlow = self._thread.solver
+        return solver
+
     def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns and rows [M'] of the frame's cells that are matched: those with confident depth."""
-        height, width = frame.grey.shape
-        rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
+        (height, width), step = frame.grey.shape, self._match_step
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
         known = frame.trust[rows, columns] > MIN_TRUST
         return columns[known], rows[known]
 

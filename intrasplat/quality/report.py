@@ -199,7 +199,7 @@ def scored_report(
         right: measure_right(clip, first.held_out, ...).
         trained: measure(clip, sample_frames(train), ...), for the comparison.
         baselines: copy_baselines(clip, train, first.held_out).
-        detail: detail_scores() of views with detail from recorded frames.
+        detail: measure_detail(clip, first.held_out, ...), of views with detail from recorded frames.
     """
     known = [each for each in first.warnings if each.code is not NoticeCode.SCORES_PENDING]
     shown_db = None if detail is None else detail.psnr_tissue_db
@@ -226,11 +226,9 @@ def scored_report(
     return first.model_copy(update={**scores, "scored": True, "warnings": tuple(dict.fromkeys([*known, *found]))})
 
 
-def detail_scores(held_out: Scores, right: RightScores) -> DetailScores:
-    """The report's scores of views with detail from recorded frames."""
-    return DetailScores(
-        psnr_tissue_db=_mean(held_out.psnr_tissue_db), psnr_right_db=_mean(right.psnr_db), ssim=_mean(held_out.ssim)
-    )
+def detail_scores(tissue_db: Sequence[float], right_db: Sequence[float], ssim: Sequence[float]) -> DetailScores:
+    """The report's scores of views with detail, from those of each frame."""
+    return DetailScores(psnr_tissue_db=_mean(tissue_db), psnr_right_db=_mean(right_db), ssim=_mean(ssim))
 
 
 def score_warnings(

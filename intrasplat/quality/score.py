@@ -13,7 +13,8 @@ from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.quality.baselines import copy_baselines
-from intrasplat.quality.report import detail_scores, measure, scored_report
+from intrasplat.quality.detail import measure_detail
+from intrasplat.quality.report import measure, scored_report
 from intrasplat.quality.right_eye import measure_right
 from intrasplat.report import Report
 from intrasplat.train.hooks import RenderedFrame
@@ -69,8 +70,7 @@ def score_model(
         detail = None
         if detailed is not None:
             left_views, right_views = views(clip, detailed), views(clip.right or clip, detailed)
-            shown = measure(clip, first.held_out, left_views, each)
-            detail = detail_scores(shown, measure_right(clip, first.held_out, right_views, each))
+            detail = measure_detail(clip, first.held_out, left_views, right_views, each)
         baselines = copied.result()
     report = scored_report(first, held_out, right, trained, baselines, detail)
     made, left_db, right_db = first.iterations, report.psnr_tissue_db, report.psnr_right_db

@@ -2,7 +2,7 @@
 
     JOB.scene.zip       stored, not compressed
     ├── manifest.json, scene.safetensors, report.json, curve.csv
-    ├── masks.zip, recorded.zip, thumbnail.jpg      if the scene has them
+    ├── masks.zip, recorded.zip, thumbnail.jpg      if the scene has them; recorded.zip with all recorded frames
     └── archive.json    written last: where it came from; size and SHA-256 of each other file
 
 archive_parts() writes an archive. read_archive() checks one from outside, except the numbers in scene.safetensors: the
@@ -43,6 +43,7 @@ from intrasplat.names import (
     PresetName,
 )
 from intrasplat.report import Report, VersionText
+from intrasplat.scene.recorded_file import complete_zip
 from intrasplat.version import version
 
 FIELD = "scene"
@@ -124,7 +125,10 @@ def archive_parts(folder: Path, scene_id: str | None = None) -> Iterator[bytes]:
         names = (MANIFEST, SCENE, REPORT, CURVE, MASKS, RECORDED, THUMBNAIL)
         found = {name: folder / name for name in names if name in NEEDED or (folder / name).is_file()}
         try:
-            files = {name: opening.enter_context(path.open("rb")) for name, path in found.items()}
+            files = {
+                name: opening.enter_context(complete_zip(folder) if name == RECORDED else path.open("rb"))
+                for name, path in found.items()
+            }
         except OSError as error:
             raise SceneError(f"The scene cannot be read ({type(error).__name__}).") from error
         return _written(files, scene_id, opening.pop_all())

@@ -5,9 +5,8 @@ Symbols: T frames, H W pixels of one eye; d disparity, x_left - x_right in px. d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -24,10 +23,10 @@ from intrasplat.clip.split import spread
 from intrasplat.clip.types import DepthClip
 from intrasplat.errors import Cancelled, InputError
 from intrasplat.instruments import Finder, looked_at
-from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import Hooks, Progress
 from intrasplat.machine.mapped import let_go, mapped_zeros
 from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.machine.pool import thread_a_core
 from intrasplat.names import Fov
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
@@ -106,7 +105,7 @@ def estimate_depth(
     nearest_px, farthest_px = (
         clip.intrinsics.fx * clip.baseline_mm / each + clip.disparity_offset_px for each in depth_range_mm
     )
-    with one_opencv_thread(), _pool() as pool:
+    with one_opencv_thread(), thread_a_core(STAGE) as pool:  # two threads for one pair are slower
         received = _receive(clip, spread(measured, ALIGNMENT_PAIRS), pool, hooks)
         lag = find_lag(*received.profiles)
         unpaired: tuple[int, ...] = ()
@@ -379,13 +378,3 @@ def _scale_assumption(clip: RectifiedClip) -> Notice:
 def _check_stop(hooks: Hooks) -> None:
     if hooks.should_stop():
         raise Cancelled("stopped while estimating depth")
-
-
-@contextmanager
-def _pool() -> Iterator[ThreadPoolExecutor]:
-    """One thread per core, one pair per thread: OpenCV releases the GIL, and two threads for one pair are slower."""
-    pool = ThreadPoolExecutor(cores(), thread_name_prefix=STAGE)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from intrasplat.fusion import fuse
 from intrasplat.machine.memory import LITTLE_BYTES, keep_free_memory
 from intrasplat.methods.method import Preset
-from intrasplat.motion.exposure import find_exposure
+from intrasplat.motion.exposure import Exposure, find_exposure
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.light import RecordedLight
 from intrasplat.motion.smoke import find_veils
-from intrasplat.motion.tracks import Tracks, moved_along
+from intrasplat.motion.tracks import Tracks, moved_along, without_gains
 from intrasplat.motion.veil import Veil
 from intrasplat.motion.vignetting import find_vignetting
 from intrasplat.notices import Notice
@@ -28,6 +30,8 @@ from intrasplat.train.setup import Setup
 from intrasplat.train.start import bounded, box_of, fusion_for, resolve_preset, start_model
 from intrasplat.train.targets import TrainingFrames, units_per_mm
 
+SAME_FLOW = 0.32
+"""Range of a channel's log gain, one stop, up to which flow between the recorded pictures is used."""
 SMOKE_PASSES = 2
 """How often smoke is measured: tracks through frames without it are better, and show it better."""
 
@@ -122,8 +126,18 @@ def _followed(setup: Setup) -> tuple[RecordedLight, Setup, list[Tracks]]:
     with setup.timings.measure("motion_s"):
         exposure = find_exposure(steady.clip, train, tracks)
     if exposure is not None:
-        steady, tracks = _steadied(steady, RecordedLight(exposure=exposure))
+        steady, tracks = _in_one_exposure(steady, exposure, tracks)
     return RecordedLight(exposure, vignetting, veils), steady, tracks
+
+
+def _in_one_exposure(setup: Setup, exposure: Exposure, tracks: list[Tracks]) -> tuple[Setup, list[Tracks]]:
+    """The setup without changes of exposure, and its tracks: of new flow only where the light changes much."""
+    light = RecordedLight(exposure=exposure)
+    if np.ptp(exposure.log_gains, axis=0).max() > SAME_FLOW:
+        return _steadied(setup, light)
+    with setup.timings.measure("motion_s"):
+        same = [without_gains(each, setup.clip, setup.split.train, exposure.log_gains) for each in tracks]
+    return in_light_of(setup, light), same
 
 
 def _steadied(setup: Setup, light: RecordedLight) -> tuple[Setup, list[Tracks]]:

@@ -1,6 +1,6 @@
-"""Recorded frames as the model's cameras see them, with their masks, to compare model and masks with.
+"""Recorded frames as the model's cameras see them, with their masks: for detail, and to compare model and masks with.
 
-A scene stores them of at most MAX_MOMENTS moments in one file, which intrasplat/scene/recorded_file.py reads.
+A scene stores them of at most MAX_MOMENTS moments, in two files that intrasplat/scene/recorded_file.py reads.
 Symbols: h w pixels of a picture.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -21,11 +21,13 @@ from intrasplat.clip.split import spread
 from intrasplat.errors import InputError, SceneError
 from intrasplat.intake.sniff import png_size
 from intrasplat.machine.mapped import let_go
+from intrasplat.names import DETAIL, RECORDED
 from intrasplat.names import Eye as EyeName
 from intrasplat.picture import RecordedMasks
 from intrasplat.report import Recorded
-from intrasplat.scene.recorded_file import MASK, PICTURE, name_of, nearest, read_frame
-from intrasplat.scene.training_pictures import EYES, RecordedEye, encoded
+from intrasplat.scene.recorded_file import EYES, MASK, PICTURE, name_of, nearest, read_frame
+from intrasplat.scene.recorded_video import RecordedEye, encoded
+from intrasplat.scene.training_pictures import coded
 
 MAX_MOMENTS = 120
 """Most moments of a clip whose frames are stored."""
@@ -63,44 +65,52 @@ class ClipPictures:
         return rgb, ~tool
 
 
-def detail_video(clip: DepthClip, eyes: int, trained: Iterable[int], recorded: Recorded) -> bytes | None:
-    """The video of the recorded training frames; None: there are none, or no encoder is installed."""
-    chosen = set(trained)
-    pictures = ClipPictures(clip, eyes, [frame for frame in recorded.frames if frame in chosen])
-    if not pictures.frames:
-        return None
-    return encoded(pictures.frames, pictures.eyes, lambda eye, frame: pictures.picture(eye, frame)[0])
+def recorded_files(
+    clip: DepthClip, eyes: Sequence[EyeName], trained: Iterable[int]
+) -> tuple[dict[str, bytes | None], Recorded]:
+    """A clip's recorded frames as files by name, and their entry in the report. The same clip gives the same bytes.
 
-
-def zipped_frames(clip: DepthClip, eyes: Sequence[EyeName]) -> tuple[bytes, Recorded]:
-    """The zip file of a clip's recorded frames, and its entry in the report. The same clip gives the same bytes.
-
-    It contains all frames, or MAX_MOMENTS that are spread evenly. If the masks were found in the pictures, it skips
-    frames without a mask: nobody searched them.
+    These are all frames, or MAX_MOMENTS that are spread evenly. If the masks were found in the pictures, frames without
+    a mask are skipped: nobody searched them. Frames that trained the model go into the video; without an encoder for
+    it, all go into the zip file.
     """
     looked_at = clip.used if clip.masks is not None and clip.masks.are_found else range(clip.frame_count)
-    frames = spread(looked_at, MAX_MOMENTS)
-    content, is_masked, size = io.BytesIO(), False, (0, 0)
+    frames, chosen = spread(looked_at, MAX_MOMENTS), set(trained)
+    pictures = ClipPictures(clip, len(eyes), [frame for frame in frames if frame in chosen])
+    filmed = pictures.frames
+    video = (
+        encoded(filmed, pictures.eyes, lambda eye, frame: coded(pictures.picture(eye, frame)[0])) if filmed else None
+    )
+    zipped, is_masked = _zipped(clip, eyes, frames, set() if video is None else set(filmed))
+    lens = pictures.eyes[0].lens
+    summary = Recorded(
+        frames=tuple(frames),
+        eyes=tuple(eyes),
+        width=lens.width,
+        height=lens.height,
+        masks=is_masked,
+        size_bytes=len(zipped) + len(video or b""),
+    )
+    return {RECORDED: zipped, DETAIL: video}, summary
+
+
+def _zipped(
+    clip: DepthClip, eyes: Sequence[EyeName], frames: Sequence[int], filmed: Container[int]
+) -> tuple[bytes, bool]:
+    """The zip file of recorded frames, without the pictures of those in the video, and whether it has masks."""
+    content, is_masked = io.BytesIO(), False
     masks: dict[str, bytes] = {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name in eyes:
             for index in frames:
                 rgb, tool = _picture(_eye(clip, name), index)
-                size, is_masked = tool.shape, is_masked or bool(tool.any())
-                archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(rgb))
+                is_masked = is_masked or bool(tool.any())
+                if index not in filmed:
+                    archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(rgb))
                 masks[name_of(name, index, MASK)] = _png(tool)
         for path, png in masks.items() if is_masked else ():
             archive.writestr(zipfile.ZipInfo(path), png)
-    height, width = size
-    summary = Recorded(
-        frames=tuple(frames),
-        eyes=tuple(eyes),
-        width=width,
-        height=height,
-        masks=is_masked,
-        size_bytes=content.tell(),
-    )
-    return content.getvalue(), summary
+    return content.getvalue(), is_masked
 
 
 def live_frame(
@@ -119,25 +129,25 @@ def live_frame(
 
 
 def stored_frame(
-    path: Path,
+    folder: Path,
     frame_count: int,
     t: float,
     eye: EyeName = "left",
     masks: RecordedMasks = RecordedMasks.MARKED,
 ) -> tuple[int, bytes]:
-    """As live_frame, from the file of zipped_frames.
+    """As live_frame, from the scene in a folder.
 
     Raises:
-        SceneError: the file is missing or damaged.
+        SceneError: it has no recorded frames, or a file is damaged.
         InputError: it has no such eye, or no masks.
     """
     if masks is RecordedMasks.ONLY:
-        return read_frame(path, frame_count, t, eye, MASK)
-    index, jpeg = read_frame(path, frame_count, t, eye)
+        return read_frame(folder, frame_count, t, eye, MASK)
+    index, jpeg = read_frame(folder, frame_count, t, eye)
     if masks is RecordedMasks.OFF:
         return index, jpeg
     try:
-        _, png = read_frame(path, frame_count, t, eye, MASK)
+        _, png = read_frame(folder, frame_count, t, eye, MASK)
     except InputError:  # nothing is masked
         return index, jpeg
     if jpeg_size(jpeg) != (size := png_size(png)) or size is None or size[0] > MAX_WIDTH or size[1] > MAX_HEIGHT:

@@ -10,7 +10,8 @@ of views as the service renders them. The rows of the left eye also have ssim wi
 copying (docs/conventions.md), bytes of the scene, of recorded.zip and of detail.mkv, seconds until the scene was done,
 and milliseconds of a view without detail, with it, and with it in a clip that is played frame by frame (medians).
 
-A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view.
+A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view; then the chart
+is drawn beside them.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.scoring import judged_pixels
 from intrasplat.view.render import render_frame
 from lab.evaluate.length import add_length, length_of
-from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
+from lab.evaluate.rows import adding_alone, commit, machine, read_rows, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, OpenClip, open_source, source_of
 from lab.evaluate.truth import Expected, Truth
+from lab.pages.detail import draw_detail
 
 CLIPS = ("d4d_stereo", *(f"phantom:{motion}:60frames:stereo" for motion in ("still", "breathing", "pull", "cut")))
 ANGLES_DEG = (5.0, 10.0, 15.0, 20.0)
@@ -70,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     text = texts_of(row, FIELDS)
                     replace_row(options.out, FIELDS, KEY, text)
                     print("  ".join(f"{name} {text[name]}" for name in FIELDS[:-2] if text[name]), flush=True)
+    draw_detail(read_rows(options.out), options.out.parent)
 
 
 def measured(opened: OpenClip, options: ReconstructionOptions) -> Iterator[dict[str, object]]:

@@ -1,7 +1,7 @@
 """How long a caller waits after POST /reconstruct for the first view, the finished scene and its scores.
 
-    python -m lab.benchmarks.bm_post [--clip d4d_stereo] [--presets instant fast] [--budget-s S] [--repeats 5] [--shell]
-        [--csv lab/rows/post.csv]
+    python -m lab.benchmarks.bm_post [--clip d4d_stereo] [--poses auto] [--presets instant fast] [--budget-s S]
+        [--repeats 5] [--shell] [--drawn FOLDER] [--csv lab/rows/post.csv]
 
 Starts `intrasplat up` on a data directory of its own, trains once untimed, so that the worker is warm, and then sends
 the clip again and again. Seconds from the POST, medians: first_view_s, the first answer to GET /render; good_view_s, a
@@ -10,7 +10,9 @@ scored_s, its report has scores. eta_off is how far the job's eta_s was off at m
 first tenth of it. psnr_db and device are the report's, stages the report's seconds. --shell measures `intrasplat
 reconstruct` from the shell, too: done_s is the whole command.
 
-The recording is found through INTRASPLAT_DATA; without it a synthetic clip is drawn.
+--clip is a name of lab/evaluate/sources.py: a recording, which is found through INTRASPLAT_DATA, or a phantom such as
+phantom:breathing+pan:640x512:60frames:nomasks, which is drawn as a video of both eyes. --drawn keeps drawn clips for
+the next run.
 """
 
 from __future__ import annotations
@@ -30,18 +32,20 @@ from statistics import median
 from typing import Any
 
 from intrasplat_client import Client, Conflict, JobState, ServiceUnavailable
-from lab.benchmarks.bm_service import make_clip
 from lab.demo import started_service
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, write_rows
 from lab.evaluate.sources import DATA_VARIABLE, source_of
+from lab.phantom import make_phantom
+from lab.phantom.writers import write_stereo_video
 
+PHANTOM = "phantom:breathing:640x512:89frames:nomasks"
 GOOD_DB = 33.0
 LOOK_PERIOD_S = 0.05
 CLOCKS = ("first_view_s", "good_view_s", "done_s", "scored_s")
 EARLY = 0.1
 """Share of a job at its start in which its duration cannot be estimated."""
-FIELDS = ("clip", "preset", "budget_s", "way", "repeat", *CLOCKS, "eta_off", "psnr_db", "psnr_right_db", "stages",
-          "load_1min", "device", "machine", "commit")  # fmt: skip
+FIELDS = ("clip", "poses", "preset", "budget_s", "way", "repeat", *CLOCKS, "eta_off", "psnr_db", "psnr_right_db",
+          "stages", "load_1min", "device", "machine", "commit")  # fmt: skip
 
 Row = dict[str, Any]
 
@@ -50,11 +54,11 @@ def main() -> None:
     options = _parser().parse_args()
     with tempfile.TemporaryDirectory(prefix="intrasplat-post-") as name:
         folder = Path(name)
-        clip, files = _clip_of(options.clip, folder)
+        clip, files = _clip_of(options.clip, options.drawn or folder)
         rows: list[Row] = []
 
         def keep(row: Row) -> None:
-            rows.append(row | {"clip": options.clip, "machine": machine(), "commit": commit()})
+            rows.append(row | {"clip": options.clip, "poses": options.poses, "machine": machine(), "commit": commit()})
             print(_line(rows[-1]), flush=True)
             if options.csv:
                 with adding_alone(options.csv.parent):
@@ -65,29 +69,32 @@ def main() -> None:
             client.report(warm.id)  # waits until scoring has ended
             for repeat in range(options.repeats):
                 for preset in options.presets:
-                    keep(_sent(client, clip, files, preset, options.budget_s) | {"repeat": repeat})
+                    keep(_sent(client, clip, files, preset, options) | {"repeat": repeat})
         for repeat in range(options.repeats if options.shell else 0):
             for preset in options.presets:
                 out = folder / f"{preset}-{repeat}"
-                keep(_run(clip, files, preset, options.budget_s, out) | {"repeat": repeat})
+                keep(_run(clip, files, preset, options, out) | {"repeat": repeat})
     for preset, way in dict.fromkeys((row["preset"], row["way"]) for row in rows):
         print(_line(_medians([row for row in rows if (row["preset"], row["way"]) == (preset, way)])))
 
 
 def _clip_of(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
-    """A video of both eyes, and its calibration and masks."""
-    if name.startswith("phantom"):
-        drawn = make_clip(folder, frames=89)
-        return drawn.video, {"calibration": drawn.calibration}
+    """A clip of both eyes, its calibration, and its masks if it has any. A phantom is drawn into the folder, once."""
     source = source_of(name)
-    assert source.clip is not None
-    return source.clip, {"calibration": source.files["calibration"], "masks": source.files["masks"]}
+    if source.phantom is None:
+        return source.clip, dict(source.files)
+    drawn = folder / source.name
+    if not drawn.exists():
+        write_stereo_video(make_phantom(source.phantom), drawn, masks=source.masks)
+    files = {"calibration": drawn / "calibration.json", "masks": drawn / "masks.zip"}
+    return drawn / "stereo.webm", {key: path for key, path in files.items() if path.exists()}
 
 
-def _sent(client: Client, clip: Path, files: Mapping[str, Any], preset: str, budget_s: float | None) -> Row:
+def _sent(client: Client, clip: Path, files: Mapping[str, Any], preset: str, options: argparse.Namespace) -> Row:
     """Send the clip over HTTP to the warm worker."""
+    budget_s: float | None = options.budget_s
     row: Row = {"preset": preset, "budget_s": budget_s or "", "way": "http", "load_1min": round(os.getloadavg()[0], 2)}
-    chosen: dict[str, Any] = {"preset": preset, **({"budget_s": budget_s} if budget_s else {})}
+    chosen: dict[str, Any] = {"preset": preset, "poses": options.poses, **({"budget_s": budget_s} if budget_s else {})}
     start_s = time.perf_counter()
     job = client.reconstruct(clip, **files, **chosen)
     viewer = threading.Thread(target=_look, args=(client.url, job.id, start_s, row))
@@ -124,10 +131,11 @@ def _look(url: str, job_id: str, start_s: float, row: Row) -> None:
                 row["first_view_s"] = round(time.perf_counter() - start_s, 2)
 
 
-def _run(clip: Path, files: Mapping[str, Any], preset: str, budget_s: float | None, out: Path) -> Row:
+def _run(clip: Path, files: Mapping[str, Any], preset: str, options: argparse.Namespace, out: Path) -> Row:
     """Reconstruct the clip by the command line."""
+    budget_s: float | None = options.budget_s
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
-    given += ["--preset", preset, *(["--budget-s", str(budget_s)] if budget_s else [])]
+    given += ["--preset", preset, "--poses", options.poses, *(["--budget-s", str(budget_s)] if budget_s else [])]
     command = [sys.executable, "-m", "intrasplat", "reconstruct", str(clip), *given, "--out", str(out)]
     start_s, load = time.perf_counter(), os.getloadavg()[0]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -155,11 +163,13 @@ def _line(row: Row) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clip", default="d4d_stereo" if os.environ.get(DATA_VARIABLE) else "phantom")
+    parser.add_argument("--clip", default="d4d_stereo" if os.environ.get(DATA_VARIABLE) else PHANTOM)
+    parser.add_argument("--poses", choices=("auto", "fixed", "estimate"), default="auto")
     parser.add_argument("--presets", nargs="+", default=["instant"])
     parser.add_argument("--budget-s", type=float)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--shell", action="store_true")
+    parser.add_argument("--drawn", type=Path, metavar="FOLDER")
     parser.add_argument("--csv", type=Path)
     return parser
 

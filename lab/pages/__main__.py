@@ -12,6 +12,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from lab.pages.detail import DETAIL_CHART, detail_sections
 from lab.pages.evaluation import sections, write_readme
 from lab.pages.gpu import gpu_sections
 from lab.pages.moving import moving_sections
@@ -34,7 +35,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent.parent
 ROWS, PICTURES = REPOSITORY / "lab" / "rows", REPOSITORY / "docs" / "results"
 SHOWN = (
     "curves.png", "pareto.png", "pareto-one-clip.png", "frames.png", "capacity/knee.png", "table1/curves.png",
-    "table1/pareto.png", "table1/frames.png", CONFIDENCE_CHART, MAP,
+    "table1/pareto.png", "table1/frames.png", CONFIDENCE_CHART, DETAIL_CHART, MAP,
 )  # fmt: skip
 """The charts that the results page or README shows, by their place beside the rows."""
 _INTRODUCTION = """# Results
@@ -57,6 +58,7 @@ def main() -> None:
         *post_sections(ROWS),
         *table1_sections(ROWS),
         *two_eyes_sections(ROWS),
+        *detail_sections(ROWS, PICTURES),
         *off_axis_sections(PICTURES),
         *confidence_sections(ROWS, PICTURES),
         *measure_sections(ROWS),

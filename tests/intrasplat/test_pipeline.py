@@ -508,7 +508,7 @@ def test_recorded_frames_of_the_eyes_that_taught_are_kept_with_the_scene(
     for eye, name in zip(shown[0].eyes, told.eyes, strict=False):
         for index in (0, 5, 9):
             off = RecordedMasks.OFF, RecordedMasks.ONLY
-            (_, jpeg), (_, png) = (stored_frame(tmp_path / RECORDED, 10, index / 10, name, each) for each in off)
+            (_, jpeg), (_, png) = (stored_frame(tmp_path, 10, index / 10, name, each) for each in off)
             rgb = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
             assert cv2.PSNR(np.ascontiguousarray(rgb), eye.rgb[index]) > 30
             mask = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)

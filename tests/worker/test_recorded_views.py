@@ -18,7 +18,7 @@ from intrasplat.picture import ImageFormat, IntrinsicsOverride, RecordedMasks
 from intrasplat.pose import parse_pose
 from intrasplat.report import Masks, RightEye
 from intrasplat.scene.checkpoint import save_scene
-from intrasplat.view.recorded import EYES, zipped_frames
+from intrasplat.view.recorded import EYES, recorded_files
 from tests.intrasplat.scenes import FRAMES, random_scene
 from tests.reports import REPORT_OF_A_SCENE
 from worker.reply import NotYetError
@@ -63,7 +63,7 @@ def test_recorded_frames_are_of_the_job_that_trains_and_of_its_scene(store: Stor
     assert (shown.t, shown.iteration, shown.media_type) == (0.5, 0, "image/jpeg")
     work = store.work_folder(job_id, 1)
     (work / REPORT).write_text(REPORT_OF_IT)
-    (work / RECORDED).write_bytes(zipped_frames(clip, EYES[:1])[0])
+    (work / RECORDED).write_bytes(recorded_files(clip, EYES[:1], ())[0][RECORDED] or b"")
     save_scene(work, random_scene())
     store.publish_scene(job_id, 1)
     for masks in RecordedMasks:

@@ -176,7 +176,7 @@ def test_recorded_frames_are_read_on_any_machine_unless_they_were_altered(tmp_pa
     (folder / MANIFEST).write_text(json.dumps({"files": {}, "beside": {RECORDED: {"sha256": digest}}}))
     worker.publish_scene(job_id, 1)
     service = on(tmp_path, "service")
-    assert read_frame(service.scene_folder(job_id, 1) / RECORDED, 12, 0.2) == (3, b"jpeg")
+    assert read_frame(service.scene_folder(job_id, 1), 12, 0.2) == (3, b"jpeg")
     bucket.put_object(Key=f"{PREFIX}scenes/{job_id}.1/{RECORDED}", Body=b"another patient's")
     with pytest.raises(SceneError, match="damaged"):
         on(tmp_path, "another").scene_folder(job_id, 1)

@@ -15,7 +15,7 @@ from intrasplat.clip import DepthClip, split_frames
 from intrasplat.motion.exposure import MIN_CELLS, MIN_SHARE, Exposure, find_exposure, in_steady_light
 from intrasplat.motion.keyframes import track_keyframes
 from intrasplat.motion.light import RecordedLight
-from intrasplat.motion.tracks import Tracks
+from intrasplat.motion.tracks import Tracks, without_gains
 from intrasplat.notices import NoticeCode
 from intrasplat.outcome import snapshot_of, training_of
 from intrasplat.train.scoring import frame_renderer
@@ -142,6 +142,17 @@ def test_a_clip_in_steady_light_has_the_light_of_the_reference() -> None:
     np.testing.assert_array_equal(steady.rgb[exposure.reference], clip.rgb[exposure.reference])
     before, after = (each.rgb[split_frames(clip).train].mean(axis=(1, 2)).std(axis=0) for each in (clip, steady))
     assert (after < 0.4 * before)[[0, 2]].all()
+
+
+def test_tracks_without_gains_have_the_colours_of_steady_light() -> None:
+    (clip, logs), train = drifting(0.9), split_frames(phantom_clip(tools=False)).train
+    recorded, steady = (track_keyframes(each, train)[0] for each in (clip, phantom_clip(tools=False)))
+    corrected = without_gains(recorded, clip, train, logs)
+    trusted = (recorded.confidence > 0.5) & (steady.confidence > 0.5)
+    off, off_before = (np.abs(each.colour - steady.colour)[trusted].mean() for each in (corrected, recorded))
+    assert off < 0.2 * off_before
+    assert off < 0.004
+    assert corrected.displacement_mm is recorded.displacement_mm
 
 
 def test_a_scene_shows_steady_light_or_the_recorded_one_and_resumes_with_its_gains(tmp_path: Path) -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import DepthClip, training_frames
-from intrasplat.errors import InputError
+from intrasplat.errors import Cancelled, InputError
 from intrasplat.machine.hooks import Hooks
 from intrasplat.machine.timing import Timings
 from intrasplat.notices import NoticeCode
 from intrasplat.options import ReconstructionOptions
 from intrasplat.poses import camera_rests, with_poses
-from intrasplat.poses.estimate import FoundPath, find_path
+from intrasplat.poses.estimate import CHAINING, FITTING, FoundPath, find_path
 from intrasplat.poses.links import Frames
 from intrasplat.poses.rigid import Reals
 from intrasplat.poses.trajectory import trajectory_error
@@ -77,6 +77,27 @@ def test_held_out_frames_change_no_other_pose() -> None:
     one, two = path_of("still", "turn"), find_path(replace(clip, rgb=spoilt), TRAIN)
     assert (one.world_from_camera[TRAIN] == two.world_from_camera[TRAIN]).all()
     assert one.period_frames == two.period_frames
+
+
+def test_a_path_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("intrasplat.machine.pool.cores", lambda: 1)
+    clip, _ = clip_of("still", "turn")
+    alone = find_path(clip, TRAIN)
+    monkeypatch.setattr("intrasplat.machine.pool.cores", lambda: 4)
+    together = find_path(clip, TRAIN)
+    assert (alone.world_from_camera == together.world_from_camera).all()
+    assert alone.sigma_mm == together.sigma_mm
+
+
+def test_what_progress_raises_ends_the_search() -> None:
+    clip, _ = clip_of("still", "turn")
+
+    def stop(share: float) -> None:
+        if share >= CHAINING + FITTING:  # other frames are being placed
+            raise Cancelled("Stopped.")
+
+    with pytest.raises(Cancelled):
+        find_path(clip, TRAIN, stop)
 
 
 def test_a_fixed_camera_leaves_the_clip_as_it_is() -> None:

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from intrasplat.clip import FrameSplit, split_frames
-from intrasplat.clip.types import DepthClip
+from intrasplat.clip.types import DepthClip, Eye
 from intrasplat.errors import TrainingDiverged
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.baselines import CopyBaselines, copy_baselines
 from intrasplat.quality.checks import clip_warnings
+from intrasplat.quality.detail import measure_detail
 from intrasplat.quality.report import Scores, Training, first_report, measure, score_warnings, scored_report
-from intrasplat.quality.right_eye import RightScores
+from intrasplat.quality.right_eye import RightScores, measure_right
 from intrasplat.report import RESEARCH_USE, Report
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import RenderedFrame
@@ -64,6 +65,23 @@ def views(clip: DepthClip, noise: float = 0.01) -> Callable[[int], RenderedFrame
         return RenderedFrame(rgb.astype(np.float32), clip.depth_mm[index] + 0.5, np.ones_like(clip.depth_mm[index]))
 
     return render
+
+
+def test_views_with_detail_are_scored_like_the_model() -> None:
+    clip, frames = long_clip(), [3, 11, 19]
+    right = Eye(clip.rgb, clip.tissue, clip.depth_mm, clip.depth_confidence, clip.intrinsics, clip.world_from_camera)
+    both = dataclasses.replace(clip, right=right)
+    detail, model = measure_detail(both, frames, views(clip), views(clip, 0.02)), measure(clip, frames, views(clip))
+    assert detail.psnr_tissue_db == pytest.approx(np.mean(model.psnr_tissue_db))
+    assert detail.ssim == pytest.approx(np.mean(model.ssim))
+    assert detail.psnr_right_db == pytest.approx(np.mean(measure_right(both, frames, views(clip, 0.02)).psnr_db))
+    assert measure_detail(clip, frames, views(clip), views(clip)).psnr_right_db is None
+
+
+def test_detail_that_is_no_number_is_no_score() -> None:
+    clip = long_clip()
+    with pytest.raises(TrainingDiverged):
+        measure_detail(clip, [3], views(clip, math.nan), views(clip))
 
 
 def report_of(clip: DepthClip, holdout: str = "every8", noise: float = 0.01) -> Report:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from intrasplat.camera import Intrinsics
 from intrasplat.errors import SceneError
 from intrasplat.names import DETAIL, RECORDED
-from intrasplat.scene import training_pictures
-from intrasplat.scene.recorded_file import MASK, name_of
-from intrasplat.scene.training_pictures import KEY_EVERY, RecordedEye, encoded, pictures_of
+from intrasplat.scene import recorded_video
+from intrasplat.scene.recorded_file import EYES, MASK, PICTURE, complete_zip, name_of, read_frame
+from intrasplat.scene.recorded_video import KEY_EVERY, RecordedEye, encoded
+from intrasplat.scene.training_pictures import coded, pictures_of
 
 WIDTH, HEIGHT = 65, 47
 LENS = Intrinsics(width=WIDTH, height=HEIGHT, fx=80.0, fy=81.0, cx=31.5, cy=24.25)
@@ -29,6 +31,10 @@ def picture(eye: int, frame: int) -> NDArray[np.uint8]:
     return np.asarray(128 + 90 * np.stack(waves, axis=-1), np.uint8)
 
 
+def frame_of(eye: int, frame: int) -> av.VideoFrame:
+    return coded(picture(eye, frame))
+
+
 def eyes() -> list[RecordedEye]:
     beside = np.eye(4)
     beside[0, 3] = 4.25
@@ -38,7 +44,7 @@ def eyes() -> list[RecordedEye]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("scene")
-    content = encoded(FRAMES, eyes(), picture)
+    content = encoded(FRAMES, eyes(), frame_of)
     assert content is not None
     (made / DETAIL).write_bytes(content)
     return made
@@ -65,6 +71,25 @@ def test_each_frame_comes_back_in_any_order(folder: Path, order: str) -> None:
             assert tissue.shape == rgb.shape[:2] == (HEIGHT, WIDTH)
 
 
+@pytest.mark.parametrize("eye", [0, 1])
+def test_frames_of_the_video_and_of_the_zip_file_are_served_as_one_row_of_pictures(
+    tmp_path: Path, folder: Path, eye: int
+) -> None:
+    count, held_out = FRAMES[-1] + 1, sorted(set(range(FRAMES[-1] + 1)) - set(FRAMES))
+    (tmp_path / DETAIL).write_bytes((folder / DETAIL).read_bytes())
+    with zipfile.ZipFile(tmp_path / RECORDED, "w") as archive:
+        for frame in held_out:
+            shown = cv2.imencode(".jpg", picture(eye, frame)[..., ::-1])[1].tobytes()
+            archive.writestr(name_of(EYES[eye], frame, PICTURE), shown)
+    complete = zipfile.ZipFile(complete_zip(tmp_path))
+    for frame in range(count):
+        index, jpeg = read_frame(tmp_path, count, frame / count, EYES[eye])
+        shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        assert index == frame
+        assert error_db(shown, picture(eye, frame)) > 30
+        assert complete.read(name_of(EYES[eye], frame, PICTURE)) == jpeg
+
+
 def test_lens_and_pose_of_the_eyes_come_back(folder: Path) -> None:
     for found, given in zip(pictures_of(folder).eyes, eyes(), strict=True):
         assert found.lens == given.lens
@@ -72,13 +97,13 @@ def test_lens_and_pose_of_the_eyes_come_back(folder: Path) -> None:
 
 
 def test_the_same_pictures_give_the_same_bytes(folder: Path) -> None:
-    assert encoded(FRAMES, eyes(), picture) == (folder / DETAIL).read_bytes()
+    assert encoded(FRAMES, eyes(), frame_of) == (folder / DETAIL).read_bytes()
 
 
 def test_the_other_encoder_serves_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = training_pictures.CODECS["libvpx-vp9"]
-    monkeypatch.setattr(training_pictures, "CODECS", {"missing": {}, "libvpx-vp9": options})
-    content = encoded(FRAMES[:5], eyes()[:1], picture)
+    options = recorded_video.CODECS["libvpx-vp9"]
+    monkeypatch.setattr(recorded_video, "CODECS", {"missing": {}, "libvpx-vp9": options})
+    content = encoded(FRAMES[:5], eyes()[:1], frame_of)
     assert content is not None
     (tmp_path / DETAIL).write_bytes(content)
     reader = pictures_of(tmp_path)
@@ -88,8 +113,8 @@ def test_the_other_encoder_serves_as_well(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_without_an_encoder_there_is_no_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_pictures, "CODECS", {"missing": {}})
-    assert encoded(FRAMES, eyes(), picture) is None
+    monkeypatch.setattr(recorded_video, "CODECS", {"missing": {}})
+    assert encoded(FRAMES, eyes(), frame_of) is None
 
 
 def test_masks_say_what_is_tissue(tmp_path: Path, folder: Path) -> None:

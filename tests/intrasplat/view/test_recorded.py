@@ -13,10 +13,11 @@ import pytest
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip, Eye
 from intrasplat.errors import InputError, SceneError
+from intrasplat.names import RECORDED
 from intrasplat.picture import RecordedMasks
 from intrasplat.report import Masks
-from intrasplat.scene.recorded_file import MAX_FRAME_BYTES
-from intrasplat.view.recorded import EYES, MARK, MAX_MOMENTS, MAX_WIDTH, live_frame, stored_frame, zipped_frames
+from intrasplat.scene.recorded_file import EYES, MAX_FRAME_BYTES
+from intrasplat.view.recorded import MARK, MAX_MOMENTS, MAX_WIDTH, live_frame, recorded_files, stored_frame
 
 FRAMES = 40
 
@@ -56,9 +57,10 @@ def two_eyes() -> DepthClip:
 
 
 def kept(tmp_path: Path, of: DepthClip, eyes: int = 1) -> Path:
-    path = tmp_path / "recorded.zip"
-    path.write_bytes(zipped_frames(of, EYES[:eyes])[0])
-    return path
+    for name, content in recorded_files(of, EYES[:eyes], ())[0].items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+    return tmp_path
 
 
 def mask_of(png: bytes) -> np.ndarray:
@@ -116,12 +118,18 @@ def test_a_mask_is_white_on_instruments_and_of_its_own_eye(tmp_path: Path) -> No
 def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Path) -> None:
     count = 3 * MAX_MOMENTS
     long = clip(frames=count, width=16, height=12, masks=Masks(source="given", share=0.33))
-    content, told = zipped_frames(long, EYES[:1])
-    assert zipped_frames(long, EYES[:1]) == (content, told)
+    files, told = recorded_files(long, EYES[:1], ())
+    assert recorded_files(long, EYES[:1], ()) == (files, told)
     assert len(told.frames) == MAX_MOMENTS
     assert (told.frames[0], told.frames[-1]) == (0, count - 1)
     assert max(np.diff(told.frames)) <= 4
-    assert (told.eyes, told.width, told.height, told.masks, told.size_bytes) == (("left",), 16, 12, True, len(content))
+    assert (told.eyes, told.width, told.height, told.masks, told.size_bytes) == (
+        ("left",),
+        16,
+        12,
+        True,
+        len(files[RECORDED] or b""),
+    )
     path = kept(tmp_path, long)
     shown = {stored_frame(path, count, index / count)[0] for index in range(count)}
     assert tuple(sorted(shown)) == told.frames
@@ -130,14 +138,14 @@ def test_a_long_clip_is_thinned_and_the_report_says_to_which_frames(tmp_path: Pa
 @pytest.mark.parametrize(("source", "frames"), [("found", 2 * FRAMES - 3), ("given", 2 * FRAMES)])
 def test_frames_that_nobody_looked_at_are_kept_where_their_masks_are_known(source: str, frames: int) -> None:
     masks = Masks(source=source, share=0.33)  # type: ignore[arg-type]
-    _, told = zipped_frames(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), skipped=(4, 5, 6)), EYES[:1])
+    _, told = recorded_files(dataclasses.replace(clip(frames=2 * FRAMES, masks=masks), skipped=(4, 5, 6)), EYES[:1], ())
     assert len(told.frames) == frames
 
 
 def test_a_clip_without_instruments_keeps_no_masks(tmp_path: Path) -> None:
     bare = clip()
     bare.tissue[:] = True
-    assert not zipped_frames(bare, EYES[:1])[1].masks
+    assert not recorded_files(bare, EYES[:1], ())[1].masks
     path = kept(tmp_path, bare)
     plain, marked = (
         stored_frame(path, FRAMES, 0.5, "left", each) for each in (RecordedMasks.OFF, RecordedMasks.MARKED)
@@ -158,11 +166,11 @@ def test_an_eye_that_is_not_there_is_told(tmp_path: Path, masks: RecordedMasks) 
 def test_a_scene_without_recorded_frames_is_told_from_a_damaged_one(tmp_path: Path) -> None:
     path = tmp_path / "recorded.zip"
     with pytest.raises(SceneError, match="keeps no recorded frames"):
-        stored_frame(path, FRAMES, 0.0)
+        stored_frame(tmp_path, FRAMES, 0.0)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("000012.jpg", b"of an earlier program")
     with pytest.raises(SceneError, match="keeps no recorded frames"):
-        stored_frame(path, FRAMES, 0.0)
+        stored_frame(tmp_path, FRAMES, 0.0)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"x" * 100])
@@ -170,7 +178,7 @@ def test_a_damaged_file_is_told(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "recorded.zip"
     path.write_bytes(content)
     with pytest.raises(SceneError, match="cannot be read"):
-        stored_frame(path, FRAMES, 0.0)
+        stored_frame(tmp_path, FRAMES, 0.0)
 
 
 @pytest.mark.parametrize(("jpeg", "png"), [(b"", b""), (b"JPEG", b""), (None, b"PNG"), (None, None), (HUGE, None)])
@@ -183,7 +191,7 @@ def test_a_damaged_picture_or_a_mask_of_another_size_is_told(
         archive.writestr("left/000000.jpg", live_frame(clip(), 0.0)[1] if jpeg is None else jpeg)
         archive.writestr("left/000000.png", other if png is None else png)
     with pytest.raises(SceneError, match="recorded frame of this scene"):
-        stored_frame(path, FRAMES, 0.0)
+        stored_frame(tmp_path, FRAMES, 0.0)
 
 
 def test_a_file_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> None:
@@ -192,4 +200,4 @@ def test_a_file_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> No
         with zipfile.ZipFile(path, "w", how) as archive:
             archive.writestr("left/000000.jpg", bytes(size))
         with pytest.raises(SceneError, match="cannot be read"):
-            stored_frame(path, FRAMES, 0.0)
+            stored_frame(tmp_path, FRAMES, 0.0)
