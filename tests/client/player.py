@@ -58,6 +58,17 @@ const manifest = await (await fetch(given[0] + "manifest.json")).json();
 const scene = await (await fetch(given[0] + "scene.safetensors")).arrayBuffer();
 window.player?.close();
 window.player = await Player.of({ manifest, scene }, new OffscreenCanvas(1, 1));
+if (player.hasDetail) {
+  const { Detail } = await import("/player/detail.js");
+  const { TrainingPictures } = await import("/player/trainingpictures.js");
+  const video = new Uint8Array(await (await fetch(given[0] + "detail.mkv")).arrayBuffer());
+  const mask = async (eye, frame) => {
+    const answer = await fetch(`${given[0]}${["left", "right"][eye]}/${String(frame).padStart(6, "0")}.png`);
+    return answer.ok ? answer.blob() : null;
+  };
+  const source = { bytes: video.length, read: async (first, end) => video.slice(first, end), mask };
+  player.takeDetail(Detail, TrainingPictures.open(source));
+}
 return player.times;
 """
 DRAW = """
@@ -65,7 +76,7 @@ const [{ t, orbit, eye, width, height, highlights, isMarked, isTimed }] = given;
 const shown = player.cameras.shownTime(t);
 const own = eye === "right" ? player.cameras.rightEye(shown) : player.cameras.endoscope(shown);
 const pose = orbit ? player.cameras.orbit(...orbit) : own;
-const drawn = await player.draw({ t, pose, width, height, highlights, isMarked, isTimed });
+const drawn = await player.draw({ t, pose, width, height, highlights, isMarked, isTimed, isRefined: player.hasDetail });
 const pixels = player.pixels();
 let text = "";
 for (let i = 0; i < pixels.length; i += 8192) text += String.fromCharCode(...pixels.subarray(i, i + 8192));
@@ -171,7 +182,7 @@ class _Files(http.server.SimpleHTTPRequestHandler):
 
     def translate_path(self, path: str) -> str:
         if path.startswith(SCENES):
-            return str(self._scene / Path(path).name)
+            return str(self._scene / path.removeprefix(SCENES))
         return str(DASHBOARD / path.lstrip("/"))
 
     def end_headers(self) -> None:

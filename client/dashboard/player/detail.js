@@ -126,9 +126,14 @@ export class Detail {
     return this.neighbours(t).flatMap(({ frame }) => eyes.map((eye) => ({ eye, frame })));
   }
 
-  /** Whether a residual is there. @param {Wanted} wanted */
+  /** Whether a residual is there; it stays, then, while others are computed. @param {Wanted} wanted */
   has({ eye, frame }) {
-    return this.residuals.has(keyOf(eye, frame));
+    const key = keyOf(eye, frame);
+    const found = this.residuals.get(key);
+    if (!found) return false;
+    this.residuals.delete(key);
+    this.residuals.set(key, found);
+    return true;
   }
 
   /** Where the model's own picture of an eye is to be blended, before measure(). @returns {WebGLFramebuffer} */
@@ -217,9 +222,9 @@ export class Detail {
     const [before, after = before] = neighbours.map(({ frame }) => frame);
     const [, known] = this.drawing.blended;
     const cameraFromWorld = this.cameras.cameraFromWorld(pose);
-    const moved = this.#motion(view, lens, cameraFromWorld, [before, after].map((frame) => this.#residual(nearest, frame).centres));
+    const moved = this.#motion(view, lens, cameraFromWorld, [before, after].map((frame) => this.residuals.get(keyOf(nearest, frame)).centres));
     const totals = eyes.map((eye, place) => {
-      const [first, second] = [before, after].map((frame) => this.#residual(eye, frame));
+      const [first, second] = [before, after].map((frame) => this.residuals.get(keyOf(eye, frame)));
       const fromView = (each) => matrix(this.cameras.inUnits(times(inverse(each.pose), pose)));
       const textures = { residualBefore: first.residual, depthBefore: first.depth, movedBefore: moved[0] };
       programs.CARRY.use({ known, ...textures, residualAfter: second.residual, depthAfter: second.depth, movedAfter: moved[1] }, {
@@ -240,18 +245,10 @@ export class Detail {
       fillTarget(gl, view.sumTarget, lens.width, lens.height);
     }
     gl.bindTexture(gl.TEXTURE_2D, view.weights);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...view.coarse, gl.RGBA, gl.FLOAT, weights);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...view.cells, gl.RGBA, gl.FLOAT, weights);
     programs.TOGETHER.use({ left, right, sums: view.sums, weights: view.weights }, { eyes: ["1i", isOwn ? 0 : totals.length] });
     fillTarget(gl, view.addedTarget, lens.width, lens.height);
     return view.added;
-  }
-
-  #residual(eye, frame) {
-    const key = keyOf(eye, frame);
-    const found = this.residuals.get(key);
-    this.residuals.delete(key);
-    this.residuals.set(key, found);
-    return found;
   }
 
   /** Textures for views of a size. */
@@ -260,16 +257,15 @@ export class Detail {
     this.ofView?.made.free();
     const { gl } = this;
     const made = new Textures(gl);
-    const coarse = [width, height].map((side) => Math.max(1, Math.ceil((side - CELL_PX / 2) / CELL_PX)));
     const cells = [width, height].map((side) => Math.ceil(side / CELL_PX));
     const many = (count, kind, size) => Array.from({ length: count }, () => made.add(kind, ...size));
     const gathered = this.drawing.blendable(...cells, 2);
     made.all.push(...gathered);
     const [blurred, moved] = [many(4, this.FLOATS, cells), many(2, this.FLOATS, cells)];
     const [sums, totals] = [made.add(this.FLOATS, width, height), many(2, this.HALVES, [width, height])];
-    const [depths, weights, added] = [made.add(this.FLOATS, ...coarse), made.add(this.FLOATS, ...coarse), made.add(this.HALVES, width, height)];
+    const [depths, weights, added] = [made.add(this.FLOATS, ...cells), made.add(this.FLOATS, ...cells), made.add(this.HALVES, width, height)];
     this.ofView = {
-      width, height, made, coarse, cells, gathered, blurred, moved, sums, totals, weights, added,
+      width, height, made, cells, gathered, blurred, moved, sums, totals, weights, added,
       depthTarget: made.target(depths),
       gatherTarget: made.target(...gathered),
       blurTarget: made.target(...blurred),
@@ -281,8 +277,8 @@ export class Detail {
     return this.ofView;
   }
 
-  /** @returns {Float32Array} of the view's grid, first row first; 0 where nothing is solid */
-  #coarseDepth({ coarse: [w, h], depthTarget }) {
+  /** @returns {Float32Array} in the middles of the view's cells, first row first; 0 where nothing is solid */
+  #coarseDepth({ cells: [w, h], depthTarget }) {
     const { gl } = this;
     this.programs.COARSE.use({ known: this.drawing.blended[1] }, {});
     fillTarget(gl, depthTarget, w, h);
@@ -294,12 +290,13 @@ export class Detail {
   /** Which eyes count at all, the nearest of them, and how much of what each alone misses, and of what both miss. */
   #weights(t, pose, lens, depth) {
     const poses = this.pictures.eyes.map((_, eye) => this.eyePose(eye, t));
-    const [w] = this.ofView.coarse;
+    const [w] = this.ofView.cells;
     const solid = depth.filter((each) => each > 0).sort();
     const [low, high] = [solid[(solid.length - 1) >> 1] ?? 1, solid[solid.length >> 1] ?? 1];
     const far = (low + high) / 2;
     const points = Array.from(depth, (each, at) => {
-      const [j, i] = [at % w, Math.floor(at / w)].map((cell) => CELL_PX * cell + CELL_PX / 2 + 0.5);
+      const cell = [at % w, Math.floor(at / w)];
+      const [j, i] = [lens.width, lens.height].map((side, axis) => Math.min(CELL_PX * cell[axis] + CELL_PX / 2, side - 1) + 0.5);
       const d = each > 0 ? each : far;
       return [(d * (j - lens.cx)) / lens.fx, (d * (i - lens.cy)) / lens.fy, d, 1];
     });

@@ -3,7 +3,7 @@
 
 import { HEAD, ROW } from "./shaders.js";
 
-/** Side of a cell of motion; step of the grid of weights; side of the square in which eyes are compared; squares along a sum. */
+/** Side of a cell of the view, in which motion is averaged and angles are computed; blocks along a sum of the picture. */
 export const CELL_PX = 8;
 export const SUMMED = 32;
 
@@ -142,13 +142,13 @@ void main() {
   depth = vec4(solidDepth(texelFetch(known, at, 0)));
 }`;
 
-/** The view's depth at every eighth pixel. */
+/** The view's depth in the middles of its cells. */
 export const COARSE = `${TOOLS}
 uniform sampler2D known;
 layout(location = 0) out vec4 depth;
 void main() {
-  ivec2 pixel = ivec2(gl_FragCoord.xy) * ${CELL_PX} + ${CELL_PX / 2};
-  depth = vec4(solidDepth(texelFetch(known, ivec2(pixel.x, textureSize(known, 0).y - 1 - pixel.y), 0)));
+  ivec2 last = textureSize(known, 0) - 1, pixel = min(ivec2(gl_FragCoord.xy) * ${CELL_PX} + ${CELL_PX / 2}, last);
+  depth = vec4(solidDepth(texelFetch(known, ivec2(pixel.x, last.y - pixel.y), 0)));
 }`;
 
 /** The motion of a Gaussian to two other times, in the cell of the view that shows its centre. */
@@ -314,8 +314,8 @@ void main() {
   vec2 sum = vec2(0.0);
   for (int i = -4; i <= 4; i++) sum += texelFetch(sums, ivec2(at.x, mirrored(at.y + i, size.y)), 0).xy / 81.0;
   float correlation = clamp(sum.x / (sum.y + 1e-7), 0.0, 1.0), alike = 2.0 * correlation / (1.0 + correlation);
-  vec3 common = alike * l.a * r.a / 2.0 * (l.rgb + r.rgb);
+  vec3 both = alike * l.a * r.a / 2.0 * (l.rgb + r.rgb);
   float near = weight.x + weight.y, scale = 1.0 / max(near, 1.0);
-  vec3 alone = scale * (weight.x * (l.rgb - common) + weight.y * (r.rgb - common));
-  added = vec4(max(weight.z, min(near, 1.0)) * common + alone, 1.0);
+  vec3 alone = scale * (weight.x * (l.rgb - both) + weight.y * (r.rgb - both));
+  added = vec4(max(weight.z, min(near, 1.0)) * both + alone, 1.0);
 }`;
