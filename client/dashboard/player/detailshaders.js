@@ -1,16 +1,18 @@
 // What the GPU computes of a view's detail. The contract is intrasplat/view/detail.py and transfer.py; lengths are in units.
 // Pictures are as the blend leaves them, last row first; coded planes and grids of cells have the first row first.
 
+import { CELL_PX } from "./flow.js";
 import { HEAD, ROW } from "./shaders.js";
 
-/** Side of a cell of the view, in which motion is averaged and angles are computed; blocks along a sum of the picture. */
-export const CELL_PX = 8;
+/** Blocks along a sum of the picture. */
 export const SUMMED = 32;
 
 const TOOLS = `${HEAD}
 const float COVERED = 0.5, LEAST_Z = 1e-4;
+// Of what was blended, or of a texture of depths, whose other numbers are 0, 0 and 1.
 float solidDepth(vec4 known) {
   float alpha = 1.0 - known.a;
+  if (alpha == 0.0) return known.r;
   return alpha >= COVERED ? known.r / alpha : 0.0;
 }
 // Four numbers about a place between texels, whose borders count as repeated.
@@ -31,7 +33,7 @@ int mirrored(int x, int count) {
 }
 `;
 
-/** What the model misses of a recorded picture, in steady light and without smoke; and whether that is known. */
+/** What the model misses of a recorded picture, in steady light and without smoke, and whether that is known; its grey. */
 export const MISSED = `${TOOLS}
 uniform sampler2D shown, known, luma, blue, red, mask, smoke;
 uniform bool isMasked, isSmoky;
@@ -42,6 +44,7 @@ uniform vec3 gains;
 uniform vec2 vignetting;                        // power, logarithm of the level
 uniform vec4 airlight;                          // and the smoke's reference depth
 layout(location = 0) out vec4 missed;
+layout(location = 1) out vec4 grey;
 const float MIN_TRANSMISSION = 0.3, MIN_LIGHT = 0.2, LEAST_LOG_COSINE = -3.0;
 vec3 recordedAt(ivec2 at) {
   vec2 size = vec2(textureSize(luma, 0));
@@ -70,6 +73,8 @@ void main() {
   vec3 light = gains * exp(vignetting.x * cosine - vignetting.y);
   isValid = isValid && min(light.r, min(light.g, light.b)) > MIN_LIGHT;
   steady /= max(light, vec3(MIN_LIGHT));
+  vec3 levels = floor(clamp(steady, 0.0, 1.0) * 255.0 + 0.5);
+  grey = vec4(floor(dot(levels, vec3(0.299, 0.587, 0.114)) + 0.5) / 255.0);
   missed = isValid ? vec4(clamp(steady - texelFetch(shown, at, 0).rgb, -1.0, 1.0), 1.0) : vec4(0.0);
 }`;
 
@@ -132,14 +137,39 @@ void main() {
 }`;
 
 export const RESIDUAL = `${TOOLS}
-uniform sampler2D faded, known;
+uniform sampler2D faded, known, shade;
 flat in float scale;
 layout(location = 0) out vec4 residual;         // red, green, blue times validity, validity
 layout(location = 1) out vec4 depth;
+layout(location = 2) out vec4 grey;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   residual = texelFetch(faded, at, 0) * vec4(vec3(scale), 1.0);
   depth = vec4(solidDepth(texelFetch(known, at, 0)));
+  grey = texelFetch(shade, at, 0);
+}`;
+
+/** A recorded picture's grey as CARRY takes it: times validity, and validity. */
+export const VALID_GREY = `${HEAD}
+uniform sampler2D residual, grey;
+layout(location = 0) out vec4 valid;
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  float share = texelFetch(residual, at, 0).a;
+  valid = vec4(texelFetch(grey, at, 0).r * share, 0.0, 0.0, share);
+}`;
+
+/** Two grey pictures, the second as the model moves it to the first; and whether both show a place. First row first. */
+export const PAIR = `${HEAD}
+uniform sampler2D residual, grey, carried;
+layout(location = 0) out vec4 pair;
+const float MIN_SEEN = 0.3;
+void main() {
+  ivec2 at = ivec2(int(gl_FragCoord.x), textureSize(grey, 0).y - 1 - int(gl_FragCoord.y));
+  vec4 second = texelFetch(carried, at, 0);
+  float first = texelFetch(grey, at, 0).r;
+  bool isSeen = second.a > MIN_SEEN && texelFetch(residual, at, 0).a > MIN_SEEN;
+  pair = vec4(first, isSeen ? second.r / max(second.a, MIN_SEEN) : first, isSeen ? 1.0 : 0.0, 1.0);
 }`;
 
 /** The view's depth in the middles of its cells. */
@@ -229,6 +259,29 @@ vec4 mean(sampler2D near, sampler2D far) {
 void main() {
   before = mean(nearBefore, farBefore);
   after = mean(nearAfter, farAfter);
+}`;
+
+/** The motion to two frames, after which their pictures show the same where they meet: the flow between them is shared. */
+export const CORRECT = `${TOOLS}
+uniform sampler2D movedBefore, movedAfter, weights, flow;   // weights: the fourth is the view's depth
+uniform mat4 beforeFromView, afterFromView, beforeFromWorld, afterFromWorld;
+uniform vec4 lens, eyeLens;
+uniform vec2 size, eyeSize;
+uniform float share;                            // of the second frame
+layout(location = 0) out vec4 before;
+layout(location = 1) out vec4 after;
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  vec2 pixel = min(vec2(at * ${CELL_PX} + ${CELL_PX / 2}), size - 1.0) + 0.5;
+  vec4 point = vec4(texelFetch(weights, at, 0).w * vec3((pixel - lens.zw) / lens.xy, 1.0), 1.0);
+  vec3 toBefore = texelFetch(movedBefore, at, 0).xyz, toAfter = texelFetch(movedAfter, at, 0).xyz;
+  vec3 seen = (beforeFromView * point).xyz, there = seen + mat3(beforeFromWorld) * toBefore;
+  vec2 place = eyeLens.xy * there.xy / max(there.z, LEAST_Z) + eyeLens.zw - 0.5;
+  vec2 apart = between(flow, scaled(place, flow, eyeSize)).xy;
+  vec3 first = vec3(-share * apart * seen.z / eyeLens.xy, 0.0);
+  vec3 second = vec3((1.0 - share) * apart * (afterFromView * point).z / eyeLens.xy, 0.0);
+  before = vec4(toBefore + transpose(mat3(beforeFromWorld)) * first, 1.0);
+  after = vec4(toAfter + transpose(mat3(afterFromWorld)) * second, 1.0);
 }`;
 
 /** An eye's residuals of two frames where the points of the view were then: red, green, blue times weight, and weight. */

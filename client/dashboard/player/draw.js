@@ -242,6 +242,23 @@ export class Drawing {
     return this.told;
   }
 
+  /** What the target that was drawn into last shows, as soon as it is drawn. @returns {Promise<Uint8Array>} [height, width, 4] */
+  async read(width, height) {
+    const { gl } = this;
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, 4 * width * height, gl.STREAM_READ);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    await this.settled();
+    const pixels = new Uint8Array(4 * width * height);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, pixels);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    gl.deleteBuffer(buffer);
+    return pixels;
+  }
+
   /** Give the GPU's memory back. */
   close() {
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();

@@ -140,10 +140,10 @@ export class Player {
     if (view.isRefined) await this.opening;
     const { detail } = this;
     if (detail === null || !(view.isRefined || this.detailMs < MAX_DETAIL_MS)) return false;
-    const wanted = detail.wanted(t, view.pose);
+    const { residuals, flows } = detail.wanted(t, view.pose);
     const { pictures } = detail;
-    if (view.isMoving) for (const { eye, frame } of wanted) pictures.ahead(eye, frame);
-    const missing = wanted.filter((each) => !detail.has(each));
+    if (view.isMoving) for (const { eye, frame } of residuals) pictures.ahead(eye, frame);
+    const missing = residuals.filter((each) => !detail.has(each));
     const found = view.isRefined
       ? await Promise.all(missing.map(({ eye, frame }) => pictures.load(eye, frame)))
       : missing.map(({ eye, frame }) => pictures.at(eye, frame));
@@ -157,6 +157,7 @@ export class Player {
       this.#blend(then, pose, pictures.eyes[eye].lens, true, detail.ownTarget(eye));
       detail.measure({ eye, frame }, found[place]);
     }
+    for (const pair of flows) await Promise.race([detail.find(pair), this.closing]);
     return true;
   }
 
