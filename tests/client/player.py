@@ -6,9 +6,11 @@ import base64
 import functools
 import http.server
 import threading
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ from numpy.typing import NDArray
 from selenium import webdriver
 
 from client.page import DASHBOARD
+from intrasplat.names import RECORDED
 from intrasplat.pose import parse_pose
+from intrasplat.scene.recorded_file import MASK
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import pose_of
 from intrasplat.view.render import render_frame
@@ -174,7 +178,7 @@ class PlayerPage:
 
 
 class _Files(http.server.SimpleHTTPRequestHandler):
-    """The dashboard's files, and a scene's under SCENES, with the headers of the service."""
+    """The dashboard's files, and a scene's and its masks under SCENES, with the headers of the service."""
 
     def __init__(self, *arguments: Any, scene: Path) -> None:
         self._scene = scene
@@ -182,8 +186,21 @@ class _Files(http.server.SimpleHTTPRequestHandler):
 
     def translate_path(self, path: str) -> str:
         if path.startswith(SCENES):
-            return str(self._scene / path.removeprefix(SCENES))
+            return str(self._scene / Path(path).name)
         return str(DASHBOARD / path.lstrip("/"))
+
+    def do_GET(self) -> None:
+        if not (self.path.startswith(SCENES) and self.path.endswith(f".{MASK}")):
+            return super().do_GET()
+        try:
+            with zipfile.ZipFile(self._scene / RECORDED) as archive:
+                content = archive.read(self.path.removeprefix(SCENES))
+        except KeyError:
+            return self.send_error(HTTPStatus.NOT_FOUND)
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
 
     def end_headers(self) -> None:
         for name, value in ANSWER_HEADERS.items():

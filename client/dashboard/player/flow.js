@@ -14,63 +14,69 @@ const UNSEEN = 0.1;
 /** @typedef {{w: number, h: number, first: Uint8Array, second: Uint8Array}} Level */
 /** A flow of w x h places. @typedef {{w: number, h: number, u: Float32Array, v: Float32Array}} Flow */
 
-/** Which of `size` numbers lie in each of `count` parts, and by which share of the part. */
+/** Which of `size` numbers each of `count` parts covers, at most `most` of them, and with which shares of the part. */
 function areas(size, count) {
-  const scale = size / count;
-  return Array.from({ length: count }, (_, part) => {
-    const [from, to] = [part * scale, Math.min((part + 1) * scale, size)];
-    const first = Math.floor(from + 1e-9);
-    const length = Math.max(1, Math.ceil(to - 1e-9) - first);
-    const share = (i) => Math.max(0, Math.min(to, first + i + 1) - Math.max(from, first + i)) / (to - from);
-    return { first, shares: Float64Array.from({ length }, (_, i) => share(i)) };
-  });
-}
-
-/** Means of a picture's areas. @param {ArrayLike<number>} from [h, w] @returns {Float32Array} [down, across] */
-function meansOf(from, w, h, across, down) {
-  const [columns, rows] = [areas(w, across), areas(h, down)];
-  const narrow = new Float32Array(across * h);
-  for (let i = 0; i < h; i++) {
-    for (let j = 0; j < across; j++) {
-      const { first, shares } = columns[j];
-      let sum = 0;
-      for (let k = 0; k < shares.length; k++) sum += from[i * w + first + k] * shares[k];
-      narrow[i * across + j] = sum;
+  const most = Math.min(Math.ceil(size / count) + 1, size);
+  const [first, shares] = [new Int32Array(count), new Float32Array(count * most)];
+  for (let part = 0; part < count; part++) {
+    const [from, to] = [part, part + 1].map((each) => (each * size) / count);
+    first[part] = Math.min(Math.floor(from + 1e-9), size - most);
+    for (let k = 0; k < most; k++) {
+      const at = first[part] + k;
+      shares[part * most + k] = Math.max(0, Math.min(to, at + 1) - Math.max(from, at)) / (to - from);
     }
   }
+  return { most, first, shares };
+}
+
+/** Means of a picture's areas. @param {Uint8Array | Float32Array} from [h, w] @returns {Float32Array} [down, across] */
+function meansOf(from, w, h, across, down) {
+  if (w === across && h === down) return Float32Array.from(from);
+  const [columns, rows] = [areas(w, across), areas(h, down)];
   const small = new Float32Array(across * down);
+  const row = new Float32Array(w);
   for (let i = 0; i < down; i++) {
-    const { first, shares } = rows[i];
-    for (let k = 0; k < shares.length; k++) {
-      for (let j = 0; j < across; j++) small[i * across + j] += narrow[(first + k) * across + j] * shares[k];
+    row.fill(0);
+    for (let k = 0; k < rows.most; k++) {
+      const share = rows.shares[i * rows.most + k];
+      const start = (rows.first[i] + k) * w;
+      if (share > 0) for (let j = 0; j < w; j++) row[j] += share * from[start + j];
+    }
+    for (let j = 0; j < across; j++) {
+      let sum = 0;
+      for (let k = 0; k < columns.most; k++) sum += columns.shares[j * columns.most + k] * row[columns.first[j] + k];
+      small[i * across + j] = sum;
     }
   }
   return small;
 }
 
-/** A place among `count` numbers of another scale, and the one behind it, with its share. */
-function between(i, size, count) {
-  const place = Math.min(Math.max(((i + 0.5) * count) / size - 0.5, 0), count - 1);
-  const before = Math.floor(place);
-  return [before, Math.min(before + 1, count - 1), place - before];
-}
-
-/** A flow in more places, times a factor. @param {Flow} flow @returns {Flow} */
-function enlarged({ w, h, u, v }, across, down, factor) {
-  const found = { w: across, h: down, u: new Float32Array(across * down), v: new Float32Array(across * down) };
-  const columns = Array.from({ length: across }, (_, j) => between(j, across, w));
+/** Numbers in more places, times a factor. @param {Float32Array} from [h, w] @returns {Float32Array} [down, across] */
+function enlarged(from, w, h, across, down, factor) {
+  const place = (i, size, count) => Math.min(Math.max(((i + 0.5) * count) / size - 0.5, 0), count - 1);
+  const columns = Float32Array.from({ length: across }, (_, j) => place(j, across, w));
+  const found = new Float32Array(across * down);
+  const row = new Float32Array(w + 1);
   for (let i = 0; i < down; i++) {
-    const [a, b, f] = between(i, down, h);
+    const at = place(i, down, h);
+    const above = Math.floor(at);
+    const below = Math.min(above + 1, h - 1);
+    for (let j = 0; j < w; j++) {
+      row[j] = factor * (from[above * w + j] + (at - above) * (from[below * w + j] - from[above * w + j]));
+    }
+    row[w] = row[w - 1];
     for (let j = 0; j < across; j++) {
-      const [c, d, g] = columns[j];
-      for (const [from, to] of [[u, found.u], [v, found.v]]) {
-        const above = from[a * w + c] + g * (from[a * w + d] - from[a * w + c]);
-        const below = from[b * w + c] + g * (from[b * w + d] - from[b * w + c]);
-        to[i * across + j] = factor * (above + f * (below - above));
-      }
+      const before = columns[j] | 0;
+      found[i * across + j] = row[before] + (columns[j] - before) * (row[before + 1] - row[before]);
     }
   }
   return found;
+}
+
+/** A flow in more places, in their pixels. @param {Flow} flow @returns {Flow} */
+function finer({ w, h, u, v }, across, down, factor) {
+  const [us, vs] = [u, v].map((each) => enlarged(each, w, h, across, down, factor));
+  return { w: across, h: down, u: us, v: vs };
 }
 
 /** The finest and the coarsest level of pictures of a size. */
@@ -275,28 +281,34 @@ export function opticalFlow(first, second, width, height) {
   const { w, h } = levels.at(-1);
   let flow = { w, h, u: new Float32Array(w * h), v: new Float32Array(w * h) };
   levels.reverse().forEach((level, i) => {
-    if (i > 0) flow = enlarged(flow, level.w, level.h, 2);
+    if (i > 0) flow = finer(flow, level.w, level.h, 2);
     flow = dense(level, new Search(level, flow).run());
   });
-  return enlarged(flow, width, height, 2 ** range[0]);
+  return finer(flow, width, height, 2 ** range[0]);
 }
 
-/** Blur with a standard deviation of one, borders mirrored, along rows or columns. */
-function blurred(from, w, h, isAlong) {
-  const weights = [-4, -3, -2, -1, 0, 1, 2, 3, 4].map((i) => Math.exp(-(i * i) / 2));
-  const total = weights.reduce((sum, each) => sum + each, 0);
-  const mirrored = (i, count) => {
-    if (count === 1) return 0;
-    const at = Math.abs(i) % (2 * (count - 1));
-    return at >= count ? 2 * (count - 1) - at : at;
-  };
-  return Float32Array.from(from, (_, at) => {
-    const [i, j] = [Math.floor(at / w), at % w];
-    return weights.reduce((sum, weight, k) => {
-      const place = isAlong ? i * w + mirrored(j + k - 4, w) : mirrored(i + k - 4, h) * w + j;
-      return sum + (weight / total) * from[place];
-    }, 0);
-  });
+const WEIGHTS = [-4, -3, -2, -1, 0, 1, 2, 3, 4].map((i) => Math.exp(-(i * i) / 2)).map((each, _, all) => {
+  return each / all.reduce((sum, weight) => sum + weight, 0);
+});
+
+/** Blur with a standard deviation of one; borders are mirrored. @param {Float32Array} from [h, w], in place */
+function blur(from, w, h) {
+  for (const [count, lines, step, next] of [[w, h, 1, w], [h, w, w, 1]]) {
+    const line = new Float32Array(count + 8);
+    const period = Math.max(2 * (count - 1), 1);
+    for (let n = 0; n < lines; n++) {
+      for (let k = 0; k < count + 8; k++) {
+        const at = Math.abs(k - 4) % period;
+        line[k] = from[n * next + (at >= count ? period - at : at) * step];
+      }
+      for (let k = 0; k < count; k++) {
+        let sum = 0;
+        for (let l = 0; l < 9; l++) sum += WEIGHTS[l] * line[k + l];
+        from[n * next + k * step] = sum;
+      }
+    }
+  }
+  return from;
 }
 
 /**
@@ -305,14 +317,19 @@ function blurred(from, w, h, isAlong) {
  * @returns {{w: number, h: number, flow: Float32Array}} flow: [h, w, 2] px
  */
 export function flowInCells(pictures, width, height) {
-  const plane = (channel) => Uint8Array.from({ length: width * height }, (_, at) => pictures[4 * at + channel]);
-  const [first, second, seen] = [0, 1, 2].map(plane);
+  const [first, second, isSeen] = [new Uint8Array(width * height), new Uint8Array(width * height), new Float32Array(width * height)];
+  for (let at = 0; at < width * height; at++) {
+    first[at] = pictures[4 * at];
+    second[at] = pictures[4 * at + 1];
+    isSeen[at] = pictures[4 * at + 2] > 0 ? 1 : 0;
+  }
   const { u, v } = opticalFlow(first, second, width, height);
-  const [w, h] = [Math.ceil(width / CELL_PX), Math.ceil(height / CELL_PX)];
-  const isSeen = Float32Array.from(seen, (each) => (each > 0 ? 1 : 0));
-  const [us, vs, shares] = [u.map((each, at) => each * isSeen[at]), v.map((each, at) => each * isSeen[at]), isSeen].map((each) => {
-    return blurred(blurred(meansOf(each, width, height, w, h), w, h, true), w, h, false);
-  });
+  for (let at = 0; at < width * height; at++) {
+    u[at] *= isSeen[at];
+    v[at] *= isSeen[at];
+  }
+  const [w, h] = [width, height].map((side) => Math.ceil(side / CELL_PX));
+  const [us, vs, shares] = [u, v, isSeen].map((each) => blur(meansOf(each, width, height, w, h), w, h));
   const flow = new Float32Array(2 * w * h);
   shares.forEach((share, at) => flow.set([us[at] / (share + UNSEEN), vs[at] / (share + UNSEEN)], 2 * at));
   return { w, h, flow };

@@ -15,7 +15,7 @@ const PICTURES = 16;
 /** While the view moves, so many frames are prepared, and the runs and masks of those beyond are loaded. */
 const [AHEAD, FAR_AHEAD] = [3, 12];
 /** How many pixels share a number of chroma, across and down. */
-const SHARED = { I420: 2, NV12: 2, I444: 1 };
+const SHARED = { I420: 2, NV12: 2 };
 
 /**
  * Where the files are. bytes: of detail.mkv. mask: a PNG, opaque on instruments; null: the scene has no masks.
