@@ -9,7 +9,6 @@ import { Detail } from "./player/detail.js";
 import { CannotDrawError } from "./player/gpu.js";
 import { DETAIL, Player } from "./player/player.js";
 import { graphics } from "./player/support.js";
-import { TrainingPictures } from "./player/trainingpictures.js";
 import { Problem } from "./problem.js";
 
 const SCENE = "scene.safetensors";
@@ -134,7 +133,7 @@ export class Memory extends EventTarget {
       canvas.addEventListener("webglcontextlost", () => {
         if (this.player === player) this.giveUp(new CannotDrawError("The GPU has dropped the scene.", "context_lost"));
       });
-      if (player.hasDetail) player.takeDetail(Detail, TrainingPictures.open(picturesOf(scene, files.manifest)));
+      if (player.hasDetail) player.takeDetail(() => Detail.of(player, picturesOf(scene, files.manifest)));
       this.player = player;
       this.loading = null;
       this.#tell();

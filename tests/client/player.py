@@ -64,14 +64,13 @@ window.player?.close();
 window.player = await Player.of({ manifest, scene }, new OffscreenCanvas(1, 1));
 if (player.hasDetail) {
   const { Detail } = await import("/player/detail.js");
-  const { TrainingPictures } = await import("/player/trainingpictures.js");
   const video = new Uint8Array(await (await fetch(given[0] + "detail.mkv")).arrayBuffer());
   const mask = async (eye, frame) => {
     const answer = await fetch(`${given[0]}${["left", "right"][eye]}/${String(frame).padStart(6, "0")}.png`);
     return answer.ok ? answer.blob() : null;
   };
   const source = { bytes: video.length, read: async (first, end) => video.slice(first, end), mask };
-  player.takeDetail(Detail, TrainingPictures.open(source));
+  player.takeDetail(() => Detail.of(player, source));
 }
 return player.times;
 """

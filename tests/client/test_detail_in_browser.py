@@ -1,4 +1,4 @@
-"""A page that draws scenes by itself adds the detail of recorded frames; where it cannot, the service's picture follows."""
+"""A page that draws scenes adds the detail of recorded frames; where it cannot, the service's picture follows."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import { CannotDrawError, fillTarget, linked } from "./gpu.js";
 import { fourOf, kindsOf, Points, Textures } from "./points.js";
 import { RecordedLight } from "./recordedlight.js";
 import { EVERYWHERE, ROW } from "./shaders.js";
+import { TrainingPictures } from "./trainingpictures.js";
 import { weightsOf } from "./viewweights.js";
 
 const CACHED = 6;
@@ -23,14 +24,14 @@ const ROUNDING = 1e-6;
 
 export class Detail {
   /**
-   * @param {import("./draw.js").Drawing} drawing
-   * @param {import("./camera.js").Cameras} cameras
-   * @param {Record<string, any>} settings of the scene's manifest
-   * @param {import("./trainingpictures.js").TrainingPictures} pictures
+   * @param {import("./player.js").Player} player
+   * @param {import("./trainingpictures.js").Source} source
+   * @returns {Promise<Detail>}
+   * @throws as TrainingPictures.open()
    */
-  static async of(drawing, cameras, settings, pictures) {
+  static async of({ drawing, cameras, settings }, source) {
     const light = new RecordedLight(cameras, settings);
-    await light.open();
+    const [pictures] = await Promise.all([TrainingPictures.open(source), light.open()]);
     return new Detail(drawing, cameras, settings, pictures, light);
   }
 

@@ -27,6 +27,7 @@ const MAX_DETAIL_MS = 60;
  * @typedef {{t: number, pose: number[][], width: number, height: number, highlights?: boolean, isMarked?: boolean,
  *   isMoving?: boolean, isTimed?: boolean, isRefined?: boolean, isOutdated?: () => boolean}} View
  */
+/** @typedef {import("./detail.js").Detail} Detail */
 /** @typedef {{code: string, text: string}} Notice as a render's warnings */
 /** @typedef {{t: number, unseen: number, warnings: Notice[], hasDetail: boolean}} Drawn */
 
@@ -73,9 +74,9 @@ export class Player {
     /** Whether recorded frames are stored, from which views take detail. */
     this.hasDetail = manifest.beside?.[DETAIL] !== undefined;
     this.hasRecordedLight = RECORDED_LIGHT.some((name) => this.settings[name] !== undefined);
-    /** @type {Promise<import("./detail.js").Detail> | null} */
+    /** @type {Promise<Detail> | null} */
     this.opening = null;
-    /** @type {import("./detail.js").Detail | null} */
+    /** @type {Detail | null} */
     this.detail = null;
     this.detailMs = Infinity; // that a view takes with detail
     this.isClosed = false;
@@ -90,12 +91,10 @@ export class Player {
 
   /**
    * Add detail to views as soon as it can be computed.
-   * @param {typeof import("./detail.js").Detail} Detail
-   * @param {Promise<import("./trainingpictures.js").TrainingPictures>} pictures
+   * @param {() => Promise<Detail>} open from the scene's recorded frames
    */
-  takeDetail(Detail, pictures) {
-    this.opening = pictures.then(async (opened) => {
-      const detail = await Detail.of(this.drawing, this.cameras, this.settings, opened);
+  takeDetail(open) {
+    this.opening = open().then((detail) => {
       if (this.isClosed) detail.close();
       return (this.detail = detail);
     });
