@@ -43,8 +43,10 @@ export class Detail {
     const trained = new Set(cameras.trainedFrames);
     this.frames = pictures.frames.filter((frame) => trained.has(frame));
     this.kinds = kindsOf(gl);
-    const fills = { MISSED, INNER, FADED, POWER, COARSE, BLUR_ROWS, BLUR_COLUMNS, CARRY, CORRECT, ALIKE, TOGETHER, VALID_GREY, PAIR };
-    this.programs = Object.fromEntries(Object.entries(fills).map(([name, each]) => [name, linked(gl, EVERYWHERE, each)]));
+    const ofFrames = { MISSED, INNER, FADED, POWER, VALID_GREY, PAIR };
+    const ofViews = { COARSE, BLUR_ROWS, BLUR_COLUMNS, CARRY, CORRECT, ALIKE, TOGETHER };
+    const fills = Object.entries({ ...ofFrames, ...ofViews });
+    this.programs = Object.fromEntries(fills.map(([name, each]) => [name, linked(gl, EVERYWHERE, each)]));
     this.programs.RESIDUAL = linked(gl, ABOVE_NOISE, RESIDUAL);
     this.programs.GATHER = linked(gl, GATHER, GATHERED);
     this.worker = new Worker(new URL("./flow.worker.js", import.meta.url), { type: "module" });
@@ -114,14 +116,24 @@ export class Detail {
     const points = new Points(this.drawing, this.cameras, this.programs, width, height);
     const { made } = points;
     const { halves, floats, byte, bytes } = this.kinds;
+    const whole = (kind) => made.add(kind, width, height);
     const [shown, known] = this.drawing.blendable(width, height, 2).map((each) => made.take(each));
-    const [missed, faded, shade, inner, valid, carried, pair] = [halves, halves, byte, byte, floats, floats, bytes].map((kind) => made.add(kind, width, height));
-    const sums = made.add(floats, SUMMED, SUMMED);
-    const [innerTarget, fadedTarget, sumTarget, validTarget, carriedTarget, pairTarget] = [inner, faded, sums, valid, carried, pair].map((each) => made.target(each));
-    const targets = { innerTarget, fadedTarget, sumTarget, validTarget, carriedTarget, pairTarget };
-    const [missedTarget, blendTarget] = [made.target(missed, shade), made.target(shown, known)];
-    this.ofEye = { points, shown, known, missed, faded, shade, inner, sums, valid, carried, missedTarget, blendTarget, ...targets };
-    return blendTarget;
+    const textures = { shown, known, missed: whole(halves), shade: whole(byte), inner: whole(byte), faded: whole(halves) };
+    Object.assign(textures, { sums: made.add(floats, SUMMED, SUMMED), valid: whole(floats), carried: whole(floats) });
+    const { missed, shade, inner, faded, sums, valid, carried } = textures;
+    this.ofEye = {
+      points,
+      ...textures,
+      blendTarget: made.target(shown, known),
+      missedTarget: made.target(missed, shade),
+      innerTarget: made.target(inner),
+      fadedTarget: made.target(faded),
+      sumTarget: made.target(sums),
+      validTarget: made.target(valid),
+      carriedTarget: made.target(carried),
+      pairTarget: made.target(whole(bytes)),
+    };
+    return this.ofEye.blendTarget;
   }
 
   /**

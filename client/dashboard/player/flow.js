@@ -98,7 +98,8 @@ function levelsOf(first, second, width, height, [finest, coarsest]) {
     const [across, down] = [Math.trunc(w / step), Math.trunc(h / step)];
     if (Math.min(across, down) < PATCH) break;
     const last = levels.at(-1) ?? { first, second };
-    levels.push({ w: across, h: down, first: smaller(last.first, w, h, across, down), second: smaller(last.second, w, h, across, down) });
+    const [one, other] = [last.first, last.second].map((each) => smaller(each, w, h, across, down));
+    levels.push({ w: across, h: down, first: one, second: other });
     [w, h] = [across, down];
   }
   return levels;
@@ -277,9 +278,9 @@ function dense({ w, h, first, second }, { u, v, across, down }) {
 export function opticalFlow(first, second, width, height) {
   const range = rangeOf(width, height);
   const levels = levelsOf(first, second, width, height, range);
-  if (levels.length === 0) return { w: width, h: height, u: new Float32Array(width * height), v: new Float32Array(width * height) };
-  const { w, h } = levels.at(-1);
-  let flow = { w, h, u: new Float32Array(w * h), v: new Float32Array(w * h) };
+  const none = (w, h) => ({ w, h, u: new Float32Array(w * h), v: new Float32Array(w * h) });
+  if (levels.length === 0) return none(width, height);
+  let flow = none(levels.at(-1).w, levels.at(-1).h);
   levels.reverse().forEach((level, i) => {
     if (i > 0) flow = finer(flow, level.w, level.h, 2);
     flow = dense(level, new Search(level, flow).run());
@@ -317,14 +318,15 @@ function blur(from, w, h) {
  * @returns {{w: number, h: number, flow: Float32Array}} flow: [h, w, 2] px
  */
 export function flowInCells(pictures, width, height) {
-  const [first, second, isSeen] = [new Uint8Array(width * height), new Uint8Array(width * height), new Float32Array(width * height)];
-  for (let at = 0; at < width * height; at++) {
+  const count = width * height;
+  const [first, second, isSeen] = [new Uint8Array(count), new Uint8Array(count), new Float32Array(count)];
+  for (let at = 0; at < count; at++) {
     first[at] = pictures[4 * at];
     second[at] = pictures[4 * at + 1];
     isSeen[at] = pictures[4 * at + 2] > 0 ? 1 : 0;
   }
   const { u, v } = opticalFlow(first, second, width, height);
-  for (let at = 0; at < width * height; at++) {
+  for (let at = 0; at < count; at++) {
     u[at] *= isSeen[at];
     v[at] *= isSeen[at];
   }

@@ -2,7 +2,10 @@
 
 /** This browser cannot draw the scene. */
 export class CannotDrawError extends Error {
-  /** @param {string} message @param {"kind"|"no_floats"|"too_large"|"no_worker"|"no_codec"|"context_lost"|"closed"|"outdated"} code */
+  /**
+   * @param {string} message
+   * @param {"kind"|"no_floats"|"too_large"|"no_worker"|"no_codec"|"context_lost"|"closed"|"outdated"} code
+   */
   constructor(message, code) {
     super(message);
     this.code = code;

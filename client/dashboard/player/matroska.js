@@ -65,8 +65,8 @@ export function headOf(bytes, tag) {
   if (!segment) throw new DamagedError("The recorded frames are no Matroska file.");
   const start = segment.at;
   const whole = { at: start, end: Math.min(segment.end, bytes.length) };
-  const seeks = [...inside(bytes, whole, SEEK_HEAD, SEEK)].map((each) => [SEEK_ID, SEEK_POSITION].map((id) => numberIn(bytes, each, id)));
-  const cues = seeks.find(([id]) => id === CUES);
+  const seeks = [...inside(bytes, whole, SEEK_HEAD, SEEK)];
+  const cues = seeks.find((each) => numberIn(bytes, each, SEEK_ID) === CUES);
   const tags = [...inside(bytes, whole, TAGS, TAG, SIMPLE_TAG)];
   const own = tags.find((each) => text(bytes, first(bytes, each, TAG_NAME)) === tag);
   const tracks = [...inside(bytes, whole, TRACKS, TRACK)].map((each) => {
@@ -81,7 +81,7 @@ export function headOf(bytes, tag) {
   });
   if (!cues || !own) throw new DamagedError("The recorded frames' file has no index.");
   const scaleS = (numberIn(bytes, whole, INFO, SCALE) || SCALE_NS) / 1e9;
-  return { start, cuesAt: start + cues[1], scaleS, tracks, tag: text(bytes, first(bytes, own, TAG_TEXT)) };
+  return { start, cuesAt: start + numberIn(bytes, cues, SEEK_POSITION), scaleS, tracks, tag: text(bytes, first(bytes, own, TAG_TEXT)) };
 }
 
 /** @param {Uint8Array} bytes from the cues on @param {ReturnType<headOf>} head @returns {Key[]} */

@@ -198,6 +198,7 @@ export class Player {
   }
 
   #deform(t, isTimed) {
+    if (isTimed) this.times.deformMs = 0;
     if (this.deformedAt === t) return;
     const began = performance.now();
     this.drawing.deform(patternsAt(this.table, t));

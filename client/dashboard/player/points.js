@@ -61,7 +61,8 @@ export class Points {
     this.gathered = drawing.blendable(...cells, 2).map((each) => made.take(each));
     [this.blurred, this.moved, this.corrected] = [many(4), many(2), many(2)];
     [this.depths, this.weights] = many(2);
-    [this.gatherTarget, this.blurTarget, this.movedTarget, this.correctedTarget] = [this.gathered, this.blurred, this.moved, this.corrected].map((each) => made.target(...each));
+    const drawn = [this.gathered, this.blurred, this.moved, this.corrected].map((each) => made.target(...each));
+    [this.gatherTarget, this.blurTarget, this.movedTarget, this.correctedTarget] = drawn;
     this.depthTarget = made.target(this.depths);
     this.array = gl.createVertexArray();
   }
@@ -70,7 +71,7 @@ export class Points {
     return this.width === width && this.height === height;
   }
 
-  /** @param {WebGLTexture} known @returns {Float32Array} depth in the cells' middles, first row first; 0 where nothing is solid */
+  /** Depth in the cells' middles, first row first; 0 where nothing is solid. @param {WebGLTexture} known */
   depthInCells(known) {
     const { gl } = this;
     const [w, h] = this.cells;
@@ -81,7 +82,7 @@ export class Points {
     return Float32Array.from({ length: w * h }, (_, at) => read[4 * at]);
   }
 
-  /** The motion in cells to two other times. @param {View} view @param {WebGLTexture[]} others centres @returns {WebGLTexture[]} */
+  /** The motion in cells to two times of other centres. @param {View} view @returns {WebGLTexture[]} */
   motion({ pose, lens, known, centres }, [before, after]) {
     const { gl, programs } = this;
     programs.GATHER.use({ now: centres, before, after, known }, {
@@ -123,8 +124,9 @@ export class Points {
   /** What two frames of an eye show of the points, times weights. eyes: residual, depth, pose and lens of each. */
   carry({ pose, lens, known }, eyes, moved, weights, into) {
     const [first, second] = eyes;
-    const textures = { residualBefore: first.residual, depthBefore: first.depth, movedBefore: moved[0] };
-    this.programs.CARRY.use({ known, ...textures, residualAfter: second.residual, depthAfter: second.depth, movedAfter: moved[1] }, {
+    const before = { residualBefore: first.residual, depthBefore: first.depth, movedBefore: moved[0] };
+    const after = { residualAfter: second.residual, depthAfter: second.depth, movedAfter: moved[1] };
+    this.programs.CARRY.use({ known, ...before, ...after }, {
       ...this.#seenFrom(pose, lens, eyes),
       weights: ["2f", ...weights],
     });

@@ -121,8 +121,10 @@ export class TrainingPictures {
       const found = [];
       // Its last frames may lie in the cluster that the next one begins.
       for (let at = this.starts.indexOf(this.keys[eye][place]?.at); found.length < count; at++) {
-        const blocks = blocksOf(await this.#chunk(at), this.scaleS).filter(({ number }) => number === this.numbers[eye]);
-        found.push(...blocks.map((block) => ({ ...block, frame: frameAt(block.time) })).filter((block) => block.frame >= from && block.frame < to));
+        for (const { number, time, data } of blocksOf(await this.#chunk(at), this.scaleS)) {
+          const coded = frameAt(time);
+          if (number === this.numbers[eye] && coded >= from && coded < to) found.push({ frame: coded, data });
+        }
       }
       return decoded(this.configs[eye], found);
     });
