@@ -1,17 +1,20 @@
 // A finished scene in this browser's memory: downloaded and decoded once while the service draws, then drawn here. It is
 // kept nowhere else: nothing of a patient stays in the browser's cache.
 
-import { request } from "./api.js";
+import { bodyOf, request } from "./api.js";
 import { soon } from "./events.js";
 import { insist } from "./pause.js";
 import { DamagedError } from "./player/decode.js";
-import { CannotDrawError } from "./player/draw.js";
-import { Player } from "./player/player.js";
+import { Detail } from "./player/detail.js";
+import { CannotDrawError } from "./player/gpu.js";
+import { DETAIL, Player } from "./player/player.js";
 import { graphics } from "./player/support.js";
 import { Problem } from "./problem.js";
 
 const SCENE = "scene.safetensors";
 const PARTIAL = 206;
+const UNPROCESSABLE = 422;
+const EYES = ["left", "right"];
 const MAX_SIDE_PX = 4096;
 const KEPT_AS = "intrasplat-drawing";
 /** Whether this browser draws: where it has a graphics processor, wherever it can, or never. */
@@ -80,7 +83,7 @@ export class Memory extends EventTarget {
    * Draw a view; its picture is on the image until the next one is.
    * @param {View} view
    * @param {{width: number, height: number}} room in pixels of the screen
-   * @param {{isMoving: boolean, isTimed: boolean}} how as the player's View
+   * @param {{isMoving: boolean, isTimed: boolean, isRefined?: boolean, isOutdated?: () => boolean}} how as the player's View
    * @returns {Promise<Picture>}
    */
   async draw(view, room, how) {
@@ -105,6 +108,7 @@ export class Memory extends EventTarget {
       camera: { ...cameras.resized(size.width, size.height), world_from_camera: pose.slice(0, 3).flat() },
       way: "memory",
       isMoving: how.isMoving,
+      hasDetail: drawn.hasDetail,
     };
   }
 
@@ -129,6 +133,7 @@ export class Memory extends EventTarget {
       canvas.addEventListener("webglcontextlost", () => {
         if (this.player === player) this.giveUp(new CannotDrawError("The GPU has dropped the scene.", "context_lost"));
       });
+      if (player.hasDetail) player.takeDetail(() => Detail.of(player, picturesOf(scene, files.manifest)));
       this.player = player;
       this.loading = null;
       this.#tell();
@@ -171,6 +176,29 @@ async function download(id, signal, onShare) {
   const got = { tag: "", length: 0, parts: [] };
   await patiently(() => goOn(`${path}${SCENE}`, got, signal, () => onShare(got.length / bytes)));
   return { manifest, scene: await new Blob(got.parts).arrayBuffer() };
+}
+
+/** @returns {import("./player/trainingpictures.js").Source} */
+function picturesOf(id, manifest) {
+  const count = manifest.world_from_camera.length;
+  return {
+    bytes: manifest.beside[DETAIL].bytes,
+    async read(first, end, signal) {
+      const headers = { Range: `bytes=${first}-${end - 1}` };
+      const response = await request(`/scenes/${id}/files/${DETAIL}`, { signal, headers });
+      const bytes = new Uint8Array(await bodyOf(response, "arrayBuffer"));
+      return response.status === PARTIAL ? bytes : bytes.subarray(first, end);
+    },
+    async mask(eye, frame, signal) {
+      const query = new URLSearchParams({ t: String(frame / count), eye: EYES[eye], masks: "only" });
+      try {
+        return await bodyOf(await request(`/scenes/${id}/recorded?${query}`, { signal }), "blob");
+      } catch (error) {
+        if (error.status === UNPROCESSABLE) return null; // nothing is masked
+        throw error;
+      }
+    },
+  };
 }
 
 /** Download what is left of a file. */

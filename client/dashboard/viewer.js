@@ -24,10 +24,10 @@ const COARSE = "coarse";
 /**
  * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own, of the eye;
  * camera: null where it is not known, as of recorded frames; way: how the picture came; isMoving: it was drawn at once, perhaps
- * with its Gaussians sorted for the view before, and an exact picture follows.
+ * with its Gaussians sorted for the view before, and an exact picture follows; hasDetail: this browser added that of recorded frames.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
  *   highlights: "on"|"off", light: "steady"|"recorded", state: "running"|"done", way: "stream"|"single"|"memory",
- *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null, isMoving: boolean}} Shown
+ *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null, isMoving: boolean, hasDetail: boolean}} Shown
  */
 /** Not a layer of the model, but what the endoscope saw. */
 const RECORDED = "recorded";
@@ -201,7 +201,7 @@ export class Viewer extends EventTarget {
       this.pace.note();
       if (!picture.isRecorded) this.clip.follow(picture);
       this.#present(picture, image, view, name, began);
-      if (isDrawnHere) await this.#refine(view, visit, name);
+      if (isDrawnHere) await this.#refine(view, visit, name, picture.hasDetail);
       else if (picture.state === "done") this.memory.want(view);
     } catch (error) {
       if (visit !== this.visit) return;
@@ -218,12 +218,16 @@ export class Viewer extends EventTarget {
 
   /** Draw a view here: at once while it moves, and once more, exactly, when it rests. */
   async #draw(view) {
-    const { clientWidth, clientHeight } = this.parts.stage;
-    const room = { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio };
     const { isMoving } = this;
     clearTimeout(this.resting);
     if (isMoving && !this.timeline.isPlaying) this.resting = setTimeout(() => this.refresh(), 2 * REST_MS);
-    return this.memory.draw(view, room, { isMoving, isTimed: this.way.isOpen });
+    return this.memory.draw(view, this.#room, { isMoving, isTimed: this.way.isOpen });
+  }
+
+  /** In pixels of the screen. */
+  get #room() {
+    const { clientWidth, clientHeight } = this.parts.stage;
+    return { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio };
   }
 
   /** Put a view's picture on the screen, and say what it shows. began: when it was asked for. */
@@ -234,18 +238,30 @@ export class Viewer extends EventTarget {
     this.#tell(name, picture, performance.now() - began);
   }
 
-  /** Show the service's picture of a view that rests: only it has the detail of recorded frames. */
-  async #refine(view, visit, name) {
+  /** Show a view that rests with the detail of recorded frames; the service draws it where this browser cannot. */
+  async #refine(view, visit, name, isRefined) {
     await this.memory.player?.settled();
-    if (this.isMoving || this.isWanted || !this.memory.player?.hasDetail) return;
+    if (isRefined || this.isMoving || this.isWanted || !this.memory.player?.hasDetail) return;
     const began = performance.now();
+    const isOutdated = () => visit !== this.visit || this.isWanted;
     try {
-      const picture = judged(await this.pictures.ask(view), view);
-      const image = await createImageBitmap(picture.blob);
-      if (visit !== this.visit || this.isWanted) return;
-      this.#present(picture, image, view, name, began);
+      const picture = judged((await this.#drawRefined(view, isOutdated)) ?? (await this.pictures.ask(view)), view);
+      const image = picture.image ?? (await createImageBitmap(picture.blob));
+      if (!isOutdated()) this.#present(picture, image, view, name, began);
     } catch {
       // What is drawn here stays; #confirm() says whether the service still has the scene.
+    }
+  }
+
+  /** @returns {Promise<import("./stream.js").Picture | null>} null: this browser cannot add detail */
+  async #drawRefined(view, isOutdated) {
+    try {
+      const how = { isMoving: false, isTimed: this.way.isOpen, isRefined: true, isOutdated };
+      const picture = await this.memory.draw(view, this.#room, how);
+      return picture.hasDetail ? picture : null;
+    } catch (error) {
+      if (isOutdated()) throw error;
+      return null;
     }
   }
 
@@ -295,6 +311,6 @@ export class Viewer extends EventTarget {
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
 function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights, light = "steady" }, picture) {
-  const { t, state, way, camera, depthRangeMm, isMoving = false } = picture;
-  return { scene, t, pose, eye, layer, unseen, highlights, light, state, way, camera, depthRangeMm, isMoving };
+  const { t, state, way, camera, depthRangeMm, isMoving = false, hasDetail = false } = picture;
+  return { scene, t, pose, eye, layer, unseen, highlights, light, state, way, camera, depthRangeMm, isMoving, hasDetail };
 }

@@ -6,9 +6,11 @@ import base64
 import functools
 import http.server
 import threading
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ from numpy.typing import NDArray
 from selenium import webdriver
 
 from client.page import DASHBOARD
+from intrasplat.names import RECORDED
 from intrasplat.pose import parse_pose
+from intrasplat.scene.recorded_file import MASK
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import pose_of
 from intrasplat.view.render import render_frame
@@ -58,6 +62,16 @@ const manifest = await (await fetch(given[0] + "manifest.json")).json();
 const scene = await (await fetch(given[0] + "scene.safetensors")).arrayBuffer();
 window.player?.close();
 window.player = await Player.of({ manifest, scene }, new OffscreenCanvas(1, 1));
+if (player.hasDetail) {
+  const { Detail } = await import("/player/detail.js");
+  const video = new Uint8Array(await (await fetch(given[0] + "detail.mkv")).arrayBuffer());
+  const mask = async (eye, frame) => {
+    const answer = await fetch(`${given[0]}${["left", "right"][eye]}/${String(frame).padStart(6, "0")}.png`);
+    return answer.ok ? answer.blob() : null;
+  };
+  const source = { bytes: video.length, read: async (first, end) => video.slice(first, end), mask };
+  player.takeDetail(() => Detail.of(player, source));
+}
 return player.times;
 """
 DRAW = """
@@ -65,7 +79,7 @@ const [{ t, orbit, eye, width, height, highlights, isMarked, isTimed }] = given;
 const shown = player.cameras.shownTime(t);
 const own = eye === "right" ? player.cameras.rightEye(shown) : player.cameras.endoscope(shown);
 const pose = orbit ? player.cameras.orbit(...orbit) : own;
-const drawn = await player.draw({ t, pose, width, height, highlights, isMarked, isTimed });
+const drawn = await player.draw({ t, pose, width, height, highlights, isMarked, isTimed, isRefined: player.hasDetail });
 const pixels = player.pixels();
 let text = "";
 for (let i = 0; i < pixels.length; i += 8192) text += String.fromCharCode(...pixels.subarray(i, i + 8192));
@@ -163,7 +177,7 @@ class PlayerPage:
 
 
 class _Files(http.server.SimpleHTTPRequestHandler):
-    """The dashboard's files, and a scene's under SCENES, with the headers of the service."""
+    """The dashboard's files, and a scene's and its masks under SCENES, with the headers of the service."""
 
     def __init__(self, *arguments: Any, scene: Path) -> None:
         self._scene = scene
@@ -173,6 +187,19 @@ class _Files(http.server.SimpleHTTPRequestHandler):
         if path.startswith(SCENES):
             return str(self._scene / Path(path).name)
         return str(DASHBOARD / path.lstrip("/"))
+
+    def do_GET(self) -> None:
+        if not (self.path.startswith(SCENES) and self.path.endswith(f".{MASK}")):
+            return super().do_GET()
+        try:
+            with zipfile.ZipFile(self._scene / RECORDED) as archive:
+                content = archive.read(self.path.removeprefix(SCENES))
+        except KeyError:
+            return self.send_error(HTTPStatus.NOT_FOUND)
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
 
     def end_headers(self) -> None:
         for name, value in ANSWER_HEADERS.items():

@@ -15,7 +15,8 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.clip import Eye as ClipEye
 from intrasplat.names import RECORDED, Eye
-from intrasplat.view.recorded import EYES, zipped_frames
+from intrasplat.scene.recorded_file import EYES
+from intrasplat.view.recorded import recorded_files
 from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
 from tests.client.test_theatre_in_browser import SIZES, box_of, screen_of
 from tests.client.words import say
@@ -51,8 +52,8 @@ def recorded_scene(site: Site, eyes: tuple[Eye, ...] = ("left",), *, masks: bool
     scene = site.scene(MODEL_MARK)
     left, right = (eye_of(eye, masks=masks) for eye in EYES)
     clip = DepthClip(**left, frame_times_s=np.arange(FRAMES) / 25, right=ClipEye(**right))
-    content, kept = zipped_frames(clip, eyes)
-    (site.store.scene_folder(scene, 1) / RECORDED).write_bytes(content)
+    files, kept = recorded_files(clip, eyes, ())
+    (site.store.scene_folder(scene, 1) / RECORDED).write_bytes(files[RECORDED] or b"")
     site.store.add_scores(WORKER, scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"recorded": kept}))
     return scene
 

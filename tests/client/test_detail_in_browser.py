@@ -1,43 +1,78 @@
-"""A browser that draws scenes by itself shows the service's picture, with detail, as soon as the view rests."""
+"""A page that draws scenes adds the detail of recorded frames; where it cannot, the service's picture follows."""
 
 from __future__ import annotations
 
-import zipfile
-from io import BytesIO
+import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
+from selenium import webdriver
 
 from contract.store.store import Store
-from intrasplat.names import DETAIL, RECORDED
-from intrasplat.scene.recorded_file import name_of
-from intrasplat.scene.training_pictures import RecordedEye, encoded
-from tests.client.drawn import opened, picture_of, render_of
-from tests.client.page import site_at
+from intrasplat.names import DETAIL, RECORDED, REPORT
+from intrasplat.report import Report
+from tests.client.drawn import Drawn, beside_the_service, opened, picture_of, render_of
+from tests.client.page import Site, site_at
 from tests.client.player import drawing_browser
 from tests.client.test_player import scattered
+from tests.client.test_player_detail import stored
 from worker.views import Views
 
+WITHOUT_WEBCODECS = "delete window.VideoDecoder;"
 
-def test_a_view_that_rests_gets_detail_from_the_service(tmp_path: Path) -> None:
-    model, archive = scattered(14, moves=True), BytesIO()
-    lens = model.intrinsics
-    white = np.full((lens.height, lens.width, 3), 250, np.uint8)
-    video = encoded(model.trained_frames, [RecordedEye(lens, np.eye(4))], lambda eye, frame: white)
-    assert video is not None
-    with zipfile.ZipFile(archive, "w") as recorded:
-        recorded.writestr(name_of("left", 0, "jpg"), b"")
-    beside = {DETAIL: video, RECORDED: archive.getvalue()}
-    views = Views(Store(tmp_path / "data"))
-    with drawing_browser() as driver, site_at(tmp_path / "data", views.answer) as site:
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[webdriver.Chrome]:
+    with drawing_browser() as driver:
         driver.set_window_size(640, 480)  # a processor draws few pixels
+        yield driver
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with site_at(tmp_path / "data", Views(Store(tmp_path / "data")).answer) as site:
+        yield site
+
+
+def view_with_detail(site: Site, page: Drawn, folder: Path, *, is_damaged: bool = False) -> None:
+    """A scene with recorded frames that the page draws by itself."""
+    model = dataclasses.replace(scattered(14, moves=True), trained_t=(0.0, 1 / 3, 2 / 3))
+    scene = stored(folder, model, 2)
+    beside = {name: (folder / name).read_bytes() for name in (DETAIL, RECORDED)}
+    if is_damaged:
+        beside[DETAIL] = beside[DETAIL][:3000] + bytes(len(beside[DETAIL]) - 3000)
+    name = site.scene(model=scene, beside=beside)
+    path = site.store.scene_folder(name, 1) / REPORT
+    report = Report.model_validate_json(path.read_text())
+    path.write_text(report.model_copy(update={"frame_count": scene.frame_count}).model_dump_json())
+    page.press(name, "View")
+    page.choose_way("always")
+    page.until_way("memory", "")
+
+
+def test_a_view_that_rests_gets_detail_from_the_page(site: Site, driver: webdriver.Chrome, tmp_path: Path) -> None:
+    with opened(site.url, driver) as page:
+        view_with_detail(site, page, tmp_path / "made")
+        for wish in ({"t": 0.3, "pose": None}, {"t": 0.5, "pose": "orbit:5,-3,1"}):
+            page.look(**wish)
+            page.until(lambda: page.shown.get("t") == wish["t"] and page.shown["hasDetail"])  # noqa: B023
+            beside_the_service(site, page)
+
+
+@pytest.mark.parametrize("lack", ["no_codec", "damaged"])
+def test_where_the_page_cannot_the_services_picture_follows(
+    site: Site, driver: webdriver.Chrome, tmp_path: Path, lack: str
+) -> None:
+    source = WITHOUT_WEBCODECS if lack == "no_codec" else ""
+    script = driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
+    try:
         with opened(site.url, driver) as page:
-            page.press(site.scene(model=model, beside=beside), "View")
-            page.choose_way("always")
-            page.until_way("memory", "")
+            view_with_detail(site, page, tmp_path / "made", is_damaged=lack == "damaged")
             page.look(t=0.3)
             page.until(lambda: page.shown.get("t") == 0.3 and page.shown.get("way") in ("stream", "single"))
             shown = picture_of(page).mean()
             assert page.way == ("memory", "")  # what moves is drawn here
             assert shown == pytest.approx(render_of(site.url, page.shown).mean(), abs=2.0)
+    finally:
+        driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)

@@ -18,6 +18,14 @@ const MAX_JUDGED_PIXELS = 2 ** 21;
 /** @typedef {{poses: Matrix[], frameTimesS: number[], trainedFrames: number[]}} Recording */
 
 const dot = (a, b) => a.reduce((sum, each, i) => sum + each * b[i], 0);
+const column = (m, j) => m.map((row) => row[j]);
+/** @param {Matrix} a @param {Matrix} b both 4 x 4 @returns {Matrix} */
+export const times = (a, b) => a.map((row) => [0, 1, 2, 3].map((j) => dot(row, column(b, j))));
+/** @param {Matrix} pose a rotation and a shift @returns {Matrix} */
+export function inverse(pose) {
+  const [turned, centre] = [[0, 1, 2].map((j) => column(pose, j).slice(0, 3)), centreOf(pose)];
+  return [...turned.map((row) => [...row, -dot(row, centre)]), [0, 0, 0, 1]];
+}
 const centreOf = (pose) => pose.slice(0, 3).map((row) => row[3]);
 
 /** A scene's manifest, as far as cameras need it. */
@@ -27,6 +35,7 @@ export class Cameras {
     this.poses = manifest.world_from_camera;
     this.frameTimesS = manifest.frame_times_s;
     this.frameCount = this.poses.length;
+    this.trainedTimes = manifest.trained_t;
     this.trainedFrames = manifest.trained_t.map((t) => Math.round(t * this.frameCount));
     this.intrinsics = manifest.intrinsics;
     this.unitsPerMm = manifest.units_per_mm;
@@ -149,11 +158,12 @@ export class Cameras {
 
   /** @param {Matrix} pose @returns {Matrix} three rows that turn places in units into the camera's axes */
   cameraFromWorld(pose) {
-    const centre = centreOf(pose);
-    return [0, 1, 2].map((i) => {
-      const row = [0, 1, 2].map((j) => pose[j][i]);
-      return [...row, -dot(row, centre) * this.unitsPerMm];
-    });
+    return this.inUnits(inverse(pose));
+  }
+
+  /** @param {Matrix} rows of a rotation and a shift in mm @returns {Matrix} three rows, the shift in units */
+  inUnits(rows) {
+    return rows.slice(0, 3).map((row) => [...row.slice(0, 3), row[3] * this.unitsPerMm]);
   }
 
   /** @param {Matrix} pose @returns {number} distance from the nearest trained pose, in median depths */

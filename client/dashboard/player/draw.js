@@ -1,5 +1,6 @@
 // A scene on the GPU, drawn by WebGL2: deformed once for each time, blended for each view.
 
+import { CannotDrawError, fillTarget, linked, matrix, padded, target, texture } from "./gpu.js";
 import { STATE } from "./pack.js";
 import { ADD, ALONG, BLEND, DEFORM, EVERYWHERE, MISSING, NUMBERS_ROW, ROW, SHOW, SPLAT, SUMS } from "./shaders.js";
 import { halfEven } from "./trust.js";
@@ -8,15 +9,6 @@ import { halfEven } from "./trust.js";
 const SMOOTHED_SHARE = 1 / 128;
 const STRIPE_SHARE = 1 / 96;
 const TELL_EVERY_MS = 250;
-
-/** This browser cannot draw the scene. */
-export class CannotDrawError extends Error {
-  /** @param {string} message @param {"kind"|"no_floats"|"too_large"|"no_worker"|"context_lost"|"closed"} code */
-  constructor(message, code) {
-    super(message);
-    this.code = code;
-  }
-}
 
 export class Drawing {
   /**
@@ -113,27 +105,26 @@ export class Drawing {
   }
 
   /**
-   * Draw what deform() and arrange() prepared.
+   * Blend what deform() and arrange() prepared.
    * @param {number[][]} cameraFromWorld three rows, units
    * @param {import("./camera.js").Intrinsics} lens of the picture's size
    * @param {[number, number]} shine side and dim
    * @param {import("./camera.js").Enlargement} enlargement
-   * @param {boolean} isMarked whether what no frame saw is hatched
+   * @param {WebGLFramebuffer | null} into a target of that size; null: what show() shows
    */
-  draw(cameraFromWorld, lens, shine, enlargement, isMarked) {
+  blend(cameraFromWorld, lens, shine, enlargement, into = null) {
     const { gl } = this;
-    this.#resize(lens.width, lens.height);
-    const columns = [0, 1, 2, 3].flatMap((j) => [...cameraFromWorld.map((row) => row[j]), j === 3 ? 1 : 0]);
+    if (into === null) this.#resize(lens.width, lens.height);
     const [place, turn, size, colour] = this.states;
     this.blender.use({ place, turn, size, colour, values: this.values }, {
-      cameraFromWorld: ["Matrix4fv", false, new Float32Array(columns)],
+      cameraFromWorld: matrix(cameraFromWorld),
       lens: ["4f", lens.fx, lens.fy, lens.cx, lens.cy],
       picture: ["2f", lens.width, lens.height],
       shine: ["2f", ...shine],
       enlarged: ["2f", ...enlargement.enlarged],
       recorded: ["4f", ...enlargement.recorded],
     });
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into ?? this.blendTarget);
     gl.viewport(0, 0, lens.width, lens.height);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -143,10 +134,14 @@ export class Drawing {
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.visible);
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
-    this.#show(isMarked);
   }
 
-  #show(isMarked) {
+  /**
+   * Show what is blended.
+   * @param {boolean} isMarked whether what no frame saw is hatched
+   * @param {WebGLTexture | null} added to the colours
+   */
+  show(isMarked, added = null) {
     const { gl } = this;
     const [width, height] = this.size;
     const reach = ["1i", halfEven((width * SMOOTHED_SHARE) / 2)];
@@ -154,7 +149,8 @@ export class Drawing {
     fillTarget(gl, this.foundTarget, width, height);
     this.along.use({ found: this.found }, { reach });
     fillTarget(gl, this.alongTarget, width, height);
-    this.shower.use({ shown: this.blended[0], along: this.counted }, {
+    this.shower.use({ shown: this.blended[0], along: this.counted, added: added ?? this.blended[0] }, {
+      isAdded: ["1i", added === null ? 0 : 1],
       reach,
       stripe: ["1i", Math.max(2, halfEven(width * STRIPE_SHARE))],
       isMarked: ["1i", isMarked ? 1 : 0],
@@ -173,14 +169,20 @@ export class Drawing {
     this.canvas.height = height;
     this.size = [width, height];
     const bytes = () => texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
-    const type = this.colourFormat === gl.RGBA32F ? gl.FLOAT : gl.HALF_FLOAT;
-    this.blended = [0, 1].map(() => texture(gl, this.colourFormat, width, height, gl.RGBA, type, null));
+    this.blended = this.blendable(width, height, 2);
     [this.found, this.counted] = [bytes(), bytes()];
     this.finals = [bytes(), bytes()];
     this.blendTarget = target(gl, this.blended);
     this.foundTarget = target(gl, [this.found]);
     this.alongTarget = target(gl, [this.counted]);
     this.finalTarget = target(gl, this.finals);
+  }
+
+  /** @returns {WebGLTexture[]} in which sums can be made */
+  blendable(width, height, count) {
+    const { gl, colourFormat } = this;
+    const type = colourFormat === gl.RGBA32F ? gl.FLOAT : gl.HALF_FLOAT;
+    return Array.from({ length: count }, () => texture(gl, colourFormat, width, height, gl.RGBA, type, null));
   }
 
   #free() {
@@ -240,77 +242,25 @@ export class Drawing {
     return this.told;
   }
 
+  /** What the target that was drawn into last shows, as soon as it is drawn. @returns {Promise<Uint8Array>} [height, width, 4] */
+  async read(width, height) {
+    const { gl } = this;
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, 4 * width * height, gl.STREAM_READ);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    await this.settled();
+    const pixels = new Uint8Array(4 * width * height);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, pixels);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    gl.deleteBuffer(buffer);
+    return pixels;
+  }
+
   /** Give the GPU's memory back. */
   close() {
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
-}
-
-function padded(data, length) {
-  if (data.length === length) return data;
-  const wide = new data.constructor(length);
-  wide.set(data);
-  return wide;
-}
-
-function texture(gl, internal, width, height, format, type, data) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, data);
-  for (const each of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, each, gl.NEAREST);
-  return made;
-}
-
-function target(gl, textures) {
-  const made = gl.createFramebuffer();
-  gl.bindFramebuffer(gl.FRAMEBUFFER, made);
-  const places = textures.map((each, i) => {
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, each, 0);
-    return gl.COLOR_ATTACHMENT0 + i;
-  });
-  gl.drawBuffers(places);
-  if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
-    throw new CannotDrawError("This GPU has no memory or no format for the picture.", "too_large");
-  }
-  return made;
-}
-
-function fillTarget(gl, frame, width, height) {
-  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-  gl.viewport(0, 0, width, height);
-  gl.drawArrays(gl.TRIANGLES, 0, 3);
-}
-
-/** A program; use() binds textures and sets uniforms by name. */
-function linked(gl, vertex, fragment) {
-  const program = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-  }
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
-    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
-    throw new CannotDrawError(`A program of the page does not compile here. ${logs.join(" ")}`, "no_floats");
-  }
-  const places = new Map();
-  const placeOf = (name) => {
-    if (!places.has(name)) places.set(name, gl.getUniformLocation(program, name));
-    return places.get(name);
-  };
-  return {
-    attribute: (name) => gl.getAttribLocation(program, name),
-    use(textures, uniforms) {
-      gl.useProgram(program);
-      Object.entries(textures).forEach(([name, each], unit) => {
-        gl.activeTexture(gl.TEXTURE0 + unit);
-        gl.bindTexture(gl.TEXTURE_2D, each);
-        gl.uniform1i(placeOf(name), unit);
-      });
-      gl.activeTexture(gl.TEXTURE0 + 15); // where textures are filled, so that none in use is replaced
-      for (const [name, [kind, ...values]] of Object.entries(uniforms)) gl[`uniform${kind}`](placeOf(name), ...values);
-    },
-  };
 }

@@ -2,7 +2,8 @@
 
 import { Cameras } from "./camera.js";
 import { DamagedError } from "./decode.js";
-import { CannotDrawError, Drawing } from "./draw.js";
+import { Drawing } from "./draw.js";
+import { CannotDrawError } from "./gpu.js";
 import { patternsAt } from "./motion.js";
 import { readTable } from "./table.js";
 
@@ -14,17 +15,21 @@ const ROUNDING = 1e-6;
 /** What a scene stores of the light and the smoke in which it was recorded, where the model's differ; not drawn here. */
 const RECORDED_LIGHT = ["log_gains", "vignetting", "veil"];
 const SCENE = "scene.safetensors";
-/** The recorded frames from which the service takes detail (intrasplat/names.py). */
-const DETAIL = "detail.mkv";
+/** The recorded frames from which views take detail (intrasplat/names.py). */
+export const DETAIL = "detail.mkv";
+/** A view that moves gets detail if that takes no longer. */
+const MAX_DETAIL_MS = 60;
 
 /**
  * What is shown: pose is world_from_camera, rows, in mm. isMoving: draw at once, sorted as the view before, if need be.
- * isTimed: wait for the GPU, and tell what each part of the work takes.
+ * isTimed: wait for the GPU, and tell what each part of the work takes. isRefined: with detail, however long that takes;
+ * else where it is quick and its pictures are there. isOutdated: whether another view is wished for, which ends isRefined.
  * @typedef {{t: number, pose: number[][], width: number, height: number, highlights?: boolean, isMarked?: boolean,
- *   isMoving?: boolean, isTimed?: boolean}} View
+ *   isMoving?: boolean, isTimed?: boolean, isRefined?: boolean, isOutdated?: () => boolean}} View
  */
+/** @typedef {import("./detail.js").Detail} Detail */
 /** @typedef {{code: string, text: string}} Notice as a render's warnings */
-/** @typedef {{t: number, unseen: number, warnings: Notice[]}} Drawn */
+/** @typedef {{t: number, unseen: number, warnings: Notice[], hasDetail: boolean}} Drawn */
 
 export class Player {
   /**
@@ -64,10 +69,16 @@ export class Player {
     Object.assign(this, { table, worker, drawing, times });
     this.canvas = drawing.canvas;
     this.cameras = new Cameras(manifest);
-    this.poseWarnings = manifest.settings?.pose_warnings ?? [];
-    /** Whether the service's pictures have more detail than those drawn here. */
+    this.settings = manifest.settings ?? {};
+    this.poseWarnings = this.settings.pose_warnings ?? [];
+    /** Whether recorded frames are stored, from which views take detail. */
     this.hasDetail = manifest.beside?.[DETAIL] !== undefined;
-    this.hasRecordedLight = RECORDED_LIGHT.some((name) => manifest.settings?.[name] !== undefined);
+    this.hasRecordedLight = RECORDED_LIGHT.some((name) => this.settings[name] !== undefined);
+    /** @type {Promise<Detail> | null} */
+    this.opening = null;
+    /** @type {Detail | null} */
+    this.detail = null;
+    this.detailMs = Infinity; // that a view takes with detail
     this.isClosed = false;
     /** Broken when the scene is let go of: a worker that has ended answers nobody. */
     this.closing = new Promise((_, reject) => (this.reject = reject));
@@ -79,34 +90,92 @@ export class Player {
   }
 
   /**
+   * Add detail to views as soon as it can be computed.
+   * @param {() => Promise<Detail>} open from the scene's recorded frames
+   */
+  takeDetail(open) {
+    this.opening = open().then((detail) => {
+      if (this.isClosed) detail.close();
+      return (this.detail = detail);
+    });
+    this.opening.catch(() => {}); // draw() tells of it, if it is asked to refine
+  }
+
+  /**
    * Draw a view; its picture is on the canvas when the promise is kept.
    * @param {View} view
    * @returns {Promise<Drawn>}
    */
   async draw(view) {
+    let began = performance.now();
     const t = this.cameras.shownTime(view.t);
-    const rows = this.cameras.cameraFromWorld(view.pose);
+    const hasDetail = await this.#prepareDetail(view, t);
+    if (hasDetail && !view.isMoving) {
+      await this.settled(); // residuals stay: what they take does not count
+      began = performance.now();
+    }
+    await this.#arrange(t, this.cameras.cameraFromWorld(view.pose), view.isMoving);
+    this.#deform(t, view.isTimed);
+    const deformed = performance.now();
+    const lens = this.cameras.resized(view.width, view.height);
+    this.#blend(t, view.pose, lens, view.highlights !== false);
+    const added = hasDetail ? this.detail.add(t, view.pose, lens) : null;
+    this.drawing.show(view.isMarked !== false, added);
+    if (hasDetail) {
+      await this.settled();
+      const ms = performance.now() - began;
+      this.detailMs = view.isMoving ? (this.detailMs + ms) / 2 : ms;
+    }
+    if (view.isTimed) {
+      this.drawing.finish();
+      this.times.drawMs = performance.now() - deformed;
+    }
+    const { unseen, hardlySeen } = this.drawing.shares(!view.isMoving);
+    return { t, unseen, warnings: this.#warnings(view, t, unseen, hardlySeen), hasDetail };
+  }
+
+  /** Have the residuals of a view. @returns {Promise<boolean>} whether they are there */
+  async #prepareDetail(view, t) {
+    if (view.isRefined) await this.opening;
+    const { detail } = this;
+    if (detail === null || !(view.isRefined || this.detailMs < MAX_DETAIL_MS)) return false;
+    const { residuals, flows } = detail.wanted(t, view.pose);
+    const { pictures } = detail;
+    if (view.isMoving) for (const { eye, frame } of residuals) pictures.ahead(eye, frame);
+    const missing = residuals.filter((each) => !detail.has(each));
+    const found = view.isRefined
+      ? await Promise.all(missing.map(({ eye, frame }) => pictures.load(eye, frame)))
+      : missing.map(({ eye, frame }) => pictures.at(eye, frame));
+    if (found.includes(null)) return false;
+    for (const [place, { eye, frame }] of missing.entries()) {
+      if (view.isOutdated?.()) throw new CannotDrawError("Another view is wished for.", "outdated");
+      const then = frame / this.cameras.frameCount;
+      const pose = detail.eyePose(eye, then);
+      await this.#arrange(then, this.cameras.cameraFromWorld(pose), false);
+      this.#deform(then);
+      this.#blend(then, pose, pictures.eyes[eye].lens, true, detail.ownTarget(eye));
+      detail.measure({ eye, frame }, found[place]);
+    }
+    for (const pair of flows) await Promise.race([detail.find(pair), this.closing]);
+    return true;
+  }
+
+  /** Have the Gaussians sorted for a camera; mayLag: perhaps as they were for the view before. */
+  async #arrange(t, rows, mayLag) {
     const key = JSON.stringify([t, rows[2]]);
     if (key !== this.sortedFor) {
-      const mayLag = view.isMoving && this.sortedFor !== "";
-      if (!mayLag) {
+      if (!mayLag || this.sortedFor === "") {
         while (this.sorting) await this.sorting;
         if (key !== this.sortedFor) await this.#sort(key, t, rows[2]);
       } else if (!this.sorting) this.#sort(key, t, rows[2]).catch(() => {}); // the next still picture tells of it
     }
     if (this.isClosed) throw new CannotDrawError("The scene is closed.", "closed");
-    this.#deform(t, view.isTimed);
-    const began = performance.now();
-    const shine = this.cameras.gloss(t, view.pose, view.highlights !== false);
-    const lens = this.cameras.resized(view.width, view.height);
-    const enlargement = this.cameras.enlargement(t, view.pose, lens);
-    this.drawing.draw(rows, lens, shine, enlargement, view.isMarked !== false);
-    if (view.isTimed) {
-      this.drawing.finish();
-      this.times.drawMs = performance.now() - began;
-    }
-    const { unseen, hardlySeen } = this.drawing.shares(!view.isMoving);
-    return { t, unseen, warnings: this.#warnings(view, t, unseen, hardlySeen) };
+  }
+
+  #blend(t, pose, lens, highlights, into = null) {
+    const shine = this.cameras.gloss(t, pose, highlights);
+    const enlargement = this.cameras.enlargement(t, pose, lens);
+    this.drawing.blend(this.cameras.cameraFromWorld(pose), lens, shine, enlargement, into);
   }
 
   /** Kept when the GPU has drawn the last picture; to draw the next one sooner would only queue it. */
@@ -124,10 +193,12 @@ export class Player {
     this.isClosed = true;
     this.reject(new CannotDrawError("The scene is closed.", "closed"));
     this.worker.terminate();
+    this.detail?.close();
     this.drawing.close();
   }
 
   #deform(t, isTimed) {
+    if (isTimed) this.times.deformMs = 0;
     if (this.deformedAt === t) return;
     const began = performance.now();
     this.drawing.deform(patternsAt(this.table, t));

@@ -6,7 +6,7 @@ export const ROW = 512;
 /** Texels in a row of the texture of motion numbers. */
 export const NUMBERS_ROW = 4096;
 
-const HEAD = `#version 300 es
+export const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -166,9 +166,9 @@ void main() {
 
 /** Down a column: what most pixels around are decides. Then the picture, with its hatch if unseen is marked. */
 export const SHOW = `${HEAD}
-uniform sampler2D shown, along;
+uniform sampler2D shown, along, added;
 uniform int reach, stripe;
-uniform bool isMarked;
+uniform bool isMarked, isAdded;
 layout(location = 0) out vec4 picture;
 layout(location = 1) out vec4 told;    // unseen, hardly trusted
 const float DARK = 40.0 / 255.0, LIGHT = 74.0 / 255.0;
@@ -180,7 +180,9 @@ void main() {
     count += int(texelFetch(along, ivec2(at.x, y > last ? 2 * last - y : y), 0).r * 255.0 + 0.5);
   }
   bool isUnseen = 2 * count > side * side;
-  vec3 rgb = clamp(texelFetch(shown, at, 0).rgb, 0.0, 1.0);
+  vec3 rgb = texelFetch(shown, at, 0).rgb;
+  if (isAdded) rgb += texelFetch(added, at, 0).rgb;
+  rgb = clamp(rgb, 0.0, 1.0);
   if (isUnseen && isMarked) rgb = vec3(((last - at.y + at.x) / stripe) % 2 == 1 ? LIGHT : DARK);
   picture = vec4(rgb, 1.0);
   told = vec4(isUnseen ? 1.0 : 0.0, isUnseen ? 0.0 : texelFetch(along, at, 0).g, 0.0, 1.0);

@@ -1,7 +1,7 @@
 // The table of a scene, decoded by several workers at a time.
 
 import { DamagedError, groupsOf, partsOf, PARTS } from "./decode.js";
-import { CannotDrawError } from "./draw.js";
+import { CannotDrawError } from "./gpu.js";
 import { tensorsOf } from "./safetensors.js";
 
 /** Channels that move: place, shape; with colour; with gloss. */
