@@ -1,0 +1,219 @@
+"""Follower: a model that follows a feed, pair by pair, and shows its newest moment and its past.
+
+A pair is rectified and matched; optical flow carries the Gaussians to it; a few steps of training teach it, half of
+them on it and half on frames of the window (window.py). Every S used frames the oldest S become a segment, a scene of
+its own that does not change any more.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from threading import Lock
+
+import numpy as np
+
+from intrasplat.clip import DepthClip
+from intrasplat.errors import InputError, TrainingDiverged
+from intrasplat.fusion import FusionSettings, fuse
+from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.live.eyes import EyesSettings, LiveEyes
+from intrasplat.live.motion import FlowStart
+from intrasplat.live.pair import FeedPair
+from intrasplat.live.window import Moment, Window
+from intrasplat.machine.hooks import ignore
+from intrasplat.machine.opencv import one_opencv_thread
+from intrasplat.methods.fast import INSTANT
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.backend import CPU, Device
+from intrasplat.splat.layout import COLOUR, MEAN
+from intrasplat.splat.optimize import rates_at
+from intrasplat.train.loop import check_sums
+from intrasplat.train.start import start_gaussians, stride_for
+from intrasplat.train.targets import units_per_mm
+
+MIN_DEPTH_SHARE = 0.05
+"""A pair is not used if a smaller share of its picture is tissue with depth."""
+MIN_STEPS = 2
+"""Steps that a pair gets, however short the time is."""
+
+
+class Added(StrEnum):
+    """What became of a pair."""
+
+    FIRST = "first"
+    FOLLOWED = "followed"
+    NO_SCENE = "no_scene"
+    """It shows too little tissue with depth, or nothing that the eyes can be registered by."""
+    RESTARTED = "restarted"
+    """Training diverged; the model began anew with this pair."""
+
+
+@dataclass(frozen=True)
+class FollowSettings:
+    """How a feed is followed.
+
+    eyes             how pairs are read
+    segment_frames   S, used frames of a segment; the window has S to 2 S of them
+    points           Gaussians that the first frame starts with, about
+    steps            steps of training for each pair; None: as many as fit into the time that add() is given
+    first_steps      steps for the first pair, if steps are given
+    opening          steps in which the rates fall from a clip's first ones to `progress`
+    progress         of a schedule, whose rates the steps have
+    keep_s           seconds of the past that are kept as segments
+    seed             of the order of frames
+    """
+
+    eyes: EyesSettings = field(default_factory=EyesSettings)
+    segment_frames: int = 8
+    points: int = 10_000
+    steps: int | None = None
+    first_steps: int = 30
+    opening: int = 100
+    progress: float = 0.5
+    keep_s: float = 20.0
+    seed: int = 0
+
+
+class Follower:
+    """Follows one feed. One thread calls add(); any thread asks for scenes.
+
+    on_segment is called with every segment as the thread of add() writes it off.
+    """
+
+    def __init__(
+        self,
+        calibration: RectifiedCalibration | RawCalibration,
+        settings: FollowSettings | None = None,
+        device: Device = CPU,
+        on_segment: Callable[[TrainedScene], None] = ignore,
+    ) -> None:
+        self.settings = settings or FollowSettings()
+        self.segments: deque[TrainedScene] = deque()
+        self.used = 0
+        self.iteration = 0
+        self._calibration, self._device, self._on_segment = calibration, device, on_segment
+        self._eyes: LiveEyes | None = None
+        self._window: Window | None = None
+        self._lock = Lock()
+        self._scene: tuple[int, TrainedScene] | None = None
+
+    @property
+    def newest(self) -> Moment | None:
+        """The newest moment that the model knows; None: none so far."""
+        return None if self._window is None else self._window.newest
+
+    def add(self, pair: FeedPair, budget_s: float = 0.2) -> Added:
+        """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
+
+        Raises:
+            InputError: its pictures have another size than those before, or the calibration does not fit them.
+        """
+        end_s = time.perf_counter() + budget_s
+        with one_opencv_thread():
+            clip = self.read(pair)
+            if clip is None:
+                return Added.NO_SCENE
+            first = self._window is None
+            if self._window is None:
+                self._start(clip, pair)
+            else:
+                self._go_on(self._window, clip, pair)
+        try:
+            self._train(end_s, self.settings.first_steps if first else self.settings.steps)
+        except TrainingDiverged:
+            with one_opencv_thread():
+                self._start(clip, pair)
+            return Added.RESTARTED
+        return Added.FIRST if first else Added.FOLLOWED
+
+    def read(self, pair: FeedPair) -> DepthClip | None:
+        """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
+        if self._eyes is None:
+            try:
+                self._eyes = LiveEyes(self._calibration, self.settings.eyes, pair.left, pair.right)
+            except InputError:  # TODO tell a calibration that cannot fit from a picture that shows nothing
+                return None
+        clip = self._eyes.moment(pair.left, pair.right, pair.source_s)
+        known = np.count_nonzero(clip.tissue[0] & (clip.depth_mm[0] > 0))
+        return clip if known >= MIN_DEPTH_SHARE * clip.field_pixels else None
+
+    def scene_at(self, source_s: float | None = None) -> tuple[TrainedScene, float] | None:
+        """The scene that shows a second of the source's clock, and the model time t of that second in it.
+
+        None: nothing is known yet. A second before or between what is known becomes the nearest known one; source_s
+        None is the newest moment.
+        """
+        scene = self._current()
+        if scene is None:
+            return None
+        if source_s is not None and source_s < scene.frame_times_s[0]:
+            earlier = [each for each in tuple(self.segments) if each.frame_times_s[0] <= source_s]
+            scene = earlier[-1] if earlier else next(iter(self.segments), scene)
+        last = scene.frame_count - 1
+        place = last if source_s is None else np.interp(source_s, scene.frame_times_s, np.arange(last + 1))
+        return scene, float(place) / scene.frame_count
+
+    def _current(self) -> TrainedScene | None:
+        """The scene of the window."""
+        with self._lock:
+            if self._window is None:
+                return None
+            if self._scene is None or self._scene[0] != self.used:
+                self._scene = self.used, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
+            return self._scene[1]
+
+    def _start(self, clip: DepthClip, pair: FeedPair) -> None:
+        """Begin a model with the clip's frame."""
+        scale = units_per_mm(clip, [0])
+        stride = stride_for(self.settings.points, clip.intrinsics)
+        cloud = fuse(clip, [0], FusionSettings(mode="fill", stride=stride), seed=self.settings.seed, right=clip.right)
+        gaussians = start_gaussians(cloud, INSTANT, scale)
+        with self._lock:
+            first = Moment.of(clip, pair, scale)
+            self._window = Window(gaussians, first, scale, self.settings.segment_frames, self._device)
+            self._flow = FlowStart(clip)
+            self.used, self.iteration = self.used + 1, 0
+
+    def _go_on(self, window: Window, clip: DepthClip, pair: FeedPair) -> None:
+        """Carry the model to the clip's frame; write a segment off where the window is full."""
+        if window.is_full:
+            self._write_off(window)
+        means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
+        moved_mm, colour = self._flow.to(clip, means_mm)
+        moment = Moment.of(clip, pair, window.scale)
+        with self._lock:
+            window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
+            self.used += 1
+
+    def _write_off(self, window: Window) -> None:
+        """Make the window's first segment a scene of the past, and forget the oldest of them."""
+        assert self._eyes is not None
+        count = self.settings.segment_frames
+        segment = window.scene(0, count + 1, seed=self.settings.seed)  # one more frame, so that no gap is between them
+        self._on_segment(segment)
+        with self._lock:
+            self.segments.append(segment)
+            while self.segments[0].frame_times_s[-1] < segment.frame_times_s[-1] - self.settings.keep_s:
+                self.segments.popleft()
+            window.give_up()
+        self._eyes.follow_range(window.newest.clip)
+
+    def _train(self, end_s: float, steps: int | None) -> None:
+        """Make the steps given or, if None, those that fit until end_s. Raises TrainingDiverged."""
+        window, made, fixed = self._window, 0, self.settings.steps is not None
+        assert window is not None
+        while made < (steps or 0) if fixed else (made < MIN_STEPS or time.perf_counter() < end_s):
+            made, iteration = made + 1, self.iteration + 1
+            slot = window.slot
+            if made % 2 == 0:
+                slot = int(np.random.default_rng([self.settings.seed, self.used, made]).integers(slot + 1))
+            progress = self.settings.progress * min(1.0, iteration / self.settings.opening)
+            rates = rates_at(INSTANT.rates, progress)
+            with self._lock:
+                sums = window.model.step(window.moments[slot].frames, INSTANT.loss, rates, iteration)
+            check_sums(sums, iteration)
+            self.iteration = iteration
