@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from threading import Lock
 
@@ -74,6 +74,9 @@ class FollowSettings:
     first_steps: int = 30
     opening: int = 100
     progress: float = 0.5
+    motion_pace: float = 1.0
+    colour_pace: float = 1.0
+    track_colour: float = 1.0
     keep_s: float = 20.0
     seed: int = 0
 
@@ -186,7 +189,7 @@ class Follower:
         moved_mm, colour = self._flow.to(clip, means_mm)
         moment = Moment.of(clip, pair, window.scale)
         with self._lock:
-            window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
+            window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour * np.float32(self.settings.track_colour))))
             self.used += 1
 
     def _write_off(self, window: Window) -> None:
@@ -213,6 +216,8 @@ class Follower:
                 slot = int(np.random.default_rng([self.settings.seed, self.used, made]).integers(slot + 1))
             progress = self.settings.progress * min(1.0, iteration / self.settings.opening)
             rates = rates_at(INSTANT.rates, progress)
+            k, kc = self.settings.motion_pace, self.settings.colour_pace
+            rates = replace(rates, motion_mean=k*rates.motion_mean, motion_quaternion=k*rates.motion_quaternion, motion_log_scale=k*rates.motion_log_scale, motion_colour=kc*rates.motion_colour, motion_gloss=kc*rates.motion_gloss)
             with self._lock:
                 sums = window.model.step(window.moments[slot].frames, INSTANT.loss, rates, iteration)
             check_sums(sums, iteration)

@@ -9,8 +9,9 @@ views-hz times a second. --pace K: every K-th pair is used and gets --steps step
 Scores are psnr_tissue in dB, of the left and the right eye, and causal: `now` is a pair before it trains, as the model
 shows the newest moment; `copy` beside it the last used pair as it is, whose left picture is warped for the right eye;
 `later` is a used pair a second after it came, `between` a pair that was not used, then. `offline` is preset instant on
-all pairs (rectified, matched and masked by the same eyes), at the used ones. flicker: root mean square over time of
-the second differences of the used frames' tissue, over the root of 6, in grey levels.
+all pairs (rectified, matched and masked by the same eyes), at the used ones. flicker: standard deviation over time, in
+grey levels, of the used frames as they are shown a second later, over the fifth of the tissue that changes least in the
+recording; beside it the recording's own, and that of `offline`.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ from lab.evaluate.sources import DATA_VARIABLE, Source, source_of
 from lab.phantom import make_phantom
 
 CLIPS = ("d4d_stereo", "phantom:breathing:72frames:stereo", "phantom:pull:72frames:stereo")
-LATER_S = 1.0
+LATER_S, RESTING_SHARE = 1.0, 0.2
 Score = tuple[float, float]
 
 
@@ -96,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.clips:
         played = played_of(source_of(name), options.fps)
         eyes = EyesSettings(width=options.width, finds_instruments=not options.no_instruments)
-        changed = {} if options.points is None else {"points": options.points}
+        changed = {name: float(value) if "." in value else int(value) for name, value in options.set}
         settings = FollowSettings(
             eyes=eyes, steps=None if options.pace == "real" else options.steps, keep_s=options.seconds, **changed
         )
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             found, follower = by_steps(played, settings, options.seconds, int(options.pace), truth)
         offline = None if options.no_offline else offline_scores(truth, played, found, options.iterations)
-        _print(name, follower, found, offline)
+        _print(name, found, _recorded(truth, played, found), offline)
 
 
 def played_of(source: Source, fps: float) -> Played:
@@ -202,7 +203,13 @@ def offline_scores(
         pictures = _shown(scene, place / len(truth), clips[place])
         shown.append(pictures[0])
         scores.append(_score(pictures, clips[place]))
-    return _mean(scores), flicker(shown, [clips[played.place(number)] for number in found.used])
+    return _mean(scores), flicker(shown, _recorded(truth, played, found))
+
+
+def _recorded(truth: Sequence[DepthClip | None], played: Played, found: Found) -> list[DepthClip]:
+    """The used frames that were shown a second later, as recorded."""
+    clips = [truth[played.place(number)] for number in found.used[: len(found.shown)]]
+    return [clip for clip in clips if clip is not None]
 
 
 def _joined(clips: Sequence[DepthClip]) -> DepthClip:
@@ -258,13 +265,14 @@ def _score(pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], clip: DepthCli
 
 
 def flicker(pictures: Sequence[NDArray[np.uint8]], clips: Sequence[DepthClip]) -> float:
-    """As the module describes it, over pixels that are tissue in three successive frames; NaN for fewer frames."""
-    found = []
-    for place in range(1, len(pictures) - 1):
-        before, here, after = (pictures[place + step].astype(np.float32) for step in (-1, 0, 1))
-        tissue = np.logical_and.reduce([clips[place + step].tissue[0] for step in (-1, 0, 1)])
-        found.append(float(np.square(before - 2 * here + after)[tissue].mean()))
-    return float(np.sqrt(np.mean(found) / 6)) if found else float("nan")
+    """As the module describes it; NaN for too few frames."""
+    recorded, shown = (np.stack(each).astype(np.float32) for each in ([clip.rgb[0] for clip in clips], pictures))
+    tissue = np.logical_and.reduce([clip.tissue[0] for clip in clips])
+    if len(shown) < 3 or not tissue.any():
+        return float("nan")
+    changes = recorded.std(0).mean(-1)
+    rests = tissue & (changes <= np.quantile(changes[tissue], RESTING_SHARE))
+    return float(shown.std(0).mean(-1)[rests].mean())
 
 
 def _mean(scores: Sequence[Score]) -> Score:
@@ -272,7 +280,9 @@ def _mean(scores: Sequence[Score]) -> Score:
     return left, right
 
 
-def _print(name: str, follower: Follower, found: Found, offline: tuple[Score, float] | None) -> None:
+def _print(
+    name: str, found: Found, recorded: Sequence[DepthClip], offline: tuple[Score, float] | None
+) -> None:
     def texts() -> Iterator[str]:
         yield name
         yield f"used {len(found.used) / found.seconds:.2f}/s, {found.steps / len(found.used):.1f} steps each"
@@ -282,9 +292,8 @@ def _print(name: str, follower: Follower, found: Found, offline: tuple[Score, fl
             yield f"{kind} {_mean(scores)[0]:.2f} {_mean(scores)[1]:.2f}"
         if offline is not None:
             yield f"offline {offline[0][0]:.2f} {offline[0][1]:.2f}, its flicker {offline[1]:.2f}"
-        newest = follower.newest
-        if newest is not None:
-            yield f"flicker {flicker(found.shown, [newest.clip] * len(found.shown)):.2f}"
+        yield f"flicker {flicker(found.shown, recorded):.2f}"
+        yield f"of the recording {flicker([clip.rgb[0] for clip in recorded], recorded):.2f}"
         yield f"rss {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
 
     print("  ".join(texts()), flush=True)
@@ -298,7 +307,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--pace", default="real")
     parser.add_argument("--steps", type=int, default=12)
-    parser.add_argument("--points", type=int)
+    parser.add_argument("--set", nargs="*", default=[], type=lambda text: text.split("="), help="FIELD=NUMBER ...")
     parser.add_argument("--budget-s", type=float, default=0.18)
     parser.add_argument("--views-hz", type=float, default=5.0)
     parser.add_argument("--iterations", type=int, default=300)
