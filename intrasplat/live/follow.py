@@ -10,18 +10,20 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from threading import Lock
 
 import numpy as np
+import torch
 
 from intrasplat.clip import DepthClip
 from intrasplat.errors import InputError, TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
 from intrasplat.live.eyes import EyesSettings, LiveEyes
-from intrasplat.live.motion import FlowStart
+from intrasplat.live.motion import Carried, FlowStart
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.window import Moment, Window
 from intrasplat.machine.hooks import ignore
@@ -75,6 +77,7 @@ class FollowSettings:
     opening: int = 100
     progress: float = 0.5
     motion_pace: float = 1.0
+    own_pace: float = 1.0
     colour_pace: float = 1.0
     track_colour: float = 1.0
     keep_s: float = 20.0
@@ -103,6 +106,9 @@ class Follower:
         self._window: Window | None = None
         self._lock = Lock()
         self._scene: tuple[int, TrainedScene] | None = None
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
+        self._rehearsed = 0
+        torch.set_num_threads(1)  # the kernels have threads of their own
 
     @property
     def newest(self) -> Moment | None:
@@ -112,26 +118,32 @@ class Follower:
     def add(self, pair: FeedPair, budget_s: float = 0.2) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
 
+        While the pair is read, the window's frames train.
+
         Raises:
             InputError: its pictures have another size than those before, or the calibration does not fit them.
         """
         end_s = time.perf_counter() + budget_s
-        with one_opencv_thread():
-            clip = self.read(pair)
-            if clip is None:
-                return Added.NO_SCENE
-            first = self._window is None
-            if self._window is None:
-                self._start(clip, pair)
-            else:
-                self._go_on(self._window, clip, pair)
+        reading = self._reader.submit(self._prepared, pair)
         try:
-            self._train(end_s, self.settings.first_steps if first else self.settings.steps)
+            self._rehearse(reading)
+            ready = reading.result()
+            if ready is None:
+                return Added.NO_SCENE
+            if self._window is None:
+                self._start(ready)
+                self._learn(end_s, self.settings.first_steps)
+                return Added.FIRST
+            self._go_on(self._window, ready)
+            self._learn(end_s, self.settings.steps)
         except TrainingDiverged:
-            with one_opencv_thread():
-                self._start(clip, pair)
+            ready = reading.result()
+            if ready is None:
+                self._window = None
+                return Added.NO_SCENE
+            self._start(ready)
             return Added.RESTARTED
-        return Added.FIRST if first else Added.FOLLOWED
+        return Added.FOLLOWED
 
     def read(self, pair: FeedPair) -> DepthClip | None:
         """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
@@ -169,27 +181,40 @@ class Follower:
                 self._scene = self.used, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
             return self._scene[1]
 
-    def _start(self, clip: DepthClip, pair: FeedPair) -> None:
-        """Begin a model with the clip's frame."""
-        scale = units_per_mm(clip, [0])
+    def _prepared(self, pair: FeedPair) -> _Ready | None:
+        """What can be computed of a pair without the model; None: it shows no scene."""
+        with one_opencv_thread():
+            clip = self.read(pair)
+            if clip is None:
+                return None
+            window = self._window
+            if window is None:
+                self._flow = FlowStart(clip)
+                scale = units_per_mm(clip, [0])
+                return _Ready(Moment.of(clip, pair, scale), scale, None)
+            return _Ready(Moment.of(clip, pair, window.scale), window.scale, self._flow.to(clip))
+
+    def _start(self, ready: _Ready) -> None:
+        """Begin a model with a frame."""
+        clip, seed = ready.moment.clip, self.settings.seed
+        scale = ready.scale
         stride = stride_for(self.settings.points, clip.intrinsics)
-        cloud = fuse(clip, [0], FusionSettings(mode="fill", stride=stride), seed=self.settings.seed, right=clip.right)
+        cloud = fuse(clip, [0], FusionSettings(mode="fill", stride=stride), seed=seed, right=clip.right)
         gaussians = start_gaussians(cloud, INSTANT, scale)
+        first = ready.moment
         with self._lock:
-            first = Moment.of(clip, pair, scale)
             self._window = Window(gaussians, first, scale, self.settings.segment_frames, self._device)
-            self._flow = FlowStart(clip)
             self.used, self.iteration = self.used + 1, 0
 
-    def _go_on(self, window: Window, clip: DepthClip, pair: FeedPair) -> None:
-        """Carry the model to the clip's frame; write a segment off where the window is full."""
+    def _go_on(self, window: Window, ready: _Ready) -> None:
+        """Carry the model to the next frame; write a segment off where the window is full."""
         if window.is_full:
             self._write_off(window)
+        assert ready.carried is not None
         means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
-        moved_mm, colour = self._flow.to(clip, means_mm)
-        moment = Moment.of(clip, pair, window.scale)
+        moved_mm, colour = ready.carried.of(means_mm)
         with self._lock:
-            window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour * np.float32(self.settings.track_colour))))
+            window.append(ready.moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
             self.used += 1
 
     def _write_off(self, window: Window) -> None:
@@ -205,20 +230,50 @@ class Follower:
             window.give_up()
         self._eyes.follow_range(window.newest.clip)
 
-    def _train(self, end_s: float, steps: int | None) -> None:
-        """Make the steps given or, if None, those that fit until end_s. Raises TrainingDiverged."""
-        window, made, fixed = self._window, 0, self.settings.steps is not None
+    def _rehearse(self, reading: Future[_Ready | None]) -> None:
+        """Train frames of the window: half the steps given or, if None, until the pair is read."""
+        steps = self.settings.steps
+        made = self._rehearsed = 0
+        if self._window is None:
+            return
+        while made < steps // 2 if steps is not None else not reading.done():
+            slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(len(self._window.moments)))
+            self._step(self._window, slot)
+            made += 1
+        self._rehearsed = made
+
+    def _learn(self, end_s: float, steps: int | None) -> None:
+        """Train the newest frame, and others in turn once it had as many steps as they."""
+        window, made = self._window, 0
         assert window is not None
-        while made < (steps or 0) if fixed else (made < MIN_STEPS or time.perf_counter() < end_s):
-            made, iteration = made + 1, self.iteration + 1
+        fixed = self.settings.steps is not None
+        rehearsed = self._rehearsed
+        while made + self._rehearsed < (steps or 0) if fixed else (made < MIN_STEPS or time.perf_counter() < end_s):
             slot = window.slot
-            if made % 2 == 0:
-                slot = int(np.random.default_rng([self.settings.seed, self.used, made]).integers(slot + 1))
-            progress = self.settings.progress * min(1.0, iteration / self.settings.opening)
-            rates = rates_at(INSTANT.rates, progress)
-            k, kc = self.settings.motion_pace, self.settings.colour_pace
-            rates = replace(rates, motion_mean=k*rates.motion_mean, motion_quaternion=k*rates.motion_quaternion, motion_log_scale=k*rates.motion_log_scale, motion_colour=kc*rates.motion_colour, motion_gloss=kc*rates.motion_gloss)
-            with self._lock:
-                sums = window.model.step(window.moments[slot].frames, INSTANT.loss, rates, iteration)
-            check_sums(sums, iteration)
-            self.iteration = iteration
+            if made - (rehearsed - self._rehearsed) > rehearsed:
+                slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(slot + 1))
+                rehearsed += 1
+            self._step(window, slot)
+            made += 1
+
+    def _step(self, window: Window, slot: int) -> None:
+        """One step on the frame in a slot. Raises TrainingDiverged."""
+        settings, iteration = self.settings, self.iteration + 1
+        progress = settings.progress * min(1.0, iteration / settings.opening)
+        rates = rates_at(INSTANT.rates, progress)
+        k, kc = self.settings.motion_pace, self.settings.colour_pace
+        rates = replace(rates, motion_mean=k*rates.motion_mean, motion_quaternion=k*rates.motion_quaternion, motion_log_scale=k*rates.motion_log_scale, motion_colour=kc*rates.motion_colour, motion_gloss=kc*rates.motion_gloss)
+        with self._lock:
+            if slot == window.slot: rates = replace(rates, **{n: self.settings.own_pace*getattr(rates,n) for n in ('mean','quaternion','log_scale','opacity','colour','gloss')})
+            sums = window.model.step(window.moments[slot].frames, INSTANT.loss, rates, iteration)
+        check_sums(sums, iteration)
+        self.iteration = iteration
+
+
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    """A pair that was read, and the motion to it; None where there is no frame before it."""
+
+    moment: Moment
+    scale: float
+    carried: Carried | None

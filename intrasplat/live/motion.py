@@ -5,10 +5,11 @@ Symbols: N Gaussians.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.camera import to_camera
 from intrasplat.clip import DepthClip
 from intrasplat.motion.lifted import CoarseFrame, Flows, PointGrid, lifted
 from intrasplat.motion.tracks import FLOW_WIDTH, MIN_GRID_SIDE
@@ -44,23 +45,33 @@ class FlowStart:
         camera[..., :2] += camera[..., 2:] * self._grid.rays[..., :2]
         return np.asarray(camera @ start.axes.T, np.float32)
 
-    def to(self, clip: DepthClip, means_mm: Floats) -> tuple[Floats, Floats]:
-        """Displacement in mm and change of the constant harmonic, [3, N] each, of Gaussians from the last frame to this
-        clip's, which becomes the last one.
-
-        means_mm: [N, 3] centres in the last frame, world.
-        """
+    def to(self, clip: DepthClip) -> Carried:
+        """The motion from the last frame to this clip's, which becomes the last one."""
         last, new = self._last, CoarseFrame(clip, 0, self._grid)
         displacement_mm, colour, _ = lifted(last, new, *Flows(last).to(new))
-        displacement_mm = self._beyond_noise(displacement_mm, last)
         self._last = new
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = last.axes, last.place_mm
-        x, y, z = to_camera(means_mm, pose).T
-        z = np.maximum(z, 1e-3)
-        column, row = self._grid.cells_at((x / z).astype(np.float32), (y / z).astype(np.float32))
-        height, width = colour.shape[:2]
+        return Carried(last, self._beyond_noise(displacement_mm, last), colour)
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """Displacement in mm (world) and change of colour [h, w, 3] of a frame's cells to the next frame."""
+
+    start: CoarseFrame
+    displacement_mm: Floats
+    colour: Floats
+
+    def of(self, means_mm: Floats) -> tuple[Floats, Floats]:
+        """Displacement in mm and change of the constant harmonic, [3, N] each, of Gaussians.
+
+        means_mm: [N, 3] centres in the first frame, world.
+        """
+        start = self.start
+        x, y, z = ((means_mm - start.place_mm) @ start.axes).T
+        z = np.maximum(z, np.float32(1e-3))
+        column, row = start.grid.cells_at(x / z, y / z)
+        height, width = self.colour.shape[:2]
         row = np.clip(np.rint(row), 0, height - 1).astype(np.intp)
         column = np.clip(np.rint(column), 0, width - 1).astype(np.intp)
-        moved_mm = np.ascontiguousarray(displacement_mm[row, column].T)
-        return moved_mm, np.ascontiguousarray(colour[row, column].T) / np.float32(SH_C0)
+        moved_mm, colour = (np.ascontiguousarray(each[row, column].T) for each in (self.displacement_mm, self.colour))
+        return moved_mm, colour / np.float32(SH_C0)
