@@ -22,6 +22,7 @@ from intrasplat.clip import DepthClip
 from intrasplat.errors import InputError, TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.live.cover import Cover, with_spares
 from intrasplat.live.eyes import EyesSettings, LiveEyes
 from intrasplat.live.motion import Carried, FlowStart
 from intrasplat.live.pair import FeedPair
@@ -37,8 +38,19 @@ from intrasplat.train.loop import check_sums
 from intrasplat.train.start import start_gaussians, stride_for
 from intrasplat.train.targets import units_per_mm
 
+RATES = replace(
+    INSTANT.rates,
+    **{
+        name: replace(getattr(INSTANT.rates, name), end=3 * (getattr(INSTANT.rates, name).end or 0.0))
+        for name in ("motion_mean", "motion_quaternion", "motion_log_scale")
+    },
+)
+"""Rates of a clip's last steps, with a faster motion: it must follow each frame in a few steps, and what all frames
+share must not follow the newest one."""
 MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
+COVER_EVERY = 4
+"""Used frames from one search for tissue without Gaussians to the next."""
 MIN_STEPS = 2
 """Steps that a pair gets, however short the time is."""
 
@@ -61,25 +73,21 @@ class FollowSettings:
     eyes             how pairs are read
     segment_frames   S, used frames of a segment; the window has S to 2 S of them
     points           Gaussians that the first frame starts with, about
+    spare            Gaussians for tissue that comes into view, as a share of these
     steps            steps of training for each pair; None: as many as fit into the time that add() is given
     first_steps      steps for the first pair, if steps are given
-    opening          steps in which the rates fall from a clip's first ones to `progress`
-    progress         of a schedule, whose rates the steps have
+    opening          steps in which the rates fall to those that they keep
     keep_s           seconds of the past that are kept as segments
     seed             of the order of frames
     """
 
     eyes: EyesSettings = field(default_factory=EyesSettings)
     segment_frames: int = 8
-    points: int = 10_000
+    points: int = 20_000
+    spare: float = 0.25
     steps: int | None = None
     first_steps: int = 30
     opening: int = 100
-    progress: float = 0.5
-    motion_pace: float = 1.0
-    own_pace: float = 1.0
-    colour_pace: float = 1.0
-    track_colour: float = 1.0
     keep_s: float = 20.0
     seed: int = 0
 
@@ -136,6 +144,7 @@ class Follower:
                 return Added.FIRST
             self._go_on(self._window, ready)
             self._learn(end_s, self.settings.steps)
+            self._look_back(self._window)
         except TrainingDiverged:
             ready = reading.result()
             if ready is None:
@@ -200,9 +209,10 @@ class Follower:
         scale = ready.scale
         stride = stride_for(self.settings.points, clip.intrinsics)
         cloud = fuse(clip, [0], FusionSettings(mode="fill", stride=stride), seed=seed, right=clip.right)
-        gaussians = start_gaussians(cloud, INSTANT, scale)
+        gaussians = with_spares(start_gaussians(cloud, INSTANT, scale), self.settings.spare)
         first = ready.moment
         with self._lock:
+            self._cover = Cover(len(gaussians), stride)
             self._window = Window(gaussians, first, scale, self.settings.segment_frames, self._device)
             self.used, self.iteration = self.used + 1, 0
 
@@ -216,6 +226,14 @@ class Follower:
         with self._lock:
             window.append(ready.moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
             self.used += 1
+
+    def _look_back(self, window: Window) -> None:
+        """Prepare the next flow, and from time to time give Gaussians to tissue that has none."""
+        shown = window.shown()
+        self._flow.look_at(shown)
+        if self.used % COVER_EVERY == 0:
+            with self._lock:
+                self._cover.renew(window, shown)
 
     def _write_off(self, window: Window) -> None:
         """Make the window's first segment a scene of the past, and forget the oldest of them."""
@@ -258,13 +276,9 @@ class Follower:
 
     def _step(self, window: Window, slot: int) -> None:
         """One step on the frame in a slot. Raises TrainingDiverged."""
-        settings, iteration = self.settings, self.iteration + 1
-        progress = settings.progress * min(1.0, iteration / settings.opening)
-        rates = rates_at(INSTANT.rates, progress)
-        k, kc = self.settings.motion_pace, self.settings.colour_pace
-        rates = replace(rates, motion_mean=k*rates.motion_mean, motion_quaternion=k*rates.motion_quaternion, motion_log_scale=k*rates.motion_log_scale, motion_colour=kc*rates.motion_colour, motion_gloss=kc*rates.motion_gloss)
+        iteration = self.iteration + 1
+        rates = rates_at(RATES, min(1.0, iteration / self.settings.opening))
         with self._lock:
-            if slot == window.slot: rates = replace(rates, **{n: self.settings.own_pace*getattr(rates,n) for n in ('mean','quaternion','log_scale','opacity','colour','gloss')})
             sums = window.model.step(window.moments[slot].frames, INSTANT.loss, rates, iteration)
         check_sums(sums, iteration)
         self.iteration = iteration

@@ -16,8 +16,8 @@ from intrasplat.motion.tracks import FLOW_WIDTH, MIN_GRID_SIDE
 from intrasplat.splat.constants import SH_C0
 
 Floats = NDArray[np.float32]
-import os
-NOISE_PX, DEPTH_NOISE_PX = map(float,os.environ.get("NP","0,0").split(","))
+NOISE_PX, DEPTH_NOISE_PX = 0.2, 0.3
+"""Motion across the view, and change of disparity, in px of the coarse grid, that are as likely noise as motion."""
 
 
 class FlowStart:
@@ -34,8 +34,6 @@ class FlowStart:
 
     def _beyond_noise(self, displacement_mm: Floats, start: CoarseFrame) -> Floats:
         """The displacement [h, w, 3], less where it is as small as the errors of flow and of stereo."""
-        if not NOISE_PX:
-            return displacement_mm
         camera, z = displacement_mm @ start.axes, np.maximum(start.depth_mm, 1e-3)
         lateral = camera[..., :2] - camera[..., 2:] * self._grid.rays[..., :2]
         squared = np.square(lateral).sum(-1) * np.square(self._focal / z)
@@ -44,6 +42,10 @@ class FlowStart:
         camera[..., 2] *= disparity / (disparity + DEPTH_NOISE_PX**2)
         camera[..., :2] += camera[..., 2:] * self._grid.rays[..., :2]
         return np.asarray(camera @ start.axes.T, np.float32)
+
+    def look_at(self, shown: DepthClip) -> None:
+        """Follow from the last frame as the model shows it, so that errors do not add up."""
+        self._last = CoarseFrame(shown, 0, self._grid)
 
     def to(self, clip: DepthClip) -> Carried:
         """The motion from the last frame to this clip's, which becomes the last one."""

@@ -28,7 +28,7 @@ from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import ROWS
 from intrasplat.splat.model import FIRST_MOMENTS
 from intrasplat.splat.step import Target, TrainingFrame
-from intrasplat.train.targets import TrainingFrames
+from intrasplat.train.targets import TrainingFrames, solid_depth_mm
 
 SLOT_WIDTH = 0.2
 """Width of a basis in the window, in slots: a neighbour's value at a slot is 4e-6, and not evaluated."""
@@ -115,6 +115,22 @@ class Window:
         for channels, change in moved:
             weight[channels] += torch.from_numpy(change).to(weight.device)
         self.moments.append(moment.at(last + 1))
+
+    def shown(self) -> DepthClip:
+        """The newest frame's left eye as the model shows it, with the recorded one where the model has nothing."""
+        clip = self.newest.clip
+        image = self.model.render(self.newest.frames[0].camera, float(self.slot))
+        depth_mm = solid_depth_mm(image[3], image[4], self.scale)
+        solid = depth_mm > 0
+        rgb = np.clip(image[:3].transpose(1, 2, 0) * 255 + 0.5, 0, 255).astype(np.uint8)
+        return replace(
+            clip,
+            rgb=np.where(solid[..., None], rgb, clip.rgb[0])[None],
+            tissue=solid[None],
+            depth_mm=depth_mm[None],
+            depth_confidence=np.where(solid, np.uint8(255), np.uint8(0))[None],
+            right=None,
+        )
 
     def scene(self, first: int, end: int, *, seed: int = 0) -> TrainedScene:
         """The scene of the frames in slots [first, end), as a copy."""
