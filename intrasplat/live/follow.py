@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from threading import Lock
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from intrasplat.clip import DepthClip
 from intrasplat.errors import InputError, TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.live.camera import Placer
 from intrasplat.live.cover import Cover, with_spares
 from intrasplat.live.eyes import EyesSettings, LiveEyes
 from intrasplat.live.motion import Carried, FlowStart
@@ -62,6 +64,8 @@ class Added(StrEnum):
     FOLLOWED = "followed"
     NO_SCENE = "no_scene"
     """It shows too little tissue with depth, or nothing that the eyes can be registered by."""
+    LOST = "lost"
+    """The moving camera's pose was not found."""
     RESTARTED = "restarted"
     """Training diverged; the model began anew with this pair."""
 
@@ -77,6 +81,7 @@ class FollowSettings:
     steps            steps of training for each pair; None: as many as fit into the time that add() is given
     first_steps      steps for the first pair, if steps are given
     opening          steps in which the rates fall to those that they keep
+    camera           whether the endoscope moves; "fixed": its motion counts as the tissue's
     keep_s           seconds of the past that are kept as segments
     seed             of the order of frames
     """
@@ -88,6 +93,7 @@ class FollowSettings:
     steps: int | None = None
     first_steps: int = 30
     opening: int = 100
+    camera: Literal["fixed", "moving"] = "fixed"
     keep_s: float = 20.0
     seed: int = 0
 
@@ -136,8 +142,8 @@ class Follower:
         try:
             self._rehearse(reading)
             ready = reading.result()
-            if ready is None:
-                return Added.NO_SCENE
+            if isinstance(ready, Added):
+                return ready
             if self._window is None:
                 self._start(ready)
                 self._learn(end_s, self.settings.first_steps)
@@ -147,9 +153,9 @@ class Follower:
             self._look_back(self._window)
         except TrainingDiverged:
             ready = reading.result()
-            if ready is None:
-                self._window = None
-                return Added.NO_SCENE
+            if isinstance(ready, Added):
+                self._window = None  # the next pair is the first one
+                return ready
             self._start(ready)
             return Added.RESTARTED
         return Added.FOLLOWED
@@ -190,17 +196,21 @@ class Follower:
                 self._scene = self.used, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
             return self._scene[1]
 
-    def _prepared(self, pair: FeedPair) -> _Ready | None:
-        """What can be computed of a pair without the model; None: it shows no scene."""
+    def _prepared(self, pair: FeedPair) -> _Ready | Added:
+        """What can be computed of a pair without the model, or why it is not used."""
         with one_opencv_thread():
             clip = self.read(pair)
             if clip is None:
-                return None
+                return Added.NO_SCENE
             window = self._window
             if window is None:
-                self._flow = FlowStart(clip)
+                self._flow, self._placer = FlowStart(clip), Placer(clip)
                 scale = units_per_mm(clip, [0])
                 return _Ready(Moment.of(clip, pair, scale), scale, None)
+            if self.settings.camera == "moving":
+                clip = self._placer.placed(clip)
+                if clip is None:
+                    return Added.LOST
             return _Ready(Moment.of(clip, pair, window.scale), window.scale, self._flow.to(clip))
 
     def _start(self, ready: _Ready) -> None:
@@ -248,7 +258,7 @@ class Follower:
             window.give_up()
         self._eyes.follow_range(window.newest.clip)
 
-    def _rehearse(self, reading: Future[_Ready | None]) -> None:
+    def _rehearse(self, reading: Future[_Ready | Added]) -> None:
         """Train frames of the window: half the steps given or, if None, until the pair is read."""
         steps = self.settings.steps
         made = self._rehearsed = 0

@@ -35,7 +35,7 @@ from intrasplat.decode import decode_clip
 from intrasplat.decode.decoding import StereoRecording
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
 from intrasplat.live.eyes import EyesSettings
-from intrasplat.live.follow import Follower, FollowSettings
+from intrasplat.live.follow import Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
@@ -58,11 +58,12 @@ Score = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A clip played to and fro: pairs as recorded, and the calibration."""
+    """A clip played to and fro: pairs as recorded, the calibration, and the true path of a phantom's camera, mm."""
 
     pairs: Sequence[tuple[RgbFrame, RgbFrame]]
     calibration: RectifiedCalibration | RawCalibration
     fps: float
+    path_mm: NDArray[np.float64] | None = None
 
     def place(self, number: int) -> int:
         """The clip's frame that a pair of the feed shows."""
@@ -85,6 +86,8 @@ class Found:
     first_s: float = 0.0
     seconds: float = 0.0
     steps: int = 0
+    path_mm: list[float] = field(default_factory=list)
+    lost: int = 0
 
     def add(self, name: str, score: Score) -> None:
         self.scores.setdefault(name, []).append(score)
@@ -99,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         eyes = EyesSettings(width=options.width, finds_instruments=not options.no_instruments)
         changed = {name: float(value) if "." in value else int(value) for name, value in options.set}
         settings = FollowSettings(
-            eyes=eyes, steps=None if options.pace == "real" else options.steps, keep_s=options.seconds, **changed
+            eyes=eyes, steps=None if options.pace == "real" else options.steps, keep_s=options.seconds, camera=options.camera, **changed
         )
         reader = Follower(played.calibration, settings)
         truth = [reader.read(played.pair(number, 0.0)) for number in range(len(played.pairs))]
@@ -115,8 +118,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def played_of(source: Source, fps: float) -> Played:
     """The pairs of a source, as recorded, in memory."""
     if source.phantom is not None:
-        drawn = make_phantom(source.phantom).stereo_recording(masks=False)
-        return Played(list(drawn.clip.pairs()), drawn.calibration, fps)
+        phantom = make_phantom(source.phantom)
+        drawn = phantom.stereo_recording(masks=False)
+        path_mm = np.stack([phantom.world_from_camera(i)[:3, 3] for i in range(drawn.clip.frame_count)])
+        return Played(list(drawn.clip.pairs()), drawn.calibration, fps, path_mm)
     decoded = decode_clip(source.clip, calibration=source.files.get("calibration"))
     assert isinstance(decoded, StereoRecording)
     return Played(list(decoded.clip.pairs()), decoded.calibration, fps)
@@ -133,10 +138,10 @@ def by_steps(
         if number % every == 0:
             _score_now(follower, truth, played, found, number)
             start_s = time.perf_counter()
-            follower.add(played.pair(number, 0.0))
+            became = follower.add(played.pair(number, 0.0))
             found.ages_s.append(time.perf_counter() - start_s)
-            found.used.append(number)
             found.first_s = found.first_s or time.perf_counter() - start_s
+            _took(follower, became, played, found, number)
         while waiting and number - waiting[0] >= LATER_S * played.fps and number % every == 0:
             _score_later(follower, truth, played, found, waiting.pop(0))
     found.steps, found.seconds = follower.iteration, time.perf_counter() - began_s
@@ -170,12 +175,24 @@ def in_real_time(
             time.sleep(1 / played.fps / 4)
             continue
         last = number
-        follower.add(played.pair(number, began + number / played.fps), budget_s)
-        found.used.append(number)
+        became = follower.add(played.pair(number, began + number / played.fps), budget_s)
+        _took(follower, became, played, found, number)
     ended.set()
     viewer.join()
     found.steps, found.seconds = follower.iteration, seconds
     return found, follower
+
+
+def _took(follower: Follower, became: Added, played: Played, found: Found, number: int) -> None:
+    """Note what became of a pair, and how far its pose is from the true one."""
+    if became not in (Added.FIRST, Added.FOLLOWED):
+        found.lost += 1
+        return
+    found.used.append(number)
+    assert follower.newest is not None
+    if played.path_mm is not None:
+        off_mm = follower.newest.clip.world_from_camera[0, :3, 3] - played.path_mm[played.place(number)]
+        found.path_mm.append(float(np.linalg.norm(off_mm)))
 
 
 def score_past(follower: Follower, truth: Sequence[DepthClip | None], played: Played, found: Found) -> None:
@@ -294,6 +311,9 @@ def _print(
             yield f"offline {offline[0][0]:.2f} {offline[0][1]:.2f}, its flicker {offline[1]:.2f}"
         yield f"flicker {flicker(found.shown, recorded):.2f}"
         yield f"of the recording {flicker([clip.rgb[0] for clip in recorded], recorded):.2f}"
+        if any(found.path_mm):
+            yield f"path off by {np.mean(found.path_mm):.2f} mm, at most {max(found.path_mm):.2f}"
+        yield f"not used {found.lost}"
         yield f"rss {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
 
     print("  ".join(texts()), flush=True)
@@ -311,6 +331,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--budget-s", type=float, default=0.18)
     parser.add_argument("--views-hz", type=float, default=5.0)
     parser.add_argument("--iterations", type=int, default=300)
+    parser.add_argument("--camera", choices=("fixed", "moving"), default="fixed")
     parser.add_argument("--no-offline", action="store_true")
     parser.add_argument("--no-instruments", action="store_true")
     return parser
