@@ -32,8 +32,8 @@ MAX_USE_PX = 0.5
 """A Gaussian that filled more than these pixels of late keeps its place."""
 CELL = 2
 """Strides along a square of tissue in which at least one Gaussian must be."""
-LEAST_SHARE = 2e-3
-"""Share of the squares without a Gaussian that are left alone."""
+LEAST_SHARE, MUCH_SHARE, LONG_FRAMES = 2e-3, 2e-2, 4
+"""Share of the cells without a Gaussian that is left alone; that is filled at once; used frames after which less is."""
 
 
 def with_spares(gaussians: Gaussians, share: float) -> Gaussians:
@@ -50,36 +50,43 @@ class Cover:
 
     def __init__(self, count: int, stride: int) -> None:
         self.use_px = np.zeros(count, np.float32)
-        self._stride = stride
+        self._stride, self._waited = stride, 0
 
     def renew(self, window: Window, shown: DepthClip) -> int:
-        """Give Gaussians to the newest frame's tissue without any; returns their number M.
+        """Give Gaussians to the newest frame's tissue without any, if it is much or has not been for long; returns
+        their number M.
 
         shown: the newest frame as the model shows it (Window.shown).
         """
-        self._look(window)
         means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
-        pixels = self._bare(window.newest.clip, shown, means_mm[self.use_px > 0])
-        columns = np.flatnonzero(self.use_px <= MAX_USE_PX)
-        columns = columns[np.argsort(self.use_px[columns], kind="stable")][: len(pixels)]
-        if not len(columns):
+        pixels, share = self._bare(window.newest.clip, shown, means_mm[self.use_px > 0])
+        self._waited += 1
+        if share < LEAST_SHARE or (share < MUCH_SHARE and self._waited < LONG_FRAMES):
             return 0
-        self._put(window, pixels[: len(columns)], columns, means_mm)
+        self._waited = 0
+        used_px = self._look(window)
+        columns = np.flatnonzero(used_px <= MAX_USE_PX)
+        columns = columns[np.argsort(self.use_px[columns], kind="stable")][: len(pixels)]
+        if len(columns):
+            self._put(window, pixels[: len(columns)], columns, means_mm, used_px)
         return len(columns)
 
-    def _look(self, window: Window) -> None:
-        """Learn what the newest frame's pictures use."""
+    def _look(self, window: Window) -> NDArray[np.float32]:
+        """[N] what the newest frame's pictures use, px; use_px learns it."""
+        found = np.zeros_like(self.use_px)
         self.use_px *= np.float32(FORGETTING)
         camera = window.newest.clip.intrinsics
         cotangents = np.zeros((5, camera.height, camera.width), np.float32)
         cotangents[0] = 1  # the gradient of all red by a Gaussian's red is the sum of its blending weights
         for frame in window.newest.frames:
             used = window.model.image_gradient(frame.camera, frame.t, cotangents)[COLOUR_ROW] / np.float32(SH_C0)
-            np.maximum(self.use_px, used, out=self.use_px)
+            np.maximum(found, used, out=found)
+        np.maximum(self.use_px, found, out=self.use_px)
+        return found
 
-    def _bare(self, clip: DepthClip, shown: DepthClip, means_mm: NDArray[np.floating]) -> NDArray[np.intp]:
+    def _bare(self, clip: DepthClip, shown: DepthClip, means_mm: NDArray[np.floating]) -> tuple[NDArray[np.intp], float]:
         """Pixels (flat) at the middles of grid cells of tissue without a Gaussian, those through which light passes
-        first; none if they are few."""
+        first; their share of all cells."""
         camera, side, pose = clip.intrinsics, CELL * self._stride, clip.world_from_camera[0]
         across, down = -(-camera.width // side), -(-camera.height // side)
         cells, _ = cells_of(means_mm, camera, pose, side)
@@ -87,11 +94,9 @@ class Cover:
         rows, columns = (each.ravel() for each in _middles(camera, self._stride))
         tissue, light = clip.tissue[0][rows, columns], ~shown.tissue[0][rows, columns]
         bare = tissue & (light | ~filled[rows // side * across + columns // side])
-        if np.count_nonzero(bare) < LEAST_SHARE * len(bare):
-            return np.zeros(0, np.intp)
         found = np.flatnonzero(bare)
         found = found[np.argsort(~light[found], kind="stable")]
-        return np.asarray(rows[found] * camera.width + columns[found], np.intp)
+        return np.asarray(rows[found] * camera.width + columns[found], np.intp), len(found) / len(bare)
 
     def _put(
         self,
@@ -99,11 +104,12 @@ class Cover:
         pixels: NDArray[np.intp],
         columns: NDArray[np.intp],
         means_mm: NDArray[np.floating],
+        used_px: NDArray[np.float32],
     ) -> None:
         """Make the Gaussians in these columns points of the newest frame that move as their neighbours."""
         clip, scale = window.newest.clip, window.scale
         cloud = points_at(clip, 0, pixels)
-        drawn = np.flatnonzero(self.use_px > MAX_USE_PX)
+        drawn = np.flatnonzero(used_px > MAX_USE_PX)
         _, near = cKDTree(means_mm[drawn]).query(cloud.points_mm)
         depth = np.linalg.norm(cloud.points_mm - clip.world_from_camera[0, :3, 3], axis=1) * scale
         width = INSTANT.spread * self._stride * depth / clip.intrinsics.fx

@@ -51,8 +51,6 @@ RATES = replace(
 share must not follow the newest one."""
 MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
-COVER_EVERY = 4
-"""Used frames from one search for tissue without Gaussians to the next."""
 MIN_STEPS = 2
 """Steps that a pair gets, however short the time is."""
 
@@ -238,12 +236,11 @@ class Follower:
             self.used += 1
 
     def _look_back(self, window: Window) -> None:
-        """Prepare the next flow, and from time to time give Gaussians to tissue that has none."""
+        """Prepare the next flow, and give Gaussians to tissue that has none."""
         shown = window.shown()
         self._flow.look_at(shown)
-        if self.used % COVER_EVERY == 0:
-            with self._lock:
-                self._cover.renew(window, shown)
+        with self._lock:
+            self._cover.renew(window, shown)
 
     def _write_off(self, window: Window) -> None:
         """Make the window's first segment a scene of the past, and forget the oldest of them."""

@@ -47,6 +47,7 @@ from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.scoring import judged_pixels
+from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.render import render_frame
 from lab.evaluate.sources import DATA_VARIABLE, Source, source_of
 from lab.phantom import make_phantom
@@ -269,8 +270,7 @@ def _score_later(
 def _shown(scene: TrainedScene, t: float, clip: DepthClip) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """The scene's pictures from both eyes."""
     assert clip.right is not None
-    place = min(round(t * scene.frame_count), scene.frame_count - 1)
-    left = scene.world_from_camera[place]
+    left = endoscope_pose(scene, t)
     right = left @ np.linalg.inv(clip.world_from_camera[0]) @ clip.right.world_from_camera[0]
     return render_frame(scene, t, left).rgb, render_frame(scene, t, right, clip.right.intrinsics).rgb
 
