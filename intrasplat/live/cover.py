@@ -52,14 +52,11 @@ class Cover:
         self.use_px = np.zeros(count, np.float32)
         self._stride, self._waited = stride, 0
 
-    def renew(self, window: Window, shown: DepthClip) -> int:
+    def renew(self, window: Window) -> int:
         """Give Gaussians to the newest frame's tissue without any, if it is much or has not been for long; returns
-        their number M.
-
-        shown: the newest frame as the model shows it (Window.shown).
-        """
+        their number M."""
         means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
-        pixels, share = self._bare(window.newest.clip, shown, means_mm[self.use_px > 0])
+        pixels, share = self._bare(window.newest.clip, window.shown(), means_mm[self.use_px > 0])
         self._waited += 1
         if share < LEAST_SHARE or (share < MUCH_SHARE and self._waited < LONG_FRAMES):
             return 0

@@ -148,7 +148,7 @@ class Follower:
                 return Added.FIRST
             self._go_on(self._window, ready)
             self._learn(end_s, self.settings.steps)
-            self._look_back(self._window)
+            self._flow.look_at(self._window.shown())
         except TrainingDiverged:
             ready = reading.result()
             if isinstance(ready, Added):
@@ -234,13 +234,7 @@ class Follower:
         with self._lock:
             window.append(ready.moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
             self.used += 1
-
-    def _look_back(self, window: Window) -> None:
-        """Prepare the next flow, and give Gaussians to tissue that has none."""
-        shown = window.shown()
-        self._flow.look_at(shown)
-        with self._lock:
-            self._cover.renew(window, shown)
+            self._cover.renew(window)
 
     def _write_off(self, window: Window) -> None:
         """Make the window's first segment a scene of the past, and forget the oldest of them."""
