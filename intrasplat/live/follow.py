@@ -29,11 +29,13 @@ from intrasplat.live.eyes import EyesSettings, LiveEyes
 from intrasplat.live.motion import Carried, FlowStart
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.window import Moment, Window
+from intrasplat.machine.cores import cores
 from intrasplat.machine.hooks import ignore
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.methods.fast import INSTANT
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
+from intrasplat.splat.cpu.threads import alone
 from intrasplat.splat.layout import COLOUR, MEAN
 from intrasplat.splat.optimize import rates_at
 from intrasplat.train.loop import check_sums
@@ -51,6 +53,8 @@ RATES = replace(
 share must not follow the newest one."""
 MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
+MANY_CORES = 4
+"""With fewer cores, steps beside the reading of a pair use one."""
 MIN_STEPS = 2
 """Steps that a pair gets, however short the time is."""
 
@@ -255,10 +259,12 @@ class Follower:
         made = self._rehearsed = 0
         if self._window is None:
             return
-        while made < steps // 2 if steps is not None else not reading.done():
-            slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(len(self._window.moments)))
-            self._step(self._window, slot)
-            made += 1
+        with alone(is_alone=cores() < MANY_CORES):
+            while made < steps // 2 if steps is not None else not reading.done():
+                slots = len(self._window.moments)
+                slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(slots))
+                self._step(self._window, slot)
+                made += 1
         self._rehearsed = made
 
     def _learn(self, end_s: float, steps: int | None) -> None:

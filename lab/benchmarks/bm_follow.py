@@ -89,6 +89,7 @@ class Found:
     steps: int = 0
     path_mm: list[float] = field(default_factory=list)
     lost: int = 0
+    cpu_s: float = 0.0
 
     def add(self, name: str, score: Score) -> None:
         self.scores.setdefault(name, []).append(score)
@@ -138,9 +139,10 @@ def by_steps(
         waiting.append(number)
         if number % every == 0:
             _score_now(follower, truth, played, found, number)
-            start_s = time.perf_counter()
+            start_s, cpu_s = time.perf_counter(), time.process_time()
             became = follower.add(played.pair(number, 0.0))
             found.ages_s.append(time.perf_counter() - start_s)
+            found.cpu_s += time.process_time() - cpu_s
             found.first_s = found.first_s or time.perf_counter() - start_s
             _took(follower, became, played, found, number)
         while waiting and number - waiting[0] >= LATER_S * played.fps and number % every == 0:
@@ -169,7 +171,7 @@ def in_real_time(
 
     viewer = threading.Thread(target=look)
     viewer.start()
-    last = -1
+    last, cpu_s = -1, time.process_time()
     while (now_s := time.time() - began) < seconds:
         number = int(now_s * played.fps)
         if number == last:
@@ -178,6 +180,7 @@ def in_real_time(
         last = number
         became = follower.add(played.pair(number, began + number / played.fps), budget_s)
         _took(follower, became, played, found, number)
+    found.cpu_s = time.process_time() - cpu_s
     ended.set()
     viewer.join()
     found.steps, found.seconds = follower.iteration, seconds
@@ -303,6 +306,7 @@ def _print(
     def texts() -> Iterator[str]:
         yield name
         yield f"used {len(found.used) / found.seconds:.2f}/s, {found.steps / len(found.used):.1f} steps each"
+        yield f"{1e3 * found.cpu_s / len(found.used):.0f} ms of a core each"
         p50, p95 = np.percentile(found.ages_s[1:], (50, 95))
         yield f"age p50 {p50:.2f} p95 {p95:.2f} s, first {found.first_s:.2f} s"
         for kind, scores in found.scores.items():
