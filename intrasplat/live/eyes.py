@@ -1,7 +1,7 @@
 """The pairs of a feed as clips of one moment with depth: resized, rectified, matched, without instruments.
 
-What a clip measures over all its frames is measured on the first pair that shows a scene: how the eyes are registered,
-the field of view, the look of tissue. The range of disparities follows the scene (follow_range).
+What a clip measures over all its frames is measured on one pair: how the eyes are registered, the field of view, the
+look of tissue. The range of disparities follows the scene (follow_range).
 
 Symbols: H W pixels of one eye of the model.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -58,33 +59,26 @@ class LiveEyes:
     """
 
     def __init__(
-        self,
-        calibration: RectifiedCalibration | RawCalibration,
-        settings: EyesSettings,
-        left: RgbFrame,
-        right: RgbFrame,
+        self, calibration: RectifiedCalibration | RawCalibration, settings: EyesSettings, recorded_size: tuple[int, int]
     ) -> None:
-        """Measure the eyes on a first pair, [H, W, 3] each.
+        """recorded_size: width and height of one eye of the feed.
 
         Raises:
-            InputError: the pair shows no scene, or does not fit the calibration.
+            InputError: the calibration is of no such eyes.
         """
-        height, width = left.shape[:2]
-        self.recorded_size = width, height
-        self._settings = settings
+        self.recorded_size, self._settings = recorded_size, settings
+        width, height = recorded_size
         new_width = settings.width or width
         self._size = new_width, max(1, round(height * new_width / width))
-        self._pair = self._resized(left, right)
+        nothing = np.zeros((*self._size[::-1], 3), np.uint8)
+        self._pair = nothing, nothing
         self._rectified = rectify(self._stereo_clip(), calibration.resized(*self._size))
-        self._work = self._measured()
+        self._work: FrameWork | None = None
 
-    @property
-    def field(self) -> NDArray[np.bool_] | None:
-        """The field of view [H, W] of the left eye; None: the whole picture."""
-        return self._work.fields.left
+    def moment(self, left: RgbFrame, right: RgbFrame, time_s: float) -> DepthClip | None:
+        """The clip of one frame of a pair as recorded, [H, W, 3] each; its camera stands at the origin.
 
-    def moment(self, left: RgbFrame, right: RgbFrame, time_s: float) -> DepthClip:
-        """The clip of one frame of a pair as recorded; its camera stands at the origin.
+        The first pair that shows a scene tells how the eyes stand to each other; None before.
 
         Raises:
             InputError: the pair has another size than the first one.
@@ -94,7 +88,12 @@ class LiveEyes:
             before = "x".join(map(str, self.recorded_size))
             raise InputError("feed", f"a picture has {width}x{height} pixels, the first had {before}.", "Start anew.")
         self._pair = self._resized(left, right)
+        if self._work is None:
+            with suppress(InputError):  # it shows nothing, or no scene that the eyes have in common
+                self._work = self._measured()
         work = self._work
+        if work is None:
+            return None
         work.matched.rgb[0], work.right.rgb[0] = self._rectified_pair()
         work.match(0)
         own = {name: np.array(getattr(work.matched, name)) for name in PIXELS}
@@ -104,7 +103,7 @@ class LiveEyes:
     def follow_range(self, moment: DepthClip) -> None:
         """Search the disparities that a moment shows from now on."""
         clip, work = self._rectified, self._work
-        assert moment.right is not None
+        assert moment.right is not None and work is not None
         pair = grey_of(moment.rgb[0]), work.registration.rectified(grey_of(moment.right.rgb[0]))
         focal_baseline = clip.intrinsics.fx * clip.baseline_mm
         try:

@@ -165,11 +165,10 @@ class Follower:
     def read(self, pair: FeedPair) -> DepthClip | None:
         """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
         if self._eyes is None:
-            try:
-                self._eyes = LiveEyes(self._calibration, self.settings.eyes, pair.left, pair.right)
-            except InputError:  # TODO tell a calibration that cannot fit from a picture that shows nothing
-                return None
+            self._eyes = LiveEyes(self._calibration, self.settings.eyes, (pair.left.shape[1], pair.left.shape[0]))
         clip = self._eyes.moment(pair.left, pair.right, pair.source_s)
+        if clip is None:
+            return None
         known = np.count_nonzero(clip.tissue[0] & (clip.depth_mm[0] > 0))
         return clip if known >= MIN_DEPTH_SHARE * clip.field_pixels else None
 

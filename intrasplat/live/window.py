@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from intrasplat.camera import to_camera
 from intrasplat.clip import DepthClip
 from intrasplat.live.pair import FeedPair
+from intrasplat.poses.rigid import inverse
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.scene.training_pictures import RecordedEye
 from intrasplat.splat.backend import CPU, Device, make_model
 from intrasplat.splat.deformation import SharedBasis
 from intrasplat.splat.gaussians import Gaussians
@@ -65,6 +67,23 @@ class Moment:
 
 def _same(target: Target) -> Target:
     return target
+
+
+class WindowPictures:
+    """The TrainingPictures of some moments, which are a scene's frames, in order."""
+
+    def __init__(self, moments: Sequence[Moment]) -> None:
+        first = moments[0].clip
+        self.frames = range(len(moments))
+        self.eyes = tuple(
+            RecordedEye(eye.intrinsics, inverse(first.world_from_camera[0]) @ eye.world_from_camera[0])
+            for eye in first.eyes
+        )
+        self._pictures = [[(eye.rgb[0], eye.tissue[0]) for eye in moment.clip.eyes] for moment in moments]
+
+    def picture(self, eye: int, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """See TrainingPictures."""
+        return self._pictures[frame][eye]
 
 
 class Window:
@@ -159,4 +178,5 @@ class Window:
             seen=torch.zeros(len(gaussians)),
             right_eye_mm=tuple(right_mm),
             seed=seed,
+            pictures=WindowPictures(moments),
         )

@@ -8,7 +8,7 @@ views-hz times a second. --pace K: every K-th pair is used and gets --steps step
 
 Scores are psnr_tissue in dB, of the left and the right eye, and causal: `now` is a pair before it trains, as the model
 shows the newest moment; `copy` beside it the last used pair as it is, whose left picture is warped for the right eye;
-`later` is a used pair a second after it came, `between` a pair that was not used, then. `offline` is preset instant on
+`later` is a used pair a second after it came, `between` a pair that was not used, then; with and without detail. `offline` is preset instant on
 all pairs (rectified, matched and masked by the same eyes), at the used ones. flicker: standard deviation over time, in
 grey levels, of the used frames as they are shown a second later, over the fifth of the tissue that changes least in the
 recording; beside it the recording's own, and that of `offline`.
@@ -164,7 +164,7 @@ def in_real_time(
             if shown is None:
                 continue
             scene, t = shown
-            render_frame(scene, t)
+            render_frame(scene, t, detail="off")
             arrived_at = began + scene.frame_times_s[-1]
             found.ages_s.append(time.time() - arrived_at)
             found.first_s = found.first_s or time.time() - began
@@ -203,7 +203,7 @@ def score_past(follower: Follower, truth: Sequence[DepthClip | None], played: Pl
     """Score the used frames, and some between, as they are shown in the end."""
     used = set(found.used)
     for number in range(found.used[0], found.used[-1]):
-        if number in used or number % 3 == 0:
+        if number in used or number % 4 == 0:
             _score_later(follower, truth, played, found, number)
 
 
@@ -268,14 +268,20 @@ def _score_later(
     found.add("later" if is_used else "between", _score(pictures, clip))
     if is_used:
         found.shown.append(pictures[0])
+    else:
+        found.add("between, detail", _score(_shown(*shown, clip, detail=True), clip))
 
 
-def _shown(scene: TrainedScene, t: float, clip: DepthClip) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The scene's pictures from both eyes."""
+def _shown(
+    scene: TrainedScene, t: float, clip: DepthClip, *, detail: bool = False
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """The scene's pictures from both eyes, without detail of the recorded frames or with it."""
     assert clip.right is not None
     left = endoscope_pose(scene, t)
     right = left @ np.linalg.inv(clip.world_from_camera[0]) @ clip.right.world_from_camera[0]
-    return render_frame(scene, t, left).rgb, render_frame(scene, t, right, clip.right.intrinsics).rgb
+    views = ((left, None), (right, clip.right.intrinsics))
+    one, other = (render_frame(scene, t, pose, lens, detail="on" if detail else "off").rgb for pose, lens in views)
+    return one, other
 
 
 def _score(pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], clip: DepthClip) -> Score:
