@@ -7,6 +7,8 @@ all keyframes by features. The tissue's main part is taken as rigid from a keyfr
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from intrasplat.clip import DepthClip
@@ -92,11 +94,10 @@ class Placer:
         """Forget a keyframe if there are too many: not the first or the newest, but one that another one resembles."""
         if len(self._keys) <= MAX_KEYS:
             return
-        keys = list(self._keys)
-        shares = [
-            self._frames.predicted(key, inverse(self._keys[after]) @ self._keys[key])[1]
-            for key, after in zip(keys[1:-1], keys[2:], strict=True)
-        ]
-        key = keys[1 + int(np.argmax(shares))]
+        resembles = {
+            key: self._frames.predicted(key, inverse(self._keys[after]) @ self._keys[key])[1]
+            for key, after in pairwise(list(self._keys)[1:])
+        }
+        key = max(resembles, key=lambda each: resembles[each])
         del self._keys[key]
         self._frames.forget(key)

@@ -18,11 +18,12 @@ from scipy.spatial import cKDTree
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.fusion.points import cells_of, points_at
-from intrasplat.live.window import FIRST_MOMENTS, SECOND_MOMENTS, WEIGHT, Window
+from intrasplat.live.window import SECOND_MOMENTS, WEIGHT, Window
 from intrasplat.methods.fast import INSTANT
 from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.gaussians import Gaussians
 from intrasplat.splat.layout import COLOUR, COLOUR_ROW, GLOSS_ROW, LOG_SCALE, MEAN, QUATERNION, QUATERNION_ROW
+from intrasplat.splat.model import FIRST_MOMENTS
 
 UNUSED_LOGIT = -20.0
 """Of a Gaussian that is not drawn."""
@@ -81,7 +82,9 @@ class Cover:
         np.maximum(self.use_px, found, out=self.use_px)
         return found
 
-    def _bare(self, clip: DepthClip, shown: DepthClip, means_mm: NDArray[np.floating]) -> tuple[NDArray[np.intp], float]:
+    def _bare(
+        self, clip: DepthClip, shown: DepthClip, means_mm: NDArray[np.floating]
+    ) -> tuple[NDArray[np.intp], float]:
         """Pixels (flat) at the middles of grid cells of tissue without a Gaussian, those through which light passes
         first; their share of all cells."""
         camera, side, pose = clip.intrinsics, CELL * self._stride, clip.world_from_camera[0]

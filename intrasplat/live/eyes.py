@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, StereoClip
 from intrasplat.clip.calibration import rectify
@@ -23,7 +23,7 @@ from intrasplat.clip.features import find_features
 from intrasplat.clip.sampling import thumbnail
 from intrasplat.clip.shown import find_shown
 from intrasplat.clip.splashes import Splashes
-from intrasplat.clip.types import PIXELS, RgbFrame
+from intrasplat.clip.types import Eye, RgbFrame
 from intrasplat.errors import InputError
 from intrasplat.instruments import Finder
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
@@ -96,14 +96,14 @@ class LiveEyes:
             return None
         work.matched.rgb[0], work.right.rgb[0] = self._rectified_pair()
         work.match(0)
-        own = {name: np.array(getattr(work.matched, name)) for name in PIXELS}
-        other = {name: np.array(getattr(work.right, name)) for name in PIXELS}
-        return replace(work.matched, frame_times_s=np.array([time_s]), right=replace(work.right, **other), **own)
+        right = replace(work.right, **_copies(work.right))
+        return replace(work.matched, frame_times_s=np.array([time_s]), right=right, **_copies(work.matched))
 
     def follow_range(self, moment: DepthClip) -> None:
         """Search the disparities that a moment shows from now on."""
         clip, work = self._rectified, self._work
-        assert moment.right is not None and work is not None
+        assert moment.right is not None
+        assert work is not None
         pair = grey_of(moment.rgb[0]), work.registration.rectified(grey_of(moment.right.rgb[0]))
         focal_baseline = clip.intrinsics.fx * clip.baseline_mm
         try:
@@ -153,3 +153,6 @@ class LiveEyes:
         return FrameWork.begin(clip, rgb, right, [0], registration, plan, fields, Splashes(), finder)
 
 
+def _copies(eye: Eye) -> dict[str, Any]:
+    """The arrays of an eye by name."""
+    return {name: np.array(values) for name, values in eye.arrays_at(slice(0, 1)).items()}

@@ -8,7 +8,6 @@ its own that does not change any more.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 
 from intrasplat.clip import DepthClip
-from intrasplat.errors import InputError, TrainingDiverged
+from intrasplat.errors import TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
 from intrasplat.live.camera import Placer
@@ -37,6 +36,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cpu.threads import alone
 from intrasplat.splat.layout import COLOUR, MEAN
+from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.splat.optimize import rates_at
 from intrasplat.train.loop import check_sums
 from intrasplat.train.start import start_gaussians, stride_for
@@ -51,6 +51,10 @@ RATES = replace(
 )
 """Rates of a clip's last steps, with a faster motion: it must follow each frame in a few steps, and what all frames
 share must not follow the newest one."""
+MIN_PSNR_DB = 16.0
+"""The model begins anew if it shows a pair worse, once it has learnt it: the feed shows something else."""
+MAX_LOST_S = 1.0
+"""Seconds of the source's clock after which a lost camera's frame begins a model in a world of its own."""
 MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
 MANY_CORES = 4
@@ -69,7 +73,7 @@ class Added(StrEnum):
     LOST = "lost"
     """The moving camera's pose was not found."""
     RESTARTED = "restarted"
-    """Training diverged; the model began anew with this pair."""
+    """The model showed something else, was lost for long or diverged, and began anew with this pair."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,7 @@ class Follower:
         on_segment: Callable[[TrainedScene], None] = ignore,
     ) -> None:
         self.settings = settings or FollowSettings()
-        self.segments: deque[TrainedScene] = deque()
+        self.segments: tuple[TrainedScene, ...] = ()
         self.used = 0
         self.iteration = 0
         self._calibration, self._device, self._on_segment = calibration, device, on_segment
@@ -124,6 +128,9 @@ class Follower:
         self._scene: tuple[int, TrainedScene] | None = None
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
         self._rehearsed = 0
+        self._flow: FlowStart
+        self._placer: Placer
+        self._cover: Cover
         torch.set_num_threads(1)  # the kernels have threads of their own
 
     @property
@@ -146,20 +153,18 @@ class Follower:
             ready = reading.result()
             if isinstance(ready, Added):
                 return ready
-            if self._window is None:
-                self._start(ready)
-                self._learn(end_s, self.settings.first_steps)
-                return Added.FIRST
-            self._go_on(self._window, ready)
-            self._learn(end_s, self.settings.steps)
-            self._flow.look_at(self._window.shown())
+            if self._window is None or ready.carried is None:
+                return self._begin(ready, end_s)
+            self._go_on(self._window, ready.moment, ready.carried)
+            self._learn(self._window, end_s, self.settings.steps)
+            shown = self._window.shown()
+            if _psnr_db(shown, ready.moment.clip) < MIN_PSNR_DB:
+                return self._begin(ready, end_s)
+            self._flow.look_at(shown)
         except TrainingDiverged:
+            self._window = None  # what it has learnt is lost
             ready = reading.result()
-            if isinstance(ready, Added):
-                self._window = None  # the next pair is the first one
-                return ready
-            self._start(ready)
-            return Added.RESTARTED
+            return ready if isinstance(ready, Added) else self._begin(ready, end_s)
         return Added.FOLLOWED
 
     def read(self, pair: FeedPair) -> DepthClip | None:
@@ -182,7 +187,7 @@ class Follower:
         if scene is None:
             return None
         if source_s is not None and source_s < scene.frame_times_s[0]:
-            earlier = [each for each in tuple(self.segments) if each.frame_times_s[0] <= source_s]
+            earlier = [each for each in self.segments if each.frame_times_s[0] <= source_s]
             scene = earlier[-1] if earlier else next(iter(self.segments), scene)
         last = scene.frame_count - 1
         place = last if source_s is None else np.interp(source_s, scene.frame_times_s, np.arange(last + 1))
@@ -192,7 +197,7 @@ class Follower:
         """The scene of the window."""
         with self._lock:
             if self._window is None:
-                return None
+                return None if self._scene is None else self._scene[1]
             if self._scene is None or self._scene[0] != self.used:
                 self._scene = self.used, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
             return self._scene[1]
@@ -204,81 +209,83 @@ class Follower:
             if clip is None:
                 return Added.NO_SCENE
             window = self._window
+            if window is not None and self.settings.camera == "moving":
+                placed = self._placer.placed(clip)
+                if placed is None and pair.source_s - window.newest.source_s < MAX_LOST_S:
+                    return Added.LOST
+                clip, window = placed or clip, None if placed is None else window
             if window is None:
                 self._flow, self._placer = FlowStart(clip), Placer(clip)
-                scale = units_per_mm(clip, [0])
-                return _Ready(Moment.of(clip, pair, scale), scale, None)
-            if self.settings.camera == "moving":
-                clip = self._placer.placed(clip)
-                if clip is None:
-                    return Added.LOST
-            return _Ready(Moment.of(clip, pair, window.scale), window.scale, self._flow.to(clip))
+                return _Ready(Moment.of(clip, pair, units_per_mm(clip, [0])), None)
+            return _Ready(Moment.of(clip, pair, window.scale), self._flow.to(clip))
 
-    def _start(self, ready: _Ready) -> None:
-        """Begin a model with a frame."""
-        clip, seed = ready.moment.clip, self.settings.seed
-        scale = ready.scale
-        stride = stride_for(self.settings.points, clip.intrinsics)
-        cloud = fuse(clip, [0], FusionSettings(mode="fill", stride=stride), seed=seed, right=clip.right)
-        gaussians = with_spares(start_gaussians(cloud, INSTANT, scale), self.settings.spare)
-        first = ready.moment
+    def _begin(self, ready: _Ready, end_s: float) -> Added:
+        """Begin a model with a frame; the one that was there becomes a segment."""
+        moment, settings, is_first = ready.moment, self.settings, self.used == 0
+        if self._window is not None:
+            self._keep(self._window.scene(0, len(self._window.moments), seed=settings.seed))
+        stride = stride_for(settings.points, moment.clip.intrinsics)
+        fusion = FusionSettings(mode="fill", stride=stride)
+        cloud = fuse(moment.clip, [0], fusion, seed=settings.seed, right=moment.clip.right)
+        gaussians = with_spares(start_gaussians(cloud, INSTANT, moment.scale), settings.spare)
+        window = Window(gaussians, moment, settings.segment_frames, self._device)
         with self._lock:
-            self._cover = Cover(len(gaussians), stride)
-            self._window = Window(gaussians, first, scale, self.settings.segment_frames, self._device)
-            self.used, self.iteration = self.used + 1, 0
+            self._window, self._cover = window, Cover(len(gaussians), stride)
+            self.used, self.iteration, self._rehearsed = self.used + 1, 0, 0
+        self._learn(window, end_s, settings.first_steps)
+        self._flow.look_at(window.shown())
+        return Added.FIRST if is_first else Added.RESTARTED
 
-    def _go_on(self, window: Window, ready: _Ready) -> None:
+    def _go_on(self, window: Window, moment: Moment, carried: Carried) -> None:
         """Carry the model to the next frame; write a segment off where the window is full."""
         if window.is_full:
             self._write_off(window)
-        assert ready.carried is not None
         means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
-        moved_mm, colour = ready.carried.of(means_mm)
+        moved_mm, colour = carried.of(means_mm)
         with self._lock:
-            window.append(ready.moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
+            window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
             self.used += 1
             self._cover.renew(window)
 
     def _write_off(self, window: Window) -> None:
-        """Make the window's first segment a scene of the past, and forget the oldest of them."""
+        """Make the window's first segment a scene of the past."""
         assert self._eyes is not None
         count = self.settings.segment_frames
-        segment = window.scene(0, count + 1, seed=self.settings.seed)  # one more frame, so that no gap is between them
-        self._on_segment(segment)
+        self._keep(window.scene(0, count + 1, seed=self.settings.seed))  # one more frame: no gap is between them
         with self._lock:
-            self.segments.append(segment)
-            while self.segments[0].frame_times_s[-1] < segment.frame_times_s[-1] - self.settings.keep_s:
-                self.segments.popleft()
             window.give_up()
         self._eyes.follow_range(window.newest.clip)
 
+    def _keep(self, segment: TrainedScene) -> None:
+        """Add a segment, and forget those before keep_s."""
+        self._on_segment(segment)
+        kept = [*self.segments, segment]
+        begins_s = segment.frame_times_s[-1] - self.settings.keep_s
+        self.segments = tuple(each for each in kept if each.frame_times_s[-1] >= begins_s)
+
     def _rehearse(self, reading: Future[_Ready | Added]) -> None:
         """Train frames of the window: half the steps given or, if None, until the pair is read."""
-        steps = self.settings.steps
-        made = self._rehearsed = 0
-        if self._window is None:
-            return
+        window, steps, made = self._window, self.settings.steps, 0
         with alone(is_alone=cores() < MANY_CORES):
-            while made < steps // 2 if steps is not None else not reading.done():
-                slots = len(self._window.moments)
-                slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(slots))
-                self._step(self._window, slot)
+            while window is not None and (made < steps // 2 if steps is not None else not reading.done()):
+                self._step(window, self._drawn(window))
                 made += 1
         self._rehearsed = made
 
-    def _learn(self, end_s: float, steps: int | None) -> None:
-        """Train the newest frame, and others in turn once it had as many steps as they."""
-        window, made = self._window, 0
-        assert window is not None
+    def _learn(self, window: Window, end_s: float, steps: int | None) -> None:
+        """Train the newest frame; once it had as many steps as others had beside its reading, others in turn."""
+        made, others = 0, self._rehearsed
         fixed = self.settings.steps is not None
-        rehearsed = self._rehearsed
-        while made + self._rehearsed < (steps or 0) if fixed else (made < MIN_STEPS or time.perf_counter() < end_s):
-            slot = window.slot
-            if made - (rehearsed - self._rehearsed) > rehearsed:
-                slot = int(np.random.default_rng([self.settings.seed, self.iteration]).integers(slot + 1))
-                rehearsed += 1
+        while made + self._rehearsed < (steps or 0) if fixed else made < MIN_STEPS or time.perf_counter() < end_s:
+            slot, newest = window.slot, made - (others - self._rehearsed)
+            if newest > others:
+                slot, others = self._drawn(window), others + 1
             self._step(window, slot)
             made += 1
+
+    def _drawn(self, window: Window) -> int:
+        """A slot of the window, drawn by the number of the step."""
+        return int(np.random.default_rng([self.settings.seed, self.iteration]).integers(len(window.moments)))
 
     def _step(self, window: Window, slot: int) -> None:
         """One step on the frame in a slot. Raises TrainingDiverged."""
@@ -295,5 +302,9 @@ class _Ready:
     """A pair that was read, and the motion to it; None where there is no frame before it."""
 
     moment: Moment
-    scale: float
     carried: Carried | None
+
+
+def _psnr_db(shown: DepthClip, clip: DepthClip) -> float:
+    """psnr_tissue of the left eye as the model shows it; NaN without tissue."""
+    return psnr_tissue(shown.rgb[0], clip.rgb[0], clip.tissue[0])

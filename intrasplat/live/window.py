@@ -1,7 +1,7 @@
 """The newest used frames of a feed, and the model that shows them: every frame has a basis of the motion to itself.
 
-A basis is so narrow that at its own frame no other one counts. A frame's weights are thus the state of the Gaussians in
-it, and training one frame leaves the others as they are, but for the canonical state that all share. A stored scene gets
+A basis is so narrow that at its own frame no other one counts. A frame's weights are thus the state of the Gaussians
+in it, and training one frame leaves the others as they are, but for the canonical state that all share. A scene gets
 wider bases (SCENE_WIDTH) between which motion is interpolated, with the same states at the frames.
 
 Symbols: N Gaussians, S frames of a segment, 2 S slots, a slot for each frame; T frames of a scene, C = 14 channels.
@@ -43,13 +43,17 @@ SIDES = (-0.5, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A used frame: the clip of this one frame, the pair's times, and both eyes' targets, left first."""
+    """A used frame: the clip of this one frame, the pair's times, and both eyes' targets, left first.
+
+    scale: optimiser units per mm of the targets.
+    """
 
     clip: DepthClip
     source_s: float
     arrived_at: float
     sequence: int
     frames: tuple[TrainingFrame, ...]
+    scale: float
 
     @classmethod
     def of(cls, clip: DepthClip, pair: FeedPair, scale: float) -> Moment:
@@ -58,7 +62,7 @@ class Moment:
         for eye, side in zip(clip.eyes, SIDES, strict=True):
             frame = TrainingFrames(eye, [0], scale, side).frame(0)
             frames.append(replace(frame, make_target=partial(_same, frame.target)))
-        return cls(clip, pair.source_s, pair.arrived_at, pair.sequence, tuple(frames))
+        return cls(clip, pair.source_s, pair.arrived_at, pair.sequence, tuple(frames), scale)
 
     def at(self, slot: int) -> Moment:
         """The moment in a slot of the window."""
@@ -89,7 +93,7 @@ class WindowPictures:
 class Window:
     """The used frames of up to two segments, and the model. The first S are given up when all slots are taken."""
 
-    def __init__(self, gaussians: Gaussians, first: Moment, scale: float, segment_frames: int, device: Device = CPU):
+    def __init__(self, gaussians: Gaussians, first: Moment, segment_frames: int, device: Device = CPU) -> None:
         """A model in which the first moment is at rest."""
         slots, count = 2 * segment_frames, len(gaussians)
         motion = SharedBasis(
@@ -97,7 +101,7 @@ class Window:
         )
         camera = first.clip.intrinsics
         self.model = make_model(gaussians, motion, camera.width, camera.height, device)
-        self.scale, self.segment_frames = scale, segment_frames
+        self.scale, self.segment_frames = first.scale, segment_frames
         self.moments = [first.at(0)]
 
     @property

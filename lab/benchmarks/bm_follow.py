@@ -8,10 +8,10 @@ views-hz times a second. --pace K: every K-th pair is used and gets --steps step
 
 Scores are psnr_tissue in dB, of the left and the right eye, and causal: `now` is a pair before it trains, as the model
 shows the newest moment; `copy` beside it the last used pair as it is, whose left picture is warped for the right eye;
-`later` is a used pair a second after it came, `between` a pair that was not used, then; with and without detail. `offline` is preset instant on
-all pairs (rectified, matched and masked by the same eyes), at the used ones. flicker: standard deviation over time, in
-grey levels, of the used frames as they are shown a second later, over the fifth of the tissue that changes least in the
-recording; beside it the recording's own, and that of `offline`.
+`later` is a used pair a second after it came, `between` a pair that was not used, then, without and with detail.
+`offline` is preset instant on all pairs (rectified, matched and masked by the same eyes), at the used ones. flicker:
+standard deviation over time, in grey levels, of the used frames as they are shown a second later, over the fifth of the
+tissue that changes least in the recording; beside it the recording's own, and that of `offline`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
-from intrasplat.clip.types import RgbFrame
+from intrasplat.clip.types import Eye, RgbFrame
 from intrasplat.decode import decode_clip
 from intrasplat.decode.decoding import StereoRecording
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
@@ -102,10 +103,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.clips:
         played = played_of(source_of(name), options.fps)
         eyes = EyesSettings(width=options.width, finds_instruments=not options.no_instruments)
-        changed = {name: float(value) if "." in value else int(value) for name, value in options.set}
-        settings = FollowSettings(
-            eyes=eyes, steps=None if options.pace == "real" else options.steps, keep_s=options.seconds, camera=options.camera, **changed
-        )
+        changed: dict[str, Any] = {name: float(text) if "." in text else int(text) for name, text in options.set}
+        settings = FollowSettings(eyes, keep_s=options.seconds, camera=options.camera, **changed)
+        if options.pace != "real":
+            settings = replace(settings, steps=options.steps)
         reader = Follower(played.calibration, settings)
         truth = [reader.read(played.pair(number, 0.0)) for number in range(len(played.pairs))]
         if options.pace == "real":
@@ -235,15 +236,17 @@ def _recorded(truth: Sequence[DepthClip | None], played: Played, found: Found) -
 
 def _joined(clips: Sequence[DepthClip]) -> DepthClip:
     """The clip of these moments."""
-    first = clips[0]
-    assert first.right is not None
-    names = ("rgb", "tissue", "depth_mm", "depth_confidence", "world_from_camera")
-    left, right = (
-        {name: np.concatenate([getattr(eye, name) for eye in eyes]) for name in names}
-        for eyes in (clips, [clip.right for clip in clips])
+    first, rights = clips[0], [clip.right for clip in clips if clip.right is not None]
+    left = _stacked(clips)
+    return replace(
+        first, frame_times_s=np.arange(len(clips)) / 25, right=replace(rights[0], **_stacked(rights)), **left
     )
-    times_s = np.arange(len(clips)) / 25
-    return replace(first, frame_times_s=times_s, right=replace(first.right, **right), **left)
+
+
+def _stacked(eyes: Sequence[Eye]) -> dict[str, Any]:
+    """The arrays of several moments as those of one eye."""
+    parts = [eye.arrays_at(slice(0, 1)) for eye in eyes]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _score_now(
@@ -306,9 +309,7 @@ def _mean(scores: Sequence[Score]) -> Score:
     return left, right
 
 
-def _print(
-    name: str, found: Found, recorded: Sequence[DepthClip], offline: tuple[Score, float] | None
-) -> None:
+def _print(name: str, found: Found, recorded: Sequence[DepthClip], offline: tuple[Score, float] | None) -> None:
     def texts() -> Iterator[str]:
         yield name
         yield f"used {len(found.used) / found.seconds:.2f}/s, {found.steps / len(found.used):.1f} steps each"
