@@ -96,8 +96,8 @@ class LiveEyes:
             return None
         work.matched.rgb[0], work.right.rgb[0] = self._rectified_pair()
         work.match(0)
-        right = replace(work.right, **_copies(work.right))
-        return replace(work.matched, frame_times_s=np.array([time_s]), right=right, **_copies(work.matched))
+        other = replace(work.right, **_copies(work.right))
+        return replace(work.matched, frame_times_s=np.array([time_s]), right=other, **_copies(work.matched))
 
     def follow_range(self, moment: DepthClip) -> None:
         """Search the disparities that a moment shows from now on."""

@@ -127,7 +127,7 @@ class Follower:
         self._lock = Lock()
         self._scene: tuple[int, TrainedScene] | None = None
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
-        self._rehearsed = 0
+        self._rehearsed = self._version = 0
         self._flow: FlowStart
         self._placer: Placer
         self._cover: Cover
@@ -161,11 +161,16 @@ class Follower:
             if _psnr_db(shown, ready.moment.clip) < MIN_PSNR_DB:
                 return self._begin(ready, end_s)
             self._flow.look_at(shown)
+            self._version += 1
         except TrainingDiverged:
             self._window = None  # what it has learnt is lost
             ready = reading.result()
             return ready if isinstance(ready, Added) else self._begin(ready, end_s)
         return Added.FOLLOWED
+
+    def close(self) -> None:
+        """End the thread that reads pairs. Scenes can still be had; no pair can be added."""
+        self._reader.shutdown()
 
     def read(self, pair: FeedPair) -> DepthClip | None:
         """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
@@ -198,8 +203,8 @@ class Follower:
         with self._lock:
             if self._window is None:
                 return None if self._scene is None else self._scene[1]
-            if self._scene is None or self._scene[0] != self.used:
-                self._scene = self.used, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
+            if self._scene is None or self._scene[0] != self._version:
+                self._scene = self._version, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
             return self._scene[1]
 
     def _prepared(self, pair: FeedPair) -> _Ready | Added:
@@ -232,8 +237,10 @@ class Follower:
         with self._lock:
             self._window, self._cover = window, Cover(len(gaussians), stride)
             self.used, self.iteration, self._rehearsed = self.used + 1, 0, 0
+            self._version += 1
         self._learn(window, end_s, settings.first_steps)
         self._flow.look_at(window.shown())
+        self._version += 1
         return Added.FIRST if is_first else Added.RESTARTED
 
     def _go_on(self, window: Window, moment: Moment, carried: Carried) -> None:
@@ -244,7 +251,7 @@ class Follower:
         moved_mm, colour = carried.of(means_mm)
         with self._lock:
             window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
-            self.used += 1
+            self.used, self._version = self.used + 1, self._version + 1
             self._cover.renew(window)
 
     def _write_off(self, window: Window) -> None:

@@ -29,6 +29,7 @@ class FlowStart:
         self._grid = PointGrid(first, min(-(-camera.width // FLOW_WIDTH), least))
         self._last = CoarseFrame(first, 0, self._grid)
         self._focal = camera.fx / self._grid.step
+        assert first.right is not None
         baseline_mm = np.linalg.norm(first.right.world_from_camera[0, :3, 3] - first.world_from_camera[0, :3, 3])
         self._focal_baseline = self._focal * float(baseline_mm)
 
@@ -76,4 +77,4 @@ class Carried:
         row = np.clip(np.rint(row), 0, height - 1).astype(np.intp)
         column = np.clip(np.rint(column), 0, width - 1).astype(np.intp)
         moved_mm, colour = (np.ascontiguousarray(each[row, column].T) for each in (self.displacement_mm, self.colour))
-        return moved_mm, colour / np.float32(SH_C0)
+        return moved_mm, np.asarray(colour / np.float32(SH_C0), np.float32)
