@@ -105,23 +105,32 @@ class Frames:
         if right is not None:
             baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
+        self._others: dict[int, DepthClip] = {}
         self._cache: dict[int, TrackedFrame] = {}
         self._landmarks: dict[int, Landmarks] = {}
         self._thread = local()
 
+    def take(self, index: int, moment: DepthClip) -> None:
+        """Frame `index` is that of a clip of one frame, of the same cameras, which need not be one of this clip."""
+        self._others[index] = moment
+
+    def _source(self, index: int) -> tuple[DepthClip, int]:
+        """The clip of a frame, and its index there."""
+        return (self._others[index], 0) if index in self._others else (self._clip, index)
+
     def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
         if index not in self._cache:
-            clip, step = self._clip, self._step
-            grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), step)
+            (clip, place), step = self._source(index), self._step
+            grey = cell_means(cv2.cvtColor(clip.rgb[place], cv2.COLOR_RGB2GRAY), step)
             height, width = grey.shape
             pick = slice(step // 2, None, step)
-            depth_mm = clip.depth_mm[index][pick, pick][:height, :width]
-            usable = clip.tissue[index][pick, pick][:height, :width] & (depth_mm > 0)
-            confidence = clip.depth_confidence[index][pick, pick][:height, :width] / np.float32(255)
+            depth_mm = clip.depth_mm[place][pick, pick][:height, :width]
+            usable = clip.tissue[place][pick, pick][:height, :width] & (depth_mm > 0)
+            confidence = clip.depth_confidence[place][pick, pick][:height, :width] / np.float32(255)
             ratio = np.float32(self.camera.fx * self.camera.baseline_mm)
             disparity = np.where(usable, ratio / np.maximum(depth_mm, 1e-3), np.float32(0))
-            clip.let_go(index)
+            clip.let_go(place)
             self._cache[index] = TrackedFrame(
                 grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0))
             )
@@ -129,14 +138,14 @@ class Frames:
 
     def forget(self, index: int) -> None:
         """Free a frame's memory."""
-        self._cache.pop(index, None)
-        self._landmarks.pop(index, None)
+        for each in (self._cache, self._landmarks, self._others):
+            each.pop(index, None)
 
     def far_motion(self, a: int, b: int) -> FarMotion | None:
         """The motion from frame a to frame b, however far apart; None: they show no common tissue that matches."""
         for index in (a, b):
             if index not in self._landmarks:
-                self._landmarks[index] = landmarks(self._clip, index, self.camera, self._step)
+                self._landmarks[index] = landmarks(*self._source(index), self.camera, self._step)
         return far_motion(self.camera, self._landmarks[a], self._landmarks[b])
 
     def far_link(self, a: int, b: int, far: FarMotion) -> tuple[FrameLink, Aligned]:
