@@ -97,7 +97,7 @@ class Decoder:
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
-        self.close: Callable[[], None] = weakref.finalize(self, end_and_remove, self._process, self.folder)
+        self.close: Callable[[], None] = weakref.finalize(self, _end_and_remove, self._process, self.folder)
         """End the process if it still runs, and remove its folder."""
 
     @property
@@ -229,8 +229,7 @@ def take_decoder() -> Decoder:
     return decoder if decoder.is_alive else Decoder()
 
 
-def end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Kill a process if it still runs, close its pipes, and remove its folder."""
+def _end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:
     if process.poll() is None:
         process.kill()
         process.wait()
