@@ -31,8 +31,9 @@ _CLONE_THREAD = 0x00010000
 _X32_CALLS = 0x40000000  # a second numbering of the same calls, on x86-64
 
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+_SOCKET = {"x86_64": 41, "aarch64": 198}
 _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
-    "socket": (41, 198),
+    "socket": (_SOCKET["x86_64"], _SOCKET["aarch64"]),
     "socketpair": (53, 199),
     "connect": (42, 203),
     "fork": (57, None),
@@ -143,7 +144,7 @@ def _instructions(machine: str, with_sockets: bool) -> list[tuple[int, int, int,
         ]
     if with_sockets:
         program += [
-            (_JUMP_IF_EQUAL, 0, 5, _FORBIDDEN["socket"][column]),
+            (_JUMP_IF_EQUAL, 0, 5, _SOCKET[machine]),
             (_LOAD, 0, 0, _FIRST_ARGUMENT_AT),
             (_JUMP_IF_EQUAL, 2, 0, socket.AF_INET),
             (_JUMP_IF_EQUAL, 1, 0, socket.AF_INET6),

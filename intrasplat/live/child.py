@@ -12,6 +12,7 @@ import json
 import os
 import ssl
 import sys
+import threading
 from pathlib import Path
 
 
@@ -36,7 +37,12 @@ def main() -> None:
     lock_in(Allowance(**request["allowance"]), readable, Path.cwd(), devices, source.get("port"))
     if os.getppid() != request["parent"]:  # the parent ended before lock_in could register for its death
         return
-    Reader(request, Answers(descriptor), tls).run()
+    answers = Answers(descriptor)
+    threading.excepthook = lambda raised: answers.fail(raised.exc_value)
+    try:
+        Reader(request, answers, tls).run()
+    except Exception as error:
+        answers.fail(error)
 
 
 if __name__ == "__main__":

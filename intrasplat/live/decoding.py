@@ -7,7 +7,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any
+from typing import Any, cast
 
 import av
 import av.error
@@ -165,7 +165,8 @@ class Decoding:
         with self._filled:
             self._queue.append(None)
             self._filled.notify()
-        self._thread.join(limit_s)
+        if self._thread.is_alive():
+            self._thread.join(limit_s)
 
     def _run(self) -> None:
         try:
@@ -213,12 +214,12 @@ class Decoding:
             arrivals.pop(next(iter(arrivals)))
         self._decode(number, packet, place)
 
-    def _context(self, arrived: Arrived) -> Any:
+    def _context(self, arrived: Arrived) -> av.VideoCodecContext:
         context = self._contexts.get(arrived.stream)
         if context is None or context.codec.name != arrived.codec:  # pushed pictures may change their codec
-            context = av.CodecContext.create(arrived.codec, "r")
+            context = cast(av.VideoCodecContext, av.CodecContext.create(arrived.codec, "r"))
             context.options = {"max_pixels": str(self._max_pixels)}
-            self._contexts[arrived.stream] = context  # type: ignore[assignment]
+            self._contexts[arrived.stream] = context
         return context
 
     def _has_newer_key(self, number: int) -> bool:
@@ -316,11 +317,9 @@ class Decoding:
         self._next_check_s = time.monotonic() + CHECK_PERIOD_S
         assert self.shape is not None
         own: Packing = "sbs" if self.shape.packing == "sbs" else "tb"
+        other: Packing = "tb" if own == "sbs" else "sbs"
         likeness = packing_likeness(self._convert(frame))
-        other = None if likeness is None else likeness["tb" if own == "sbs" else "sbs"]
-        is_other = (
-            likeness is not None and other is not None and other >= max(MIN_LIKENESS, likeness[own] + CLEAR_MARGIN)
-        )
+        is_other = likeness is not None and likeness[other] >= max(MIN_LIKENESS, likeness[own] + CLEAR_MARGIN)
         self._doubts = self._doubts + 1 if is_other else 0
         if self._doubts >= CHECKS:
             raise SourceEnd(FeedReason.PACKING_CHANGED, "the pictures hold the eyes in another way than before")

@@ -122,9 +122,10 @@ class ReadingProcess:
             for line in lines_of(self._process):
                 if line is not None:
                     self._take(json.loads(line))
+                if self.end_reason is None:
+                    yield
                 if self.end_reason is not None:
                     break
-                yield
         except MALFORMED:
             self._end(FeedReason.DECODER_ENDED, "the process that reads the source talks nonsense")
         if self.end_reason is None:
@@ -148,7 +149,7 @@ class ReadingProcess:
             pair = self._pair
             self._wanted += pair is None  # an answer from now on is for nobody
         try:
-            return pair and self._read(pair)
+            return None if pair is None else self._read(pair)
         except (*MALFORMED, OSError):
             self._end(FeedReason.DECODER_ENDED, "the process that reads the source hands over no pictures")
             return None
@@ -194,6 +195,17 @@ class ReadingProcess:
 
     def _take(self, line: dict[str, Any]) -> None:
         """Note a line. Raises one of MALFORMED for nonsense."""
+        if "received" in line:
+            self._note(line)
+        if "end" in line:
+            self._end(FeedReason(line["end"]), str(line["text"])[:300])
+        elif "pair" in line:
+            with self._answered:
+                if line["pair"]["want"] == self._wanted:
+                    self._pair = dict(line["pair"])
+                    self._answered.notify_all()
+
+    def _note(self, line: dict[str, Any]) -> None:
         shape = line["shape"]
         if shape is not None:
             height, width, packing, aspect = int(shape[0]), int(shape[1]), str(shape[2]), float(shape[3])
@@ -216,13 +228,6 @@ class ReadingProcess:
             parts=int(line["parts"]),
             recording=line["recording"] and FeedReason(line["recording"]),
         )
-        if "end" in line:
-            self._end(FeedReason(line["end"]), str(line["text"])[:300])
-        elif "pair" in line:
-            with self._answered:
-                if line["pair"]["want"] == self._wanted:
-                    self._pair = dict(line["pair"])
-                    self._answered.notify_all()
 
     def _check_size(self, height: int, width: int) -> None:
         if min(height, width) < MIN_SIDE_PX // 2 or height * width > self._max_pixels:

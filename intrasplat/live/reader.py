@@ -9,9 +9,10 @@ import ssl
 import sys
 import threading
 import time
+import traceback
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from intrasplat.clip.video_stream import RgbConverter
 from intrasplat.errors import InputError
@@ -54,6 +55,13 @@ class Answers:
                 os._exit(1)
             return True
 
+    def fail(self, error: BaseException | None) -> NoReturn:
+        """End this process, because one of its threads failed."""
+        place = "".join(traceback.format_tb(None if error is None else error.__traceback__)[-1:]).strip()
+        text = f"the process that reads the source failed ({type(error).__name__}; {place})"
+        self.send({"end": FeedReason.DECODER_ENDED, "text": text[:300]}, last=True)
+        os._exit(1)
+
 
 class Reader:
     """Reads, records and decodes one source, and hands pairs over."""
@@ -95,9 +103,7 @@ class Reader:
         clock: SourceClock | None = None
         began: tuple[float, float] | None = None
         for arrived in source.packets():
-            packet = arrived.packet
-            stamp = packet.dts if packet.dts is not None else packet.pts
-            stamp_s = float(stamp * packet.time_base)
+            stamp_s = arrived.decoding_s
             if source.is_paced:
                 began = began or (stamp_s, time.time())
                 time.sleep(max(0.0, began[1] + stamp_s - began[0] - time.time()))
@@ -119,12 +125,12 @@ class Reader:
         recorder, packet = self._recorder, arrived.packet
         assert recorder is not None
         if picture and not recorder.is_started:
-            newest = self._decoding.newest
-            if newest is None:
+            size = arrived.picture_size()
+            if size is None:
                 return
-            size = {"width": newest.left.width, "height": newest.left.height}
-            recorder.start(arrived.codec, lambda out: out.add_mux_stream(arrived.codec, rate=30, **size))
-        pts_s = float(packet.pts * packet.time_base)
+            height, width = size
+            recorder.start(arrived.codec, lambda out: out.add_mux_stream(arrived.codec, width=width, height=height))
+        pts_s = arrived.shown_s
         recorder.add(
             Recorded(
                 bytes(packet), packet.is_keyframe, place.offset_s + pts_s, place.offset_s + stamp_s, place.epoch,
@@ -167,7 +173,8 @@ class Reader:
                 ):  # fmt: skip
                     decoding.changed.wait()
                 newest, shape, want = decoding.newest, decoding.shape, self._want[0]
-            assert newest is not None and shape is not None
+            assert newest is not None
+            assert shape is not None
             if self._give(newest, shape, want):
                 answered = want
             else:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import av
 import av.container
@@ -53,6 +53,25 @@ class Arrived:
     stream: int
     arrived_at: float
     codec: str
+
+    @property
+    def shown_s(self) -> float:
+        """When it is shown, s of the source's clock."""
+        return float(Fraction(self.packet.pts or 0) * self.packet.time_base)
+
+    @property
+    def decoding_s(self) -> float:
+        """When it is decoded, s of the source's clock."""
+        stamp = self.packet.dts if self.packet.dts is not None else self.packet.pts
+        return float(Fraction(stamp or 0) * self.packet.time_base)
+
+    def picture_size(self) -> tuple[int, int] | None:
+        """Height and width of a picture that is coded by itself; None if it is damaged."""
+        try:
+            frames = cast(av.VideoCodecContext, av.CodecContext.create(self.codec, "r")).decode(self.packet)
+        except (av.error.FFmpegError, ValueError):
+            return None
+        return (frames[0].height, frames[0].width) if frames else None
 
 
 class Bytes:
@@ -125,19 +144,19 @@ class PacketSource:
         try:
             if "rtsp" in self._request:
                 own = {"protocol_whitelist": "rtsp,rtp,tcp", "rtsp_transport": "tcp"}
-                return av.open(self._request["rtsp"], format="rtsp", options=options | PROBE | own)
+                return av.open(str(self._request["rtsp"]), "r", format="rtsp", options=options | PROBE | own)
             if "device" in self._request:
                 options["codec_whitelist"] += ",rawvideo"
                 options |= {str(name): str(value) for name, value in self._request["options"].items()}
                 own = {"protocol_whitelist": "file"}
-                return av.open(self._request["device"], format="video4linux2", options=options | own)
+                return av.open(str(self._request["device"]), "r", format="video4linux2", options=options | own)
             if self._bytes is None:
                 path = Path(self._request["file"])
                 with path.open("rb") as file:
                     form = _format(file.read(12))
-                return av.open(str(path), format=form, options=options | {"protocol_whitelist": "file"})
+                return av.open(str(path), "r", format=form, options=options | {"protocol_whitelist": "file"})
             form = _format(self._bytes.head(12))
-            return av.open(self._bytes, format=form, options=options | PROBE)
+            return av.open(self._bytes, "r", format=form, options=options | PROBE)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             if isinstance(error, (EOFError, ConnectionError)):
                 raise SourceEnd(FeedReason.CLOSED, "the source closed the connection before a picture came") from error

@@ -1,25 +1,28 @@
-"""The newest stereo pair of a live source. A confined process reads it; a thread here watches that process, and replaces
-it when it ends, hangs or is killed."""
+"""The newest stereo pair of a live source. A confined process reads it; a thread here watches that process, and starts
+another when it ends, hangs or is killed."""
 
 from __future__ import annotations
 
+import logging
 import math
-import os
 import random
-import select
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
-from intrasplat.errors import InputError, UnavailableError
+from intrasplat.errors import InputError
 from intrasplat.live.connecting import Connection, ConnectionFailed, connect
 from intrasplat.live.cut import Cut, cut_parts
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.parts import Part, Parts
 from intrasplat.live.process import HandedOver, Numbers, ReadingProcess
+from intrasplat.live.push import Push
 from intrasplat.live.spec import FIELD, PICTURE_HEADER, SourceKind, SourceSpec
 from intrasplat.live.state import FeedNumbers, FeedReason, FeedState, FeedStatus, Segment
+
+logger = logging.getLogger(__name__)
 
 BEHIND_S = 0.5
 """With a longer lag of decoding the feed is behind."""
@@ -64,9 +67,8 @@ class Source:
         self._last_given: tuple[int, float] = (0, 0.0)
         self._segment: Segment | None = None
         self._window: deque[tuple[float, int, int]] = deque()
-        self._push_lock = threading.Lock()
-        self._push: int | None = None
-        self._push_wanted, self._push_broken = False, False
+        is_pushed = self._target.kind in PUSHED
+        self._push = Push(self._changed, lambda: self._is_deaf) if is_pushed else None
         self._thread = threading.Thread(target=self._run, name="live-source", daemon=True)
         self._thread.start()
 
@@ -135,6 +137,8 @@ class Source:
         """Go on at the source's present."""
         with self._changed:
             self._paused = False
+            if self._status.state is FeedState.PAUSED:
+                self._set(FeedState.CONNECTING, None, "")
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -160,65 +164,26 @@ class Source:
         """Push bytes of a stream (fragmented mp4, MPEG-TS, Matroska). They are discarded while the feed is paused.
 
         Raises:
+            InputError: this source is not pushed.
             UnavailableError: the push was cut off, as when its process ended, and must begin anew; or the bytes were
                 not taken in time.
         """
-        if self._target.kind not in PUSHED:
+        if self._push is None:
             raise InputError(FIELD, "this source is not pushed.", "Leave out its URL.")
-        deadline_s = time.monotonic() + timeout_s
-        with self._push_lock:
-            view = memoryview(data)
-            while view:
-                pipe = self._push_pipe(deadline_s)
-                if pipe is None:
-                    return
-                if not select.select([], [pipe], [], min(0.1, max(0.0, deadline_s - time.monotonic())))[1]:
-                    if time.monotonic() > deadline_s:
-                        raise _cut_off("The pushed bytes were not taken in time.")
-                    continue
-                try:
-                    view = view[os.write(pipe, view) :]
-                except BlockingIOError:
-                    continue
-                except BrokenPipeError:
-                    self._close_push(broken=True)
+        self._push.write(data, timeout_s)
 
     def write_picture(self, data: bytes, captured_s: float | None = None, timeout_s: float = 10.0) -> None:
         """Push a JPEG or WebP picture of both eyes. captured_s: the sender's clock; None: it is shown as it comes in.
 
-        Raises:
-            UnavailableError: as write.
+        Raises as write.
         """
-        self.write(PICTURE_HEADER.pack(math.nan if captured_s is None else captured_s, len(data)) + data, timeout_s)
+        stamp_s = math.nan if captured_s is None else captured_s
+        self.write(PICTURE_HEADER.pack(stamp_s, len(data)) + data, timeout_s)
 
     def end_push(self) -> None:
         """The pushed stream has ended; another may begin."""
-        with self._push_lock:
-            self._close_push(broken=False)
-
-    def _push_pipe(self, deadline_s: float) -> int | None:
-        """The pipe to push to; None while the feed is paused or has ended."""
-        with self._changed:
-            while True:
-                if self._paused or self._closed or self._status.state is FeedState.ENDED:
-                    return None
-                if self._push_broken:
-                    self._push_broken = False
-                    raise _cut_off("The process that reads the push ended.")
-                if self._push is not None:
-                    return self._push
-                self._push_wanted = True
-                self._changed.notify_all()
-                if time.monotonic() > deadline_s:
-                    raise _cut_off("Nothing takes the push.")
-                self._changed.wait(0.1)
-
-    def _close_push(self, *, broken: bool) -> None:
-        with self._changed:
-            pipe, self._push, self._push_wanted = self._push, None, False
-            self._push_broken = broken and pipe is not None
-        if pipe is not None:
-            os.close(pipe)
+        if self._push is not None:
+            self._push.end()
 
     def _given(self, pair: HandedOver, numbers: Numbers, segments: int, ended_for: FeedReason | None) -> FeedPair:
         with self._changed:
@@ -234,19 +199,25 @@ class Source:
             return FeedPair(pair.left, pair.right, source_s, pair.arrived_at, pair.sequence)
 
     def _run(self) -> None:
+        try:
+            self._read()
+        except Exception as error:
+            logger.exception("a live source failed")
+            self._set(FeedState.ENDED, FeedReason.FAULT, f"a fault of the program ({type(error).__name__})")
+
+    def _read(self) -> None:
         failures = 0
         while not self._closed:
             if self._paused:
                 self._set(FeedState.PAUSED, FeedReason.BY_HAND, "paused by hand")
                 self._wait(lambda: not self._paused, None)
-                self._set(FeedState.CONNECTING, None, "")
                 failures = 0
                 continue
-            if self._target.kind in PUSHED and not self._wait(lambda: self._push_wanted or self._paused, None):
+            if not self._wait(self._is_wanted, None) or self._is_interrupted():
                 continue
             before = self._sequence
             reason, text = self._connected()
-            if self._closed or self._paused:
+            if self._is_interrupted():
                 continue
             self._ended_for = reason
             is_over = reason is FeedReason.END_OF_FILE
@@ -255,19 +226,31 @@ class Source:
                 break
             self._set(FeedState.STALLED, reason, text)
             failures = 0 if self._sequence > before else failures + 1
-            if self._target.kind not in PUSHED:
+            if self._push is None:
                 self._wait(lambda: self._paused, self._back_off_s(failures))
         if self._status.state is not FeedState.ENDED:
             self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
+
+    def _is_interrupted(self) -> bool:
+        """Whether the caller wants no connection any more."""
+        return self._closed or self._paused
+
+    def _is_wanted(self) -> bool:
+        """Whether there is a reason to stop waiting for a push."""
+        return self._push is None or self._push.is_wanted or self._paused
+
+    @property
+    def _is_deaf(self) -> bool:
+        """Whether what is pushed is discarded."""
+        return self._paused or self._closed or self._status.state is FeedState.ENDED
 
     def _back_off_s(self, failures: int) -> float:
         back_off = self._spec.back_off
         longest_s = min(back_off.most_s, back_off.first_s * 2.0 ** min(failures, 30))
         return longest_s * random.uniform(0.5, 1.0)
 
-    def _wait(self, enough: object, timeout_s: float | None) -> bool:
+    def _wait(self, enough: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until `enough()`, the end or the time; meanwhile old parts go. Whether `enough()`."""
-        assert callable(enough)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._closed and not enough():
             left_s = PRUNE_PERIOD_S if deadline_s is None else deadline_s - time.monotonic()
@@ -294,7 +277,7 @@ class Source:
         try:
             self._watch(process)
         finally:
-            if self._closed or self._paused:
+            if self._is_interrupted():
                 process.stop(STOP_S)
             process.close(FeedReason.DECODER_ENDED, "")
             self._end_connection(connection, process)
@@ -317,7 +300,9 @@ class Source:
         folder = self.parts.incoming if self.parts else None
         process = ReadingProcess(connection, request, folder, self._spec.limits.pixels_per_frame)
         with self._changed:
-            self._process, self._push = process, connection.push
+            self._process = process
+            if self._push is not None:
+                self._push.begin(connection.push)
             self._reconnects += self._connections > 0
             self._connections += 1
             self._changed.notify_all()
@@ -325,9 +310,8 @@ class Source:
 
     def _end_connection(self, connection: Connection, process: ReadingProcess | None) -> None:
         connection.close()
-        if self._target.kind in PUSHED:
-            ended_by_sender = process is not None and process.end_reason is FeedReason.CLOSED
-            self._close_push(broken=not ended_by_sender)
+        if self._push is not None:
+            self._push.cut_off(by_sender=process is not None and process.end_reason is FeedReason.CLOSED)
         if self.parts is not None:
             self.parts.adopt()
             self.parts.clear_incoming()
@@ -346,7 +330,7 @@ class Source:
         received, sequence, parts, prune_s = 0, self._sequence, 0, 0.0
         limits = self._spec.deadlines
         for _ in process.reports():
-            if self._closed or self._paused:
+            if self._is_interrupted():
                 return
             now_s, numbers = time.monotonic(), process.numbers
             with self._changed:
@@ -405,7 +389,3 @@ class Source:
 def open_source(spec: SourceSpec) -> Source:
     """Read a source from now on. Raises as Source."""
     return Source(spec)
-
-
-def _cut_off(problem: str) -> UnavailableError:
-    return UnavailableError(problem, "Begin the push anew.", may_return=True)

@@ -40,6 +40,7 @@ class FeedReason(StrEnum):
     DECODER_ENDED = "decoder_ended"
     DECODER_MEMORY = "decoder_memory"
     TOO_SLOW = "too_slow"
+    FAULT = "fault"
     BY_HAND = "by_hand"
     END_OF_FILE = "end_of_file"
     # of the recording alone
