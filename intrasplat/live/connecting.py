@@ -8,6 +8,7 @@ import socket
 import ssl
 import struct
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,12 +37,14 @@ class Connection:
     passed   file descriptors that it inherits
     push     the end of the pipe that a pushing caller writes to; None: nobody pushes
     relay    the relay of an RTSP connection
+    made_at  UNIX time, s
     """
 
     request: dict[str, Any]
     passed: tuple[int, ...] = ()
     push: int | None = None
     relay: Relay | None = None
+    made_at: float = field(default_factory=time.time)
     _closes: list[Callable[[], None]] = field(default_factory=list)
 
     def close_passed(self) -> None:

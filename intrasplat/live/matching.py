@@ -39,6 +39,11 @@ class Matcher(Generic[Frame]):
         own.clear()  # older ones have no partner any more
         return (time_s, frame, other) if stream == 0 else (other_s, other, frame)
 
+    @property
+    def waiting(self) -> tuple[int, ...]:
+        """Frames of each stream without a partner so far."""
+        return tuple(len(each) for each in self._waiting)
+
     def clear(self) -> None:
         """Leave out all that wait."""
         for each in self._waiting:

@@ -109,6 +109,7 @@ class ReadingProcess:
         connection.close_passed()
         allowance = Allowance(MEMORY_BYTES, MAX_FILE_BYTES, MAX_CPU_S)
         more = {"open": connection.request, "pairs": self._pairs, "max_pixels": max_pixels, "parent": os.getpid()}
+        more["connected_at"] = connection.made_at
         self._send(request | more | {"allowance": asdict(allowance) | request.get("allowance", {})})
 
     @property
@@ -193,8 +194,10 @@ class ReadingProcess:
             self._process.stdin.write(json.dumps(line).encode() + b"\n")
             self._process.stdin.flush()
 
-    def _take(self, line: dict[str, Any]) -> None:
+    def _take(self, line: Any) -> None:
         """Note a line. Raises one of MALFORMED for nonsense."""
+        if not isinstance(line, dict):
+            raise ValueError("a line that is no object")
         if "received" in line:
             self._note(line)
         if "end" in line:

@@ -24,6 +24,8 @@ from intrasplat.live.state import FeedReason
 
 REPORT_PERIOD_S = 0.05
 FINISH_S = 2.0
+WAITED_S = 0.1
+"""A packet that comes sooner after this process is ready had come in before, since the connection was made."""
 MAX_LINE_BYTES = 4096  # written whole or not at all
 
 
@@ -85,14 +87,15 @@ class Reader:
         threading.Thread(target=self._obey, name="orders", daemon=True).start()
         threading.Thread(target=self._hand_over, name="hand-over", daemon=True).start()
         try:
+            began_at = time.time()
             source = PacketSource(self._request["open"], self._tls, self._request["max_pixels"])
-            self._read(source)
+            self._read(source, began_at)
         except SourceEnd as end:
             self._end(end)
         except MemoryError:
             self._end(SourceEnd(FeedReason.DECODER_MEMORY, "reading needs more memory than it may use"))
 
-    def _read(self, source: PacketSource) -> None:
+    def _read(self, source: PacketSource, began_at: float) -> None:
         decoding, recorder = self._decoding, self._recorder
         contexts = [stream.codec_context for stream in source.streams]
         self._codec = contexts[0].codec.name if contexts else ""
@@ -109,9 +112,7 @@ class Reader:
                 time.sleep(max(0.0, began[1] + stamp_s - began[0] - time.time()))
                 arrived = replace(arrived, arrived_at=time.time())
             self._codec = arrived.codec if arrived.stream == 0 else self._codec
-            if clock is None:
-                passed_s = max(0.0, arrived.arrived_at - self._request["start_at"])
-                clock = SourceClock(self._request["start_s"] + passed_s, max(1, len(contexts)))
+            clock = clock or self._clock(arrived, began_at, max(1, len(contexts)))
             place = clock.place(stamp_s, arrived.arrived_at)
             self._last_at = arrived.arrived_at
             if recorder is not None and arrived.stream == 0:
@@ -120,6 +121,13 @@ class Reader:
             self._answers.send(self._numbers())
             if decoding.end is not None:
                 raise decoding.end
+
+    def _clock(self, first: Arrived, began_at: float, streams: int) -> SourceClock:
+        """The clock whose first frame is the feed's first, or lies as long after its last one as it came in later."""
+        waited = "input" in self._request["open"] and first.arrived_at - began_at < WAITED_S
+        first_at = self._request["connected_at"] if waited else first.arrived_at
+        passed_s = max(0.0, first_at - self._request["start_at"])
+        return SourceClock(self._request["start_s"] + passed_s - (first.shown_s - first.decoding_s), streams)
 
     def _record(self, arrived: Arrived, stamp_s: float, place: Place, *, picture: bool) -> None:
         recorder, packet = self._recorder, arrived.packet
