@@ -16,7 +16,8 @@ from tests.live.test_sources import shown
 
 PYTHON = "/usr/bin/python3"
 PROBE = (
-    "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import Gst, GstRtspServer; Gst.init(None)\n"
+    "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import Gst, GstRtspServer\n"
+    "Gst.init(None)\n"
     "assert all(Gst.ElementFactory.find(each) for each in ('matroskademux', 'rtph264pay'))"
 )
 
