@@ -23,7 +23,6 @@ from intrasplat.intake.video_header import CODECS, EBML, is_video
 from intrasplat.live.spec import PICTURE_HEADER
 from intrasplat.live.state import FeedReason
 
-LIVE_CODECS = (*CODECS, "mjpeg")
 PICTURE_CODECS = {b"\xff\xd8\xff": "mjpeg", b"RIFF": "webp"}
 MAX_PICTURE_BYTES = 32 << 20
 PICTURE_TICK = Fraction(1, 1_000_000)
@@ -140,7 +139,7 @@ class PacketSource:
         raise SourceEnd(*self._at_end)
 
     def _opened(self) -> av.container.InputContainer:
-        options = {"codec_whitelist": ",".join(LIVE_CODECS), "max_pixels": str(self._max_pixels)}
+        options = {"codec_whitelist": ",".join(CODECS), "max_pixels": str(self._max_pixels)}
         try:
             if "rtsp" in self._request:
                 own = {"protocol_whitelist": "rtsp,rtp,tcp", "rtsp_transport": "tcp"}
@@ -165,10 +164,10 @@ class PacketSource:
             raise SourceEnd(FeedReason.REFUSED if is_network else FeedReason.UNDECODABLE, text) from error
 
     def _videos(self, container: av.container.InputContainer) -> list[av.VideoStream]:
-        known = (*LIVE_CODECS, "rawvideo") if "device" in self._request else LIVE_CODECS
+        known = (*CODECS, "rawvideo") if "device" in self._request else CODECS
         videos = [each for each in container.streams.video if each.codec_context and each.codec_context.name in known]
         if not videos:
-            accepted = ", ".join(LIVE_CODECS)
+            accepted = ", ".join(CODECS)
             raise SourceEnd(FeedReason.NO_VIDEO, f"the source has no video with one of the codecs {accepted}")
         return videos[:MAX_STREAMS]
 
