@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import ssl
 import sys
 import threading
 from pathlib import Path
@@ -31,7 +30,6 @@ def main() -> None:
     request = json.loads(line)
     av.logging.set_level(None)
     source = request["open"]
-    tls = ssl.create_default_context() if source.get("http", {}).get("secure") else None
     readable = [Path(each) for each in source.get("readable", ())]
     devices = [Path(source["device"])] if "device" in source else []
     lock_in(Allowance(**request["allowance"]), readable, Path.cwd(), devices, source.get("port"))
@@ -40,7 +38,7 @@ def main() -> None:
     answers = Answers(descriptor)
     threading.excepthook = lambda raised: answers.fail(raised.exc_value)
     try:
-        Reader(request, answers, tls).run()
+        Reader(request, answers).run()
     except Exception as error:
         answers.fail(error)
 

@@ -36,7 +36,7 @@ class Connection:
     request  what the reading process is asked to open (intrasplat/live/reading.py)
     passed   file descriptors that it inherits
     push     the end of the pipe that a pushing caller writes to; None: nobody pushes
-    relay    the relay of an RTSP connection
+    relay    of a connection by RTSP or TLS
     made_at  UNIX time, s
     """
 
@@ -81,13 +81,22 @@ def connect(target: Target, spec: SourceSpec) -> Connection:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise ConnectionFailed(FeedReason.UNREACHABLE, f"{target.origin} does not answer: {reason}") from error
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-    if kind is SourceKind.RTSP:
-        return _relayed(connected, target)
+    if target.is_secure:
+        connected = _secured(connected, target)
     connected.settimeout(None)
+    if kind is SourceKind.RTSP:
+        relay = Relay(connected)
+        url = f"rtsp://{target.user}127.0.0.1:{relay.port}{target.path}"
+        return Connection({"rtsp": url, "port": relay.port}, relay=relay)
     if kind is SourceKind.TCP:
         return _inherited(connected, {})
-    http = {"host": target.host, "port": target.port, "path": target.path, "secure": target.is_secure}
-    return _inherited(connected, {"http": http})
+    http = {"http": {"host": f"{bracketed(target.host)}:{target.port}", "path": target.path}}
+    if not target.is_secure:
+        return _inherited(connected, http)
+    ours, theirs = socket.socketpair()
+    connection = _inherited(theirs, http)
+    connection.relay = Relay(connected, ours)
+    return connection
 
 
 def _pipe(pictures: bool) -> Connection:
@@ -107,17 +116,13 @@ def _inherited(connected: socket.socket, request: dict[str, Any]) -> Connection:
     return Connection(request | {"input": number}, (number,), _closes=[connected.close])
 
 
-def _relayed(connected: socket.socket, target: Target) -> Connection:
-    if target.is_secure:
-        try:
-            connected = ssl.create_default_context().wrap_socket(connected, server_hostname=target.host)
-        except (OSError, ValueError) as error:
-            connected.close()
-            raise ConnectionFailed(FeedReason.UNREACHABLE, f"{target.origin} cannot be trusted: {error}") from error
-    connected.settimeout(None)
-    relay = Relay(connected)
-    url = f"rtsp://{target.user}127.0.0.1:{relay.port}{target.path}"
-    return Connection({"rtsp": url, "port": relay.port}, relay=relay)
+def _secured(connected: socket.socket, target: Target) -> socket.socket:
+    try:
+        return ssl.create_default_context().wrap_socket(connected, server_hostname=target.host)
+    except (OSError, ValueError) as error:
+        connected.close()
+        problem = f"the connection to {target.origin} cannot be secured: {error}"
+        raise ConnectionFailed(FeedReason.UNREACHABLE, problem) from error
 
 
 def _bound(address: str, port: int) -> socket.socket:

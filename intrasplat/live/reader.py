@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import ssl
 import sys
 import threading
 import time
@@ -68,8 +67,8 @@ class Answers:
 class Reader:
     """Reads, records and decodes one source, and hands pairs over."""
 
-    def __init__(self, request: dict[str, Any], answers: Answers, tls: ssl.SSLContext | None) -> None:
-        self._request, self._answers, self._tls = request, answers, tls
+    def __init__(self, request: dict[str, Any], answers: Answers) -> None:
+        self._request, self._answers = request, answers
         expected = request["expected"] and tuple(request["expected"])
         self._decoding = Decoding(
             request["layout"], expected, request["sequence"], request["max_pixels"], request["start_s"]
@@ -88,7 +87,7 @@ class Reader:
         threading.Thread(target=self._hand_over, name="hand-over", daemon=True).start()
         try:
             began_at = time.time()
-            source = PacketSource(self._request["open"], self._tls, self._request["max_pixels"])
+            source = PacketSource(self._request["open"], self._request["max_pixels"])
             self._read(source, began_at)
         except SourceEnd as end:
             self._end(end)

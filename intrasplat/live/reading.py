@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 import os
 import socket
-import ssl
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -110,18 +109,14 @@ class Bytes:
 class PacketSource:
     """A source that was opened. Its container, or None for pushed pictures."""
 
-    def __init__(self, request: dict[str, Any], tls: ssl.SSLContext | None, max_pixels: int) -> None:
-        """tls: made before the process was confined, for a source that is encrypted.
-
-        Raises:
-            SourceEnd: it cannot be opened.
-        """
+    def __init__(self, request: dict[str, Any], max_pixels: int) -> None:
+        """Raises SourceEnd if it cannot be opened."""
         self._request, self._max_pixels = request, max_pixels
         self._bytes: Bytes | None = None
         self._at_end = (FeedReason.CLOSED, "the source closed the connection")
         self.is_paced = "file" in request
         if "http" in request:
-            response = _answer(request["input"], request["http"], tls)
+            response = _answer(request["input"], request["http"])
             self._bytes = Bytes(response)
             if response.length is not None:
                 self._at_end = (FeedReason.END_OF_FILE, "the file has ended")
@@ -228,16 +223,11 @@ def _format(head: bytes) -> str:
     raise SourceEnd(FeedReason.UNDECODABLE, "the source sends neither an MPEG transport stream, nor mp4 nor Matroska")
 
 
-def _answer(connected: int, http: dict[str, Any], tls: ssl.SSLContext | None) -> HTTPResponse:
+def _answer(connected: int, http: dict[str, Any]) -> HTTPResponse:
     """The answer to a GET over an open connection. Raises SourceEnd unless it is 200."""
-    host = str(http["host"])
     link = socket.socket(fileno=connected)
     try:
-        if http["secure"]:
-            assert tls is not None
-            link = tls.wrap_socket(link, server_hostname=host)
-        name = f"[{host}]" if ":" in host else host
-        lines = (f"GET {http['path']} HTTP/1.1", f"Host: {name}:{http['port']}", "Accept: video/*", "Connection: close")
+        lines = (f"GET {http['path']} HTTP/1.1", f"Host: {http['host']}", "Accept: video/*", "Connection: close")
         link.sendall("\r\n".join((*lines, "", "")).encode())
         response = HTTPResponse(link, method="GET")
         response.begin()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.server
 import io
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -131,7 +132,7 @@ def tcp_server(serve: Serve, port: int = 0) -> Iterator[str]:
 
 
 @contextmanager
-def http_server(serve: Callable[[Any], None]) -> Iterator[str]:
+def http_server(serve: Callable[[Any], None], tls: ssl.SSLContext | None = None) -> Iterator[str]:
     """An HTTP server that answers every GET with `serve(handler)`; its URL."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -146,9 +147,11 @@ def http_server(serve: Callable[[Any], None]) -> Iterator[str]:
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
+    if tls is not None:
+        server.socket = tls.wrap_socket(server.socket, server_side=True)
     threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     try:
-        yield f"http://127.0.0.1:{server.server_address[1]}/stream"
+        yield f"http{'s' if tls else ''}://127.0.0.1:{server.server_address[1]}/stream"
     finally:
         server.shutdown()
         server.server_close()

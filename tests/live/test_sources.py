@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import shutil
 import socket
+import ssl
+import subprocess
 import threading
 import time
 from contextlib import suppress
@@ -119,6 +122,31 @@ def test_a_live_http_stream_is_read_and_a_redirect_is_not_followed(opened: Open)
         moved = opened(url.replace("/stream", "/moved"))
         until_state(moved, FeedState.STALLED, FeedReason.REDIRECTED)
         assert moved.newest(0, 0.1) is None
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl on PATH")
+def test_https_is_read_if_the_certificate_is_trusted(
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = "openssl req -x509 -newkey rsa:2048 -nodes -keyout key.pem -out cert.pem -days 2 -subj /CN=camera"
+    command = [*made.split(), "-addext", "subjectAltName=IP:127.0.0.1"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(tmp_path / "cert.pem", tmp_path / "key.pem")
+
+    def serve(handler: Any) -> None:
+        handler.send_response(200)
+        handler.end_headers()
+        stream = Stream("mp4")
+        for index in in_real_time():
+            handler.wfile.write(stream.frame(picture(index)))
+
+    with http_server(serve, tls) as url:
+        strange = opened(url)
+        until_state(strange, FeedState.STALLED, FeedReason.UNREACHABLE)
+        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "cert.pem"))
+        pair = pair_after(opened(url))
+        assert shown(pair.left) == shown(pair.right, right=True)
 
 
 def test_a_file_plays_in_real_time_with_the_bits_of_a_clip_and_ends(opened: Open, tmp_path: Path) -> None:
