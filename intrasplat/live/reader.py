@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from intrasplat.clip.video_stream import RgbConverter
 from intrasplat.errors import InputError
-from intrasplat.live.clock import Place, SourceClock
+from intrasplat.live.clock import Place, SourceClock, Waited
 from intrasplat.live.decoding import Decoding, Newest, Shape, unpacked
 from intrasplat.live.reading import Arrived, PacketSource, SourceEnd
 from intrasplat.live.recorder import Recorded, Recorder
@@ -23,8 +23,6 @@ from intrasplat.live.state import FeedReason
 
 REPORT_PERIOD_S = 0.05
 FINISH_S = 2.0
-WAITED_S = 0.1
-"""A packet that comes sooner after this process is ready had come in before, since the connection was made."""
 MAX_LINE_BYTES = 4096  # written whole or not at all
 
 
@@ -103,6 +101,7 @@ class Reader:
             codec = self._codec if len(contexts) == 1 else "two streams"
             recorder.start(codec, lambda out: out.add_stream_from_template(source.streams[0]))
         clock: SourceClock | None = None
+        waited = Waited(self._request["connected_at"] if "input" in self._request["open"] else None, began_at)
         began: tuple[float, float] | None = None
         for arrived in source.packets():
             stamp_s = arrived.decoding_s
@@ -110,8 +109,10 @@ class Reader:
                 began = began or (stamp_s, time.time())
                 time.sleep(max(0.0, began[1] + stamp_s - began[0] - time.time()))
                 arrived = replace(arrived, arrived_at=time.time())
+            else:
+                arrived = waited.dated(arrived)
             self._codec = arrived.codec if arrived.stream == 0 else self._codec
-            clock = clock or self._clock(arrived, began_at, max(1, len(contexts)))
+            clock = clock or self._clock(arrived, max(1, len(contexts)))
             place = clock.place(stamp_s, arrived.arrived_at)
             self._last_at = arrived.arrived_at
             if recorder is not None and arrived.stream == 0:
@@ -121,11 +122,9 @@ class Reader:
             if decoding.end is not None:
                 raise decoding.end
 
-    def _clock(self, first: Arrived, began_at: float, streams: int) -> SourceClock:
+    def _clock(self, first: Arrived, streams: int) -> SourceClock:
         """The clock whose first frame is the feed's first, or lies as long after its last one as it came in later."""
-        waited = "input" in self._request["open"] and first.arrived_at - began_at < WAITED_S
-        first_at = self._request["connected_at"] if waited else first.arrived_at
-        passed_s = max(0.0, first_at - self._request["start_at"])
+        passed_s = max(0.0, first.arrived_at - self._request["start_at"])
         return SourceClock(self._request["start_s"] + passed_s - (first.shown_s - first.decoding_s), streams)
 
     def _record(self, arrived: Arrived, stamp_s: float, place: Place, *, picture: bool) -> None:

@@ -150,7 +150,7 @@ class PacketSource:
                     form = _format(file.read(12))
                 return av.open(str(path), "r", format=form, options=options | {"protocol_whitelist": "file"})
             form = _format(self._bytes.head(12))
-            return av.open(self._bytes, "r", format=form, options=options | PROBE)
+            return av.open(self._bytes, "r", format=form, options=options | PROBE | {"protocol_whitelist": "none"})
         except (av.error.FFmpegError, OSError, ValueError) as error:
             if isinstance(error, (EOFError, ConnectionError)):
                 raise SourceEnd(FeedReason.CLOSED, "the source closed the connection before a picture came") from error

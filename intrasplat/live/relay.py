@@ -1,5 +1,5 @@
-"""One connection, relayed to the reading process: TLS ends here, and RTSP is offered at a port of this machine, the only
-one to which that process may connect. It ends at a redirect of RTSP: FFmpeg would follow one to any host.
+"""One connection, relayed to the reading process: TLS ends here, and RTSP is offered at a port of this machine, the one
+port to which that process may connect. It ends at a redirect of RTSP: FFmpeg would follow one to any host.
 """
 
 from __future__ import annotations

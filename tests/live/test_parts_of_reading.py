@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from typing import Any
+
+import av
 import numpy as np
 import pytest
 
-from intrasplat.live.clock import SourceClock
+from intrasplat.live.clock import SourceClock, Waited
 from intrasplat.live.decoding import LATE_S, SLOW_S, LagPolicy, Skip
 from intrasplat.live.matching import Matcher
+from intrasplat.live.reading import Arrived
 
 STEP_S = 1 / 30
 
@@ -37,6 +42,27 @@ def test_streams_that_take_turns_do_not_jump() -> None:
     clock = SourceClock(0.0, streams=2)
     stamps_s = [each for index in range(30) for each in (index * STEP_S, index * STEP_S - 0.2)]
     assert {clock.place(stamp_s, 1000.0 + stamp_s).epoch for stamp_s in stamps_s} == {0}
+
+
+def packet_at(stamp_s: float, arrived_at: float) -> Arrived:
+    packet: av.Packet[Any] = av.Packet(b"packet")
+    packet.time_base, packet.pts = Fraction(1, 1000), round(1000 * stamp_s)
+    return Arrived(packet, 0, arrived_at, "h264")
+
+
+def test_packets_that_came_in_while_the_process_started_are_dated_by_their_stamps() -> None:
+    waited = Waited(connected_at=1000.0, ready_at=1000.6)
+    dated = [waited.dated(packet_at(7.0 + 0.1 * index, 1000.65)).arrived_at for index in range(9)]
+    assert dated == pytest.approx([1000.0, 1000.1, 1000.2, 1000.3, 1000.4, 1000.5, 1000.6, 1000.65, 1000.65])
+
+
+def test_packets_that_come_later_are_dated_as_they_come() -> None:
+    waited = Waited(connected_at=1000.0, ready_at=1000.6)
+    assert waited.dated(packet_at(7.0, 1002.0)).arrived_at == 1002.0
+    assert waited.dated(packet_at(7.1, 1003.0)).arrived_at == 1003.0
+    jumping = Waited(connected_at=1000.0, ready_at=1000.6)
+    assert jumping.dated(packet_at(7.0, 1000.6)).arrived_at == 1000.0
+    assert jumping.dated(packet_at(2.0, 1000.6)).arrived_at == 1000.6
 
 
 def test_decoding_begins_at_a_key_frame_and_skips_more_the_longer_it_lags() -> None:

