@@ -22,8 +22,8 @@ from intrasplat.camera import to_camera
 from intrasplat.clip import DepthClip
 from intrasplat.live.pair import FeedPair
 from intrasplat.poses.rigid import inverse
+from intrasplat.scene.recorded_video import RecordedEye
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.scene.training_pictures import RecordedEye
 from intrasplat.splat.backend import CPU, Device, make_model
 from intrasplat.splat.deformation import SharedBasis
 from intrasplat.splat.gaussians import Gaussians
