@@ -292,7 +292,7 @@ def test_the_right_eye_is_a_key_away_and_turning_begins_there(site: Site, page: 
     assert page.find("#eye").get_attribute("value") == "right"
     page.until(lambda: "pose=right" in page.driver.current_url)
     page.find("#stage").send_keys("+")
-    page.until(lambda: shown(page)["pose"].startswith("orbit:"))
+    page.until(lambda: (shown(page)["pose"] or "").startswith("orbit:"))
     assert orbit(page).about_mm == pytest.approx((4, 0, MEDIAN_MM))
     page.find("#stage").send_keys(Keys.HOME)
     page.until(lambda: shown(page)["pose"] is None)
