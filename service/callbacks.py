@@ -13,20 +13,17 @@ import socket
 import threading
 from concurrent.futures import Future
 from contextlib import suppress
-from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
 
 import httpx
 
 from contract.runtime.settings import Settings
 from contract.wire.webhooks import CALLBACK_PART, MAX_CALLBACK_CHARACTERS
 from intrasplat.errors import InputError
+from intrasplat.intake.addresses import is_permitted
 
 DEFAULT_PORTS = {"https": 443, "http": 80}
 URL_TEXT = re.compile(r"[!-~]+", re.ASCII)
 """The characters of a URL: visible ASCII."""
-NAT64 = IPv6Network("64:ff9b::/96")
-METADATA = frozenset(map(ip_address, ("fd00:ec2::254", "fd20:ce::254", "fd00:c1::a9fe:a9fe")))
-"""Metadata servers of clouds, which give secrets to their machines; others have link-local addresses."""
 URL_REMEDY = "Give a URL such as https://his.example.org/intrasplat, without a user, a password or a fragment."
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_WEBHOOK_HOSTS."
 
@@ -97,7 +94,7 @@ async def permitted_addresses(host: str, settings: Settings, look_ups: LookUps) 
         OSError, UnicodeError: the name cannot be resolved.
     """
     addresses = await look_ups.addresses(host)
-    return [address for address in addresses if _is_permitted(address, settings.webhook_private == "yes")]
+    return [address for address in addresses if is_permitted(address, settings.webhook_private == "yes")]
 
 
 def _origin(url: str) -> str | None:
@@ -112,21 +109,3 @@ def _origin(url: str) -> str | None:
     if parts.scheme not in DEFAULT_PORTS or not host or parts.userinfo or parts.fragment:
         return None
     return f"{parts.scheme}://{host}:{parts.port or DEFAULT_PORTS[parts.scheme]}"
-
-
-def _is_permitted(text: str, private: bool) -> bool:
-    address = _meant(ip_address(text.partition("%")[0]))
-    if address.is_link_local or address.is_multicast or address.is_unspecified or address in METADATA:
-        return False
-    if address.is_reserved and not address.is_loopback:  # some map to an IPv4 address that is unknown here
-        return False
-    return address.is_global or (private and (address.is_private or address.is_loopback))
-
-
-def _meant(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:
-    """The IPv4 address that an IPv6 address embeds; any other address unchanged."""
-    if isinstance(address, IPv4Address):
-        return address
-    if address in NAT64:
-        return IPv4Address(int(address) & 0xFFFFFFFF)
-    return address.ipv4_mapped or address.sixtofour or address

@@ -10,12 +10,13 @@ import worker.reply  # noqa: F401
 from contract.wire.checks import FindingCode
 from contract.wire.webhooks import TryFailure
 from intrasplat.errors import ErrorCode, IntrasplatError
+from intrasplat.live.state import FeedReason
 from intrasplat.measuring import RefusalCode
 from intrasplat.notices import NoticeCode
 from tests.test_repository import REPOSITORY
 
-PAGE, ERRORS, REFUSALS, TRIES = re.split(
-    "## (?:Errors|Refusals|Tries of a webhook)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
+PAGE, ERRORS, REFUSALS, TRIES, FEEDS = re.split(
+    "## (?:Errors|Refusals|Tries of a webhook|Feeds)", (REPOSITORY / "docs" / "codes.md").read_text(encoding="utf-8")
 )
 NOTICES, FINDINGS = PAGE.split("## Findings")
 SOURCES = [
@@ -51,6 +52,10 @@ def test_every_code_of_a_refusal_is_explained_once_and_no_other() -> None:
 
 def test_every_code_of_a_failed_try_of_a_webhook_is_explained_once_and_no_other() -> None:
     assert sorted(listed(TRIES)) == sorted(TryFailure)
+
+
+def test_every_reason_of_a_feed_is_explained_once_and_no_other() -> None:
+    assert sorted(listed(FEEDS)) == sorted(FeedReason)
 
 
 def test_every_class_of_error_has_a_code_of_its_own() -> None:

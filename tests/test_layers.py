@@ -65,6 +65,7 @@ ORDER = {
         "pipeline",
         "recording",
         "reconstruction",
+        "live",
         "commands",
         "__main__",
     ),

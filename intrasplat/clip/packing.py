@@ -26,8 +26,8 @@ PACKING_WORDS: dict[Packing, str] = {"sbs": "side by side, left eye left", "tb":
 MAX_RATE_RATIO = 1.1  # Matroska's milliseconds change a rate of 120 Hz by 4 %
 
 _EYE_ASPECTS = (0.8, 2.4)  # plausible width / height of an endoscope's eye; 5:4 and 16:9 are well inside
-_CLEAR_MARGIN = 0.15  # of correlation; with a larger one, content overrides the shape
-_MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
+CLEAR_MARGIN = 0.15  # of correlation; with a larger one, content overrides the shape
+MIN_LIKENESS = 0.35  # two eyes on the same tissue correlate above this, different parts of one picture below
 _LIKENESS_WIDTH_PX = 160  # halves are compared at this width: disparities are a few pixels, and it takes 1 ms
 _MIN_DETAIL_STD = 1.0  # grey levels; a frame with less detail is ignored
 _MAX_FRAMES_COMPARED = 30  # clips may start black
@@ -163,14 +163,14 @@ def detect_packing(sequence: FrameSequence) -> Packing:
         raise _undecided(sequence, "the frames show too little detail")
     by_content: Packing = "sbs" if likeness["sbs"] >= likeness["tb"] else "tb"
     figures = f"likeness of the halves: side by side {likeness['sbs']:.2f}, top-bottom {likeness['tb']:.2f}"
-    if likeness[by_content] < _MIN_LIKENESS:
+    if likeness[by_content] < MIN_LIKENESS:
         raise InputError(
             "clip",
             f"{sequence.label} does not look like two eyes in one picture ({figures}).",
             'Give the right eye as a second file, or both in folders left/ and right/, or say layout "sbs" or "tb" '
             "if the clip is stereo.",
         )
-    if by_shape in (None, by_content) or abs(likeness["sbs"] - likeness["tb"]) >= _CLEAR_MARGIN:
+    if by_shape in (None, by_content) or abs(likeness["sbs"] - likeness["tb"]) >= CLEAR_MARGIN:
         return by_content
     raise _undecided(sequence, figures)
 
@@ -185,10 +185,16 @@ def _packing_by_shape(sequence: FrameSequence) -> Packing | None:
 def _likeness_in(sequence: FrameSequence) -> dict[Packing, float] | None:
     """Likeness of the halves for both packings, in the first frame with detail; None without such a frame."""
     for frame in itertools.islice(sequence.frames(), _MAX_FRAMES_COMPARED):
-        sbs, tb = _likeness(*halves(frame, "sbs")), _likeness(*halves(frame, "tb"))
-        if sbs is not None and tb is not None:
-            return {"sbs": sbs, "tb": tb}
+        likeness = packing_likeness(frame)
+        if likeness is not None:
+            return likeness
     return None
+
+
+def packing_likeness(frame: RgbFrame) -> dict[Packing, float] | None:
+    """Likeness of a picture's halves for both packings, in [-1, 1]; None if it shows too little detail."""
+    sbs, tb = _likeness(*halves(frame, "sbs")), _likeness(*halves(frame, "tb"))
+    return None if sbs is None or tb is None else {"sbs": sbs, "tb": tb}
 
 
 def _likeness(first: RgbFrame, second: RgbFrame) -> float | None:

@@ -90,7 +90,7 @@ class Decoder:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 cwd=self.folder,
-                env=_environment(self.folder),
+                env=environment_of(self.folder),
                 umask=0o077,
                 start_new_session=True,  # the parent handles Ctrl-C
             )
@@ -124,7 +124,7 @@ class Decoder:
         self._field, self._pictures = "clip", -1
         self._advanced_s = time.monotonic()
         self._end_s = self._advanced_s + patience.max_total_s
-        self._lines = _lines(self._process)
+        self._lines = lines_of(self._process)
         assert self._process.stdin is not None
         asked = request | {"allowance": asdict(allowance), "parent": os.getpid()}
         with contextlib.suppress(BrokenPipeError), self._process.stdin as stdin:  # until_ended() reports the cause
@@ -240,7 +240,7 @@ def _end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
+def lines_of(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
     """Whole lines as they arrive; None after POLL_S without a whole line.
 
     Raises:
@@ -266,7 +266,7 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
             raise ValueError("a line without an end")
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def environment_of(folder: Path) -> dict[str, str]:
     """The process's environment. From the parent's it keeps only the variables for finding libraries."""
     kept = {name: os.environ[name] for name in _PASSED_VARIABLES if name in os.environ}
     return kept | {

@@ -42,11 +42,18 @@ class Allowance:
     cpu_s: int
 
 
-def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> list[str]:
+def lock_in(
+    allowance: Allowance,
+    readable: Sequence[Path],
+    writable: Path,
+    devices: Sequence[Path] = (),
+    connect_port: int | None = None,
+) -> list[str]:
     """Drop privileges that decoding does not need. Returns the protections that were granted.
 
     Call it before the first thread starts. readable lists the untrusted files and folders; writable is the folder for
-    the results.
+    the results; devices are capture devices; with connect_port the process may open internet sockets, which the kernel
+    restricts to that port if it can.
 
     Raises:
         OSError: a limit cannot be set.
@@ -60,11 +67,11 @@ def lock_in(allowance: Allowance, readable: Sequence[Path], writable: Path) -> l
     _limit(resource.RLIMIT_CPU, allowance.cpu_s, allowance.cpu_s + 1)  # SIGXCPU names the cause; SIGKILL follows
     _limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
     granted = [LIMITED_MEMORY] if _limit_memory(allowance.memory_bytes) else []
-    apart = _leave_network()
-    confined = confine_files(_libraries() + list(readable), writable)
+    apart = connect_port is None and _leave_network()
+    confined = confine_files(_libraries() + list(readable), writable, devices, connect_port)
     _drop_capabilities()
-    filtered = forbid_network_and_programs()
-    if apart or filtered:
+    filtered = forbid_network_and_programs(with_sockets=connect_port is not None)
+    if apart or (filtered and connect_port is None):
         granted.append(NO_NETWORK)
     if filtered:
         granted.append(NO_PROGRAMS)

@@ -1,4 +1,4 @@
-"""An allow-list of files (Linux, Landlock): a compromised decoder cannot read other clips or keys."""
+"""An allow-list of files and of TCP ports (Linux, Landlock): a compromised decoder cannot read other clips or keys."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from pathlib import Path
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same numbers on every architecture
 _ASK_VERSION = 1
-_PATH_BENEATH = 1
+_PATH_BENEATH, _TCP_PORT = 1, 2  # kinds of rules
+_FIRST_WITH_TCP = 4  # version
 
 # rights (linux/landlock.h)
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
 _FILE_RIGHTS = _EXECUTE | 1 << 1 | _READ_FILE | 1 << 14 | 1 << 15  # the rights that a rule on a file may contain
 _RIGHTS_BY_VERSION = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
+_BIND_TCP, _CONNECT_TCP = 1 << 0, 1 << 1
 _READING = _EXECUTE | _READ_FILE | _READ_FOLDER
+_DEVICE = _READ_FILE | 1 << 1 | 1 << 15  # read, write, ioctl
 
 
-def confine_files(readable: Sequence[Path], writable: Path) -> bool:
-    """Allow this thread and those that it starts to read only `readable` and to change only `writable`.
+def confine_files(
+    readable: Sequence[Path], writable: Path, devices: Sequence[Path] = (), connect_port: int | None = None
+) -> bool:
+    """Allow this thread and those that it starts to read only `readable`, to change only `writable`, to control only
+    `devices`, and to connect by TCP only to `connect_port`; they may offer no port. Old kernels restrict no ports.
 
     False if the kernel cannot. Paths are files or folders; missing ones are ignored. It needs PR_SET_NO_NEW_PRIVS.
     """
@@ -33,14 +39,18 @@ def confine_files(readable: Sequence[Path], writable: Path) -> bool:
     if version < 1:
         return False
     handled = _RIGHTS_BY_VERSION[min(version, max(_RIGHTS_BY_VERSION))]
-    attributes = struct.pack("=Q", handled)
+    attributes = struct.pack("=QQ", handled, _BIND_TCP | _CONNECT_TCP)[: 16 if version >= _FIRST_WITH_TCP else 8]
     ruleset = libc.syscall(_CREATE_RULESET, attributes, len(attributes), 0)
     if ruleset < 0:
         return False
     try:
         for path in readable:
             _allow(libc, ruleset, path, _READING & handled)
+        for path in devices:
+            _allow(libc, ruleset, path, _DEVICE & handled)
         _allow(libc, ruleset, writable, handled & ~_EXECUTE)
+        if connect_port is not None and version >= _FIRST_WITH_TCP:
+            libc.syscall(_ADD_RULE, ruleset, _TCP_PORT, struct.pack("=QQ", _CONNECT_TCP, connect_port), 0)
         return bool(libc.syscall(_RESTRICT_SELF, ruleset, 0) == 0)
     finally:
         os.close(ruleset)

@@ -10,6 +10,7 @@ import ctypes
 import errno
 import os
 import platform
+import socket
 import struct
 import sys
 
@@ -30,8 +31,9 @@ _CLONE_THREAD = 0x00010000
 _X32_CALLS = 0x40000000  # a second numbering of the same calls, on x86-64
 
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+_SOCKET = {"x86_64": 41, "aarch64": 198}
 _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
-    "socket": (41, 198),
+    "socket": (_SOCKET["x86_64"], _SOCKET["aarch64"]),
     "socketpair": (53, 199),
     "connect": (42, 203),
     "fork": (57, None),
@@ -88,6 +90,7 @@ _FORBIDDEN = {  # numbers of system calls, x86-64 and arm64
     "futimesat": (261, None),
     "utimensat": (280, 88),
 }
+_FOR_SOCKETS = ("socket", "connect")
 _TGKILL = {"x86_64": 234, "aarch64": 131}  # abort() needs it
 _PRLIMIT64 = {"x86_64": 302, "aarch64": 261}  # getrlimit() and setrlimit() use it, with pid 0 for this process
 _CLONE = {"x86_64": 56, "aarch64": 220}
@@ -98,25 +101,28 @@ class _Program(ctypes.Structure):
     _fields_ = [("length", ctypes.c_ushort), ("instructions", ctypes.c_void_p)]
 
 
-def forbid_network_and_programs() -> bool:
+def forbid_network_and_programs(*, with_sockets: bool = False) -> bool:
     """Install the filter for this thread and those that it starts; False if the system does not support it.
+
+    with_sockets: permit sockets of IPv4 and IPv6, of no other family.
 
     It needs PR_SET_NO_NEW_PRIVS.
     """
     machine = platform.machine()
     if not sys.platform.startswith("linux") or machine not in _ARCHITECTURES:
         return False
-    code = b"".join(struct.pack("=HBBI", *each) for each in _instructions(machine))
+    code = b"".join(struct.pack("=HBBI", *each) for each in _instructions(machine, with_sockets))
     buffer = ctypes.create_string_buffer(code, len(code))
     program = _Program(len(code) // 8, ctypes.cast(buffer, ctypes.c_void_p))
     libc = ctypes.CDLL(None, use_errno=True)
     return bool(libc.prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.byref(program), 0, 0) == 0)
 
 
-def _instructions(machine: str) -> list[tuple[int, int, int, int]]:
+def _instructions(machine: str, with_sockets: bool) -> list[tuple[int, int, int, int]]:
     """(code, jump if true, jump if false, value) of each instruction."""
     column = list(_ARCHITECTURES).index(machine)
-    numbers = [each[column] for each in _FORBIDDEN.values()]
+    permitted = _FOR_SOCKETS if with_sockets else ()
+    numbers = [each[column] for name, each in _FORBIDDEN.items() if name not in permitted]
     program = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
         (_JUMP_IF_EQUAL, 1, 0, _ARCHITECTURES[machine]),
@@ -133,6 +139,15 @@ def _instructions(machine: str) -> list[tuple[int, int, int, int]]:
             (_JUMP_IF_EQUAL, 0, 4, number),
             (_LOAD, 0, 0, _FIRST_ARGUMENT_AT),
             (_JUMP_IF_EQUAL, 1, 0, process),
+            (_RETURN, 0, 0, _FAIL | errno.EPERM),
+            (_RETURN, 0, 0, _ALLOW),
+        ]
+    if with_sockets:
+        program += [
+            (_JUMP_IF_EQUAL, 0, 5, _SOCKET[machine]),
+            (_LOAD, 0, 0, _FIRST_ARGUMENT_AT),
+            (_JUMP_IF_EQUAL, 2, 0, socket.AF_INET),
+            (_JUMP_IF_EQUAL, 1, 0, socket.AF_INET6),
             (_RETURN, 0, 0, _FAIL | errno.EPERM),
             (_RETURN, 0, 0, _ALLOW),
         ]

@@ -20,22 +20,20 @@ CODECS: dict[str, tuple[bytes, ...]] = {  # accepted codecs, as containers name 
     "h264": (b"avc1", b"avc2", b"avc3", b"avc4", b"h264", b"H264", b"dva1", b"dvav", b"V_MPEG4/ISO/AVC"),
     "hevc": (b"hvc1", b"hvc2", b"hev1", b"dvh1", b"dvhe", b"V_MPEGH/ISO/HEVC"),
     "vp9": (b"vp09", b"VP90", b"V_VP9"),
+    "mjpeg": (b"jpeg", b"mjpg", b"mjpa", b"V_MJPEG"),
 }
 OTHER_CODECS = {  # codecs that users are likely to bring, with names for errors
     b"av01": "AV1",
     b"V_AV1": "AV1",
     b"V_VP8": "VP8",
     b"mp4v": "MPEG-4 part 2",
-    b"jpeg": "Motion JPEG",
-    b"mjpg": "Motion JPEG",
-    b"V_MJPEG": "Motion JPEG",
     b"apch": "ProRes",
     b"apcn": "ProRes",
     b"V_FFV1": "FFV1",
     b"V_MPEG4/ISO/ASP": "MPEG-4 part 2",
     b"encv": "encrypted video",
 }
-REMEDY = "Give H.264, HEVC or VP9 video in mp4, mov, mkv or webm."
+REMEDY = "Give H.264, HEVC, VP9 or Motion JPEG video in mp4, mov, mkv or webm."
 
 EBML = b"\x1aE\xdf\xa3"  # first bytes of Matroska and WebM
 _PICTURE_BOXES = (b"mdat", b"moof", b"sidx", b"styp", b"free", b"skip", b"wide")  # they may follow the header

@@ -30,8 +30,6 @@ OPENCV_AXES: dict[Axes, Reals] = {
     "llff": np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]),  # stored: down, right, back
 }
 """[4, 4] camera with these axes from a camera with OpenCV's: the columns are x (right), y (down), z (forward)."""
-MATCH_STEP = 5
-"""Cells of the coarse grid between neighbouring matches: with fewer, wrong poses agree by chance."""
 STARTS = 8
 STEPS = (1, 2, 4, 8)
 """Pairs of frames that are compared: from STARTS frames to those so many frames later."""
@@ -100,7 +98,7 @@ def agreement(clip: DepthClip, train: Sequence[int], stored: Reals, declared: Co
     0 if the first is. The tissue's own motion hardly changes it, for it does not follow the difference.
     """
     with one_opencv_thread():
-        frames = Frames(clip, MATCH_STEP)
+        frames = Frames(clip)
         links = _links(frames, train)
     if not links:
         return Agreement(declared)

@@ -19,7 +19,7 @@ from intrasplat.poses.field import DeformationField, waves
 from intrasplat.poses.links import FrameLink
 from intrasplat.poses.rigid import Reals, StereoCamera, inverse, weighted_median
 
-INDEPENDENT, NOISE_PX = 0.1, 0.35
+INDEPENDENT, NOISE_PX = 0.05, 0.35
 """Share of matches that count as independent, because errors of flow and depth are correlated over some pixels; noise
 of a match."""
 MIN_SCALE_PX = 0.5

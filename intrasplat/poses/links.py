@@ -23,8 +23,8 @@ Floats = NDArray[np.float32]
 FLOW_WIDTH = 320
 """Maximum width in px of the field of view at which flow is computed: the clip is reduced by the smallest whole factor
 that fits."""
-MATCH_STEP = 7
-"""Cells of the grid between neighbouring matches of a path: patches overlap, and steps of 5 find no path better."""
+MATCH_STEP = 5
+"""Cells of the grid between neighbouring matches."""
 PATCH_PX = 11
 """Side of the patches that refine the flow. Dense flow is smoother than the true motion, and attributes 4 % of the
 parallax to a rotation of the camera. Wider patches are too smooth as well."""
@@ -96,33 +96,41 @@ class Frames:
     Threads may share it.
     """
 
-    def __init__(self, clip: DepthClip, match_step: int = MATCH_STEP) -> None:
-        """match_step: cells of the grid between neighbouring matches."""
+    def __init__(self, clip: DepthClip) -> None:
         k = clip.intrinsics
         step = -(-_field_width(clip) // FLOW_WIDTH)
-        self._clip, self._step, self._match_step = clip, step, match_step
+        self._clip, self._step = clip, step
         right = clip.right
         baseline_mm = PSEUDO_BASELINE_MM
         if right is not None:
             baseline_mm = float(np.linalg.norm(right.world_from_camera[0, :3, 3] - clip.world_from_camera[0, :3, 3]))
         self.camera = StereoCamera(k.fx / step, k.fy / step, k.cx / step - 0.5, k.cy / step - 0.5, baseline_mm)
+        self._others: dict[int, DepthClip] = {}
         self._cache: dict[int, TrackedFrame] = {}
         self._landmarks: dict[int, Landmarks] = {}
         self._thread = local()
 
+    def take(self, index: int, moment: DepthClip) -> None:
+        """Frame `index` is that of a clip of one frame, of the same cameras, which need not be one of this clip."""
+        self._others[index] = moment
+
+    def _source(self, index: int) -> tuple[DepthClip, int]:
+        """The clip of a frame, and its index there."""
+        return (self._others[index], 0) if index in self._others else (self._clip, index)
+
     def frame(self, index: int) -> TrackedFrame:
         """A frame of the clip."""
         if index not in self._cache:
-            clip, step = self._clip, self._step
-            grey = cell_means(cv2.cvtColor(clip.rgb[index], cv2.COLOR_RGB2GRAY), step)
+            (clip, place), step = self._source(index), self._step
+            grey = cell_means(cv2.cvtColor(clip.rgb[place], cv2.COLOR_RGB2GRAY), step)
             height, width = grey.shape
             pick = slice(step // 2, None, step)
-            depth_mm = clip.depth_mm[index][pick, pick][:height, :width]
-            usable = clip.tissue[index][pick, pick][:height, :width] & (depth_mm > 0)
-            confidence = clip.depth_confidence[index][pick, pick][:height, :width] / np.float32(255)
+            depth_mm = clip.depth_mm[place][pick, pick][:height, :width]
+            usable = clip.tissue[place][pick, pick][:height, :width] & (depth_mm > 0)
+            confidence = clip.depth_confidence[place][pick, pick][:height, :width] / np.float32(255)
             ratio = np.float32(self.camera.fx * self.camera.baseline_mm)
             disparity = np.where(usable, ratio / np.maximum(depth_mm, 1e-3), np.float32(0))
-            clip.let_go(index)
+            clip.let_go(place)
             self._cache[index] = TrackedFrame(
                 grey, even_contrast(grey), disparity, np.where(usable, confidence, np.float32(0))
             )
@@ -130,14 +138,14 @@ class Frames:
 
     def forget(self, index: int) -> None:
         """Free a frame's memory."""
-        self._cache.pop(index, None)
-        self._landmarks.pop(index, None)
+        for each in (self._cache, self._landmarks, self._others):
+            each.pop(index, None)
 
     def far_motion(self, a: int, b: int) -> FarMotion | None:
         """The motion from frame a to frame b, however far apart; None: they show no common tissue that matches."""
         for index in (a, b):
             if index not in self._landmarks:
-                self._landmarks[index] = landmarks(self._clip, index, self.camera, self._step)
+                self._landmarks[index] = landmarks(*self._source(index), self.camera, self._step)
         return far_motion(self.camera, self._landmarks[a], self._landmarks[b])
 
     def far_link(self, a: int, b: int, far: FarMotion) -> tuple[FrameLink, Aligned]:
@@ -221,8 +229,8 @@ class Frames:
 
     def _matched(self, frame: TrackedFrame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns and rows [M'] of the frame's cells that are matched: those with confident depth."""
-        (height, width), step = frame.grey.shape, self._match_step
-        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+        height, width = frame.grey.shape
+        rows, columns = np.mgrid[MATCH_STEP // 2 : height : MATCH_STEP, MATCH_STEP // 2 : width : MATCH_STEP]
         known = frame.trust[rows, columns] > MIN_TRUST
         return columns[known], rows[known]
 

@@ -125,7 +125,7 @@ def estimate_depth(
         if device == "cuda":
             hooks.on_progress(Progress(COMPILATION, 0.0))
         finder = None if finder_of is None else finder_of((rgb[i] for i in looked_at(measured)), fields.left)
-        registration, plan, outside = _plan(
+        registration, plan, outside = plan_matching(
             clip, rgb, right_rgb, measured, matches, pool, device, depth_range_mm, finder, fields
         )
         splashes = find_splashes(
@@ -276,7 +276,7 @@ def _shown_tissue(clip: RectifiedClip, fields: Fields, *, has_masks: bool) -> tu
     return left, right
 
 
-def _plan(
+def plan_matching(
     clip: RectifiedClip,
     rgb: NDArray[np.uint8],
     right: NDArray[np.uint8],

@@ -136,22 +136,27 @@ def start_model(
     A "shared" motion starts from the tracks of the keyframes, if there are any. Every other motion starts at rest.
     gloss: whether two eyes are trained on.
     """
+    gaussians = start_gaussians(cloud, preset, scale)
+    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed, gloss)
+    motion = motion_named(preset.deformation).at_rest(gaussians, start)
+    if tracks and isinstance(motion, SharedBasis):
+        gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
+    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
+
+
+def start_gaussians(cloud: PointCloud, preset: Preset, scale: float) -> Gaussians:
+    """Gaussians at the cloud's points, scaled from mm to optimiser units, with the preset's opacity and spread."""
     gaussians = initial_gaussians(
         _apart_by_keyframe_mm(cloud) * np.float32(scale),  # a width depends on neighbours of the same keyframe only
         cloud.rgb,
         sh_degree=preset.sh_degree,
         opacity=preset.opacity,
     )
-    gaussians = dataclasses.replace(
+    return dataclasses.replace(
         gaussians,
         mean=torch.from_numpy(cloud.points_mm * np.float32(scale)),
         log_scale=gaussians.log_scale + math.log(preset.spread),
     )
-    start = AtRest(preset.bases, preset.start_width, [float(clip.t[i]) for i in train], seed, gloss)
-    motion = motion_named(preset.deformation).at_rest(gaussians, start)
-    if tracks and isinstance(motion, SharedBasis):
-        gaussians = _follow_tracks(gaussians, motion, cloud, tracks, clip, train, scale)
-    return make_model(gaussians, motion, clip.intrinsics.width, clip.intrinsics.height, device)
 
 
 def _apart_by_keyframe_mm(cloud: PointCloud) -> NDArray[np.float32]:

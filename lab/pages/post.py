@@ -13,6 +13,9 @@ from lab.pages.markdown import origin, source, table
 POST = "post.csv"
 CPU = "cpu"
 """The device of a row that names none: it was measured before the rows had one."""
+AUTO = "auto"
+"""The poses of a row that names none."""
+PHANTOM = "phantom:"
 _INTRODUCTION = """
 ## What a caller waits for
 
@@ -31,20 +34,20 @@ _CLOCKS = ("t_train_s", "t_post_s")
 
 
 def post_sections(folder: Path) -> list[str]:
-    """The section of bm_post.py, of the last commit of each clip, preset and way; nothing without rows."""
+    """The section of bm_post.py, of the last commit of each clip, --poses, preset and way; nothing without rows."""
     groups = _groups(folder)
     if not groups:
         return []
     cells = [
         [
-            clip,
+            clip if poses == AUTO else f"{clip}, poses={poses}",
             f"{preset}, {budget_s} s" if budget_s else preset,
             way,
             device,
             str(len(rows)),
             *(_shown(rows, *each) for each in _COLUMNS.items()),
         ]
-        for (clip, preset, budget_s, way, device), rows in groups.items()
+        for (clip, poses, preset, budget_s, way, device), rows in groups.items()
     ]
     header = ["clip", "preset", "by", "device", "runs", *(name for name, _ in _COLUMNS.values())]
     command = source(f"python -m lab.benchmarks.bm_post --csv lab/rows/{POST}", POST)
@@ -52,21 +55,22 @@ def post_sections(folder: Path) -> list[str]:
 
 
 def post_table(folder: Path) -> str:
-    """For README: both clocks of each preset that was sent as it is, by device; empty without such rows."""
+    """For README: both clocks of each preset that a recording was sent with, by device; empty without such rows."""
     cells = [
         [preset, device.removeprefix("cuda (").rstrip(")"), *(f"{_median(rows, name):.1f}" for name in _README_COLUMNS)]
-        for (_, preset, budget_s, way, device), rows in _groups(folder).items()
-        if way == "http" and not budget_s
+        for (clip, poses, preset, budget_s, way, device), rows in _groups(folder).items()
+        if way == "http" and not budget_s and poses == AUTO and not clip.startswith(PHANTOM)
     ]
     return table(["preset", "device", "first view, s", "of training, s", "scene, s"], cells) if cells else ""
 
 
-def _groups(folder: Path) -> dict[tuple[str, str, str, str, str], list[Row]]:
-    """Rows with the report's clocks as columns, by clip, preset, budget, way and device; of each the last commit's."""
-    found: dict[tuple[str, str, str, str, str], list[Row]] = {}
+def _groups(folder: Path) -> dict[tuple[str, str, str, str, str, str], list[Row]]:
+    """Rows with the report's clocks as columns, by clip, poses, preset, budget, way and device; the last commit's."""
+    found: dict[tuple[str, str, str, str, str, str], list[Row]] = {}
     for row in read_rows(folder / POST):
         clocks = {name: str(value) for name, value in json.loads(row["stages"]).items() if name in _CLOCKS}
-        key = row["clip"], row["preset"], row["budget_s"], row["way"], row.get("device") or CPU
+        asked = row["clip"], row.get("poses") or AUTO, row["preset"], row["budget_s"]
+        key = *asked, row["way"], row.get("device") or CPU
         found.setdefault(key, []).append({**row, **clocks})
     return {key: [row for row in rows if row["commit"] == rows[-1]["commit"]] for key, rows in found.items()}
 

@@ -164,6 +164,8 @@ VIDEOS: list[tuple[str, Make]] = [
     ("HEVC in mp4", video(codec="libx265")),
     ("VP9 in webm", video("clip.webm", "libvpx-vp9", options={"b": "0", "cpu-used": "8"})),
     ("VP9 in mp4", video("clip.mp4", "libvpx-vp9", options={"b": "0", "cpu-used": "8"})),
+    ("Motion JPEG in mov", video("clip.mov", "mjpeg", pixel_format="yuvj420p", options={"qmin": "1", "qmax": "3"})),
+    ("Motion JPEG in mkv", video("clip.mkv", "mjpeg", pixel_format="yuvj420p", options={"qmin": "1", "qmax": "3"})),
     ("fragmented mp4", video(options={"movflags": "frag_keyframe+empty_moov"})),
     ("RGB without loss", video(codec="libx264rgb", pixel_format="rgb24", options={"crf": "0"})),
     ("4:2:2", video(pixel_format="yuv422p")),
@@ -198,7 +200,6 @@ MENDED_VIDEOS: list[tuple[str, Make, str]] = [
     ("an odd column between the eyes", video(pack=split_by_a_line, **LOSSLESS), "middle_line_unused"),
 ]  # fmt: skip
 REFUSED_VIDEOS: list[tuple[str, Make, str]] = [
-    ("Motion JPEG", video("clip.mov", "mjpeg", pixel_format="yuvj420p"), CODEC),
     ("FFV1", video("clip.mkv", "ffv1"), CODEC),
     ("VP8", video("clip.webm", "libvpx", options={"b": "900k"}), CODEC),
     ("ProRes", video("clip.mov", "prores_ks", pixel_format="yuv422p10le"), CODEC),

@@ -207,7 +207,7 @@ def test_other_codecs_are_refused_by_name(studio) -> None:
     path = studio.video("clip.mp4", np.concatenate([left, right], axis=2), codec="mp4v")
     with pytest.raises(InputError, match="MPEG-4 part 2") as caught:
         open_clip(path)
-    assert "H.264, HEVC or VP9" in caught.value.remedy
+    assert "H.264, HEVC, VP9 or Motion JPEG" in caught.value.remedy
 
 
 def test_a_codec_hidden_in_an_accepted_container_is_refused(studio) -> None:

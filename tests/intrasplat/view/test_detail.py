@@ -13,8 +13,8 @@ from intrasplat.clip import DepthClip, FrameSplit
 from intrasplat.errors import SceneError
 from intrasplat.notices import NoticeCode
 from intrasplat.outcome import scene_of
+from intrasplat.scene.recorded_video import RecordedEye
 from intrasplat.scene.scene import TrainedScene
-from intrasplat.scene.training_pictures import RecordedEye
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.detail import CACHED, _together, detail_bytes
 from intrasplat.view.recorded import ClipPictures

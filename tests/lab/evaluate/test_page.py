@@ -95,16 +95,19 @@ def test_the_page_tells_what_a_caller_waits_for_by_both_clocks(tmp_path: Path) -
     rows = [post_row(commit="old", first_view_s=9.0), post_row(good_view_s=12.1), post_row(first_view_s=2.4)]
     rows += [post_row(preset="fast", budget_s=20), post_row(way="shell", first_view_s="", done_s=20.0)]
     rows += [post_row(device="cuda (a GPU)", first_view_s=0.5, commit="newer")]
+    rows += [post_row(poses="estimate", first_view_s=3.0), post_row(clip="phantom:pull", first_view_s=3.5)]
     write_rows(tmp_path / POST, FIELDS, rows)
     page = "".join(post_sections(tmp_path))
     assert "| d4d_stereo | instant | http | cpu | 2 | 2.2 | 12.1 (1 of 2) | 6.2 | 14.5 | 15.0 | 32.0 | – |" in page
     assert "| d4d_stereo | fast, 20 s | http | cpu | 1 | 2.0 | – | 6.2 | 14.5 | 15.0 | 32.0 | – |" in page
     assert "| d4d_stereo | instant | http | cuda (a GPU) | 1 | 0.5 | – | 6.2 | 14.5 | 15.0 | 32.0 | – |" in page
     assert "| d4d_stereo | instant | shell | cpu | 1 | – | – | 6.2 | 14.5 | 20.0 | 32.0 | – |" in page
+    assert "| d4d_stereo, poses=estimate | instant | http | cpu | 1 | 3.0 | – | 6.2 | 14.5 | 15.0 | 32.0 | – |" in page
     assert "commits new, newer" in page
     shown = post_table(tmp_path)
     assert "| instant | cpu | 2.2 | 6.2 | 14.5 |" in shown
     assert "| instant | a GPU | 0.5 | 6.2 | 14.5 |" in shown
+    assert shown.count("| instant |") == 2, "phantoms and poses that were asked for stand on the page alone"
     assert "fast" not in shown, "it was given other seconds than its own"
 
 

@@ -1,0 +1,111 @@
+"""What a feed says of itself: its state with a reason, and its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class FeedState(StrEnum):
+    """What a feed does now."""
+
+    CONNECTING = "connecting"
+    LIVE = "live"
+    BEHIND = "behind"
+    """Pairs come in, but decoding or training cannot keep up: frames are skipped."""
+    STALLED = "stalled"
+    """No pair comes in; the source is tried again, or may go on by itself."""
+    PAUSED = "paused"
+    """Nothing is read, decoded or kept."""
+    NO_TISSUE = "no_tissue"
+    ENDED = "ended"
+
+
+class FeedReason(StrEnum):
+    """Why a feed is in its state, why its last segment ended, or why nothing is recorded."""
+
+    UNREACHABLE = "unreachable"
+    HOST_REFUSED = "host_refused"
+    REDIRECTED = "redirected"
+    REFUSED = "refused"
+    CLOSED = "closed"
+    SILENT = "silent"
+    UNDECODABLE = "undecodable"
+    NO_VIDEO = "no_video"
+    TIMES_JUMPED = "times_jumped"
+    SIZE_CHANGED = "size_changed"
+    PACKING_CHANGED = "packing_changed"
+    PACKING_UNKNOWN = "packing_unknown"
+    PICTURE_LIMIT = "picture_limit"
+    DECODER_ENDED = "decoder_ended"
+    DECODER_MEMORY = "decoder_memory"
+    TOO_SLOW = "too_slow"
+    FAULT = "fault"
+    BY_HAND = "by_hand"
+    END_OF_FILE = "end_of_file"
+    # of the recording alone
+    DISK_FULL = "disk_full"
+    DISK_FAILS = "disk_fails"
+    DISK_SLOW = "disk_slow"
+    NOT_RECORDABLE = "not_recordable"
+
+
+@dataclass(frozen=True)
+class FeedStatus:
+    """The state of a source.
+
+    reason      why it is in this state; None while all is well
+    text        the same for people; its words may change
+    since       UNIX time, s, at which the state began
+    recording   why nothing is recorded at the moment; None: it is recorded, or nobody asked for it
+    """
+
+    state: FeedState
+    reason: FeedReason | None
+    text: str
+    since: float
+    recording: FeedReason | None = None
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a feed without a jump of its clock, from one connection.
+
+    number        counts from 0
+    reason        why the segment before it ended; None for the first
+    height, width, pixel_aspect   of one eye; width / height of a pixel
+    packing       sbs, tb, or two: a stream for each eye
+    codec         FFmpeg's name
+    """
+
+    number: int
+    reason: FeedReason | None
+    height: int
+    width: int
+    pixel_aspect: float
+    packing: str
+    codec: str
+
+
+@dataclass(frozen=True)
+class FeedNumbers:
+    """Numbers of a feed.
+
+    received_fps   pairs that came in a second, over the last seconds
+    used_fps       pairs that were handed over a second, over the last seconds
+    dropped        whole pairs that came in and were not handed over, in all
+    decode_lag_s   from the arrival of a packet to its decoded picture; None before the first
+    reconnects     connections after the first
+    last_frame_at  UNIX time, s, at which the newest packet came in; None before the first
+    kept_bytes     bytes of the recording on disk
+    model_age_s    from the arrival of the newest pair that the model knows until now; None without a model
+    """
+
+    received_fps: float
+    used_fps: float
+    dropped: int
+    decode_lag_s: float | None
+    reconnects: int
+    last_frame_at: float | None
+    kept_bytes: int
+    model_age_s: float | None = None
