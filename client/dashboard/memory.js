@@ -1,7 +1,7 @@
 // A finished scene in this browser's memory: downloaded and decoded once while the service draws, then drawn here. It is
 // kept nowhere else: nothing of a patient stays in the browser's cache.
 
-import { bodyOf, request } from "./api.js";
+import { bodyOf, getReport, request } from "./api.js";
 import { soon } from "./events.js";
 import { insist } from "./pause.js";
 import { DamagedError } from "./player/decode.js";
@@ -13,7 +13,6 @@ import { Problem } from "./problem.js";
 
 const SCENE = "scene.safetensors";
 const PARTIAL = 206;
-const UNPROCESSABLE = 422;
 const EYES = ["left", "right"];
 const MAX_SIDE_PX = 4096;
 const KEPT_AS = "intrasplat-drawing";
@@ -181,6 +180,7 @@ async function download(id, signal, onShare) {
 /** @returns {import("./player/trainingpictures.js").Source} */
 function picturesOf(id, manifest) {
   const count = manifest.world_from_camera.length;
+  let isMasked = null; // a promise
   return {
     bytes: manifest.beside[DETAIL].bytes,
     async read(first, end, signal) {
@@ -190,13 +190,11 @@ function picturesOf(id, manifest) {
       return response.status === PARTIAL ? bytes : bytes.subarray(first, end);
     },
     async mask(eye, frame, signal) {
+      isMasked ??= getReport(id).then(({ recorded }) => recorded?.masks === true);
+      isMasked.catch(() => (isMasked = null));
+      if (!(await isMasked)) return null;
       const query = new URLSearchParams({ t: String(frame / count), eye: EYES[eye], masks: "only" });
-      try {
-        return await bodyOf(await request(`/scenes/${id}/recorded?${query}`, { signal }), "blob");
-      } catch (error) {
-        if (error.status === UNPROCESSABLE) return null; // nothing is masked
-        throw error;
-      }
+      return bodyOf(await request(`/scenes/${id}/recorded?${query}`, { signal }), "blob");
     },
   };
 }

@@ -55,10 +55,11 @@ def read_frame(folder: Path, frame_count: int, t: float, eye: Eye = "left", kind
     try:
         with zipfile.ZipFile(folder / RECORDED) as archive:
             found = [match.groups() for name in archive.namelist() if (match := NAME.fullmatch(name))]
-            filmed = _filmed(folder, eye) if kind == PICTURE else ()
-            frames = {int(number) for side, number, ending in found if (side, ending) == (eye, kind)} | {*filmed}
+            filmed = _filmed(folder, eye)
             if not found and not filmed:
                 raise _no_recorded_frames()
+            filmed = filmed if kind == PICTURE else ()
+            frames = {int(number) for side, number, ending in found if (side, ending) == (eye, kind)} | {*filmed}
             if not frames:
                 raise _none_of(eye, kind, is_masked=any(ending == MASK for _, _, ending in found))
             index = nearest(sorted(frames), t, frame_count)

@@ -11,7 +11,8 @@ from selenium import webdriver
 
 from contract.store.store import Store
 from intrasplat.names import DETAIL, RECORDED, REPORT
-from intrasplat.report import Report
+from intrasplat.report import Recorded, Report
+from intrasplat.scene.recorded_file import EYES
 from tests.client.drawn import Drawn, beside_the_service, opened, picture_of, render_of
 from tests.client.page import Site, site_at
 from tests.client.player import drawing_browser
@@ -35,25 +36,32 @@ def site(tmp_path: Path) -> Iterator[Site]:
         yield site
 
 
-def view_with_detail(site: Site, page: Drawn, folder: Path, *, is_damaged: bool = False) -> None:
+def view_with_detail(
+    site: Site, page: Drawn, folder: Path, *, is_masked: bool = True, is_damaged: bool = False
+) -> None:
     """A scene with recorded frames that the page draws by itself."""
     model = dataclasses.replace(scattered(14, moves=True), trained_t=(0.0, 1 / 3, 2 / 3))
-    scene = stored(folder, model, 2)
+    scene = stored(folder, model, 2, is_masked=is_masked)
     beside = {name: (folder / name).read_bytes() for name in (DETAIL, RECORDED)}
     if is_damaged:
         beside[DETAIL] = beside[DETAIL][:3000] + bytes(len(beside[DETAIL]) - 3000)
     name = site.scene(model=scene, beside=beside)
     path = site.store.scene_folder(name, 1) / REPORT
-    report = Report.model_validate_json(path.read_text())
-    path.write_text(report.model_copy(update={"frame_count": scene.frame_count}).model_dump_json())
+    frames, content = tuple(scene.trained_frames), beside[RECORDED]
+    kept = Recorded(frames=frames, eyes=EYES, width=1, height=1, masks=is_masked, size_bytes=len(content))
+    changes = {"frame_count": scene.frame_count, "recorded": kept}
+    path.write_text(Report.model_validate_json(path.read_text()).model_copy(update=changes).model_dump_json())
     page.press(name, "View")
     page.choose_way("always")
     page.until_way("memory", "")
 
 
-def test_a_view_that_rests_gets_detail_from_the_page(site: Site, driver: webdriver.Chrome, tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_masked", [True, False])
+def test_a_view_that_rests_gets_detail_from_the_page(
+    site: Site, driver: webdriver.Chrome, tmp_path: Path, is_masked: bool
+) -> None:
     with opened(site.url, driver) as page:
-        view_with_detail(site, page, tmp_path / "made")
+        view_with_detail(site, page, tmp_path / "made", is_masked=is_masked)
         for wish in ({"t": 0.3, "pose": None}, {"t": 0.5, "pose": "orbit:5,-3,1"}):
             page.look(**wish)
             page.until(lambda: page.shown.get("t") == wish["t"] and page.shown["hasDetail"])  # noqa: B023

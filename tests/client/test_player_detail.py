@@ -48,8 +48,8 @@ def texture(frame: int, eye: int) -> NDArray[np.float32]:
     return np.asarray(0.08 * wave[..., None] + 0.2 * spot[..., None] * (1.0, 0.8, 0.3), np.float32)
 
 
-def stored(folder: Path, scene: TrainedScene, eyes: int) -> TrainedScene:
-    """The scene with recorded frames: what it shows in their light, with a texture and an instrument."""
+def stored(folder: Path, scene: TrainedScene, eyes: int, *, is_masked: bool = True) -> TrainedScene:
+    """The scene with recorded frames: what it shows in their light, with a texture, and perhaps an instrument."""
     lens = scene.intrinsics.resized(*SIZE)
     right = np.eye(4)
     right[:3, 3] = RIGHT_EYE_MM
@@ -68,7 +68,7 @@ def stored(folder: Path, scene: TrainedScene, eyes: int) -> TrainedScene:
     png = cv2.imencode(".png", np.dstack([tool] * 4))[1].tobytes()
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for eye in EYES[:eyes]:
+        for eye in EYES[:eyes] if is_masked else ():
             for frame in scene.trained_frames:
                 archive.writestr(name_of(eye, frame, MASK), png)
     save_scene(folder, scene, {DETAIL: video, RECORDED: content.getvalue()})

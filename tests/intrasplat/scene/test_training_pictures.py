@@ -127,6 +127,14 @@ def test_masks_say_what_is_tissue(tmp_path: Path, folder: Path) -> None:
     np.testing.assert_array_equal(pictures_of(tmp_path).picture(0, FRAMES[7])[1], tool == 0)
 
 
+def test_all_is_tissue_where_the_zip_file_is_empty(tmp_path: Path, folder: Path) -> None:
+    (tmp_path / DETAIL).write_bytes((folder / DETAIL).read_bytes())
+    with zipfile.ZipFile(tmp_path / RECORDED, "w"):
+        pass  # all frames trained the model, and nothing is masked
+    stored = pictures_of(tmp_path)
+    assert stored.picture(0, stored.frames[0])[1].all()
+
+
 def test_a_frame_that_was_not_stored_is_an_error(folder: Path) -> None:
     with pytest.raises(SceneError, match="no frame 9"):
         pictures_of(folder).picture(0, 9)
