@@ -30,6 +30,8 @@ MAX_DEPTH_ERROR = 0.06
 """Relative difference of depth at which an eye saw another point: nearer tissue hid this one."""
 MIN_SEEN = np.float32(0.3)
 """Validity from which on a pixel takes part in the flow between two frames."""
+MIN_SIDE_PX = 48
+"""Pictures with a shorter side have no flow: OpenCV's crashes in some of them."""
 FLOW_CELLS = 1.0
 """Standard deviation, in cells, of the mean of what the motion of the model leaves between two frames."""
 
@@ -145,6 +147,9 @@ def flow_between(before: Residual, after: Residual, opacity: Floats) -> Floats:
     opacity: [N] of the Gaussians.
     """
     height, width = before.grey.shape
+    cells = (-(-width // CELL_PX), -(-height // CELL_PX))
+    if min(height, width) < MIN_SIDE_PX:
+        return np.zeros((*cells[::-1], 2), np.float32)
     points = Points(before.world_from_eye, before.lens, before.depth_mm[1:-1, 1:-1])
     (moved_mm,) = points.motion_mm(before.means_mm, [after.means_mm], opacity)
     planes, valid = np.zeros_like(after.planes), after.planes[..., 3]
@@ -157,7 +162,6 @@ def flow_between(before: Residual, after: Residual, opacity: Floats) -> Floats:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(
         before.grey, np.rint(there).astype(np.uint8), np.zeros((height, width, 2), np.float32)
     )
-    cells = (-(-width // CELL_PX), -(-height // CELL_PX))
     weights = is_seen.astype(np.float32)
     planes_of_cells = cv2.resize(np.dstack([flow * weights[..., None], weights]), cells, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(planes_of_cells, (0, 0), FLOW_CELLS)

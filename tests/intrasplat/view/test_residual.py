@@ -58,6 +58,12 @@ def test_what_a_frame_does_not_show_has_no_flow(masked: str) -> None:
     assert np.abs(flow_between(before, after, opacity(before))).max() < 1e-3
 
 
+def test_flat_pictures_have_no_flow_because_that_would_crash() -> None:
+    whole = residual(texture(np.zeros(2)))
+    flat = dataclasses.replace(whole, grey=whole.grey[:30], planes=whole.planes[:32], depth_mm=whole.depth_mm[:32])
+    assert not flow_between(flat, flat, opacity(flat)).any()
+
+
 def test_views_from_beside_read_the_flow_where_the_eye_saw_the_points_and_shift_by_its_pixels() -> None:
     world_from_camera = np.eye(4)
     world_from_camera[0, 3] = 4.0  # mm to the right: points lie 10 px farther left
