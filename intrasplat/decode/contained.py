@@ -84,16 +84,7 @@ class Decoder:
         self.frames = 0
         self.result: dict[str, Any] | None = None
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", *program],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                cwd=self.folder,
-                env=environment_of(self.folder),
-                umask=0o077,
-                start_new_session=True,  # the parent handles Ctrl-C
-            )
+            self._process = start_process(program, self.folder)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
@@ -229,6 +220,24 @@ def take_decoder() -> Decoder:
     return decoder if decoder.is_alive else Decoder()
 
 
+def start_process(program: Sequence[str], folder: Path, pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
+    """Start Python with these arguments in a folder; it confines itself, and its pipes carry lines.
+
+    pass_fds: file descriptors that it gets. Raises OSError if it cannot be started.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-P", *program],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=folder,
+        env=_environment_of(folder),
+        umask=0o077,
+        start_new_session=True,  # the parent handles Ctrl-C
+        pass_fds=pass_fds,
+    )
+
+
 def _end_and_remove(process: subprocess.Popen[bytes], folder: Path) -> None:
     if process.poll() is None:
         process.kill()
@@ -266,7 +275,7 @@ def lines_of(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
             raise ValueError("a line without an end")
 
 
-def environment_of(folder: Path) -> dict[str, str]:
+def _environment_of(folder: Path) -> dict[str, str]:
     """The process's environment. From the parent's it keeps only the variables for finding libraries."""
     kept = {name: os.environ[name] for name in _PASSED_VARIABLES if name in os.environ}
     return kept | {

@@ -11,7 +11,6 @@ import math
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.decode.contained import MALFORMED, environment_of, lines_of
+from intrasplat.decode.contained import MALFORMED, lines_of, start_process
 from intrasplat.decode.guard import Allowance
 from intrasplat.intake.limits import MIN_SIDE_PX
 from intrasplat.live.connecting import Connection
@@ -91,17 +90,7 @@ class ReadingProcess:
         self._asking = threading.Lock()
         self._sending = threading.Lock()
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", *PROGRAM],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                cwd=self._folder,
-                env=environment_of(self._folder),
-                umask=0o077,
-                start_new_session=True,
-                pass_fds=(*connection.passed, self._pairs),
-            )
+            self._process = start_process(PROGRAM, self._folder, (*connection.passed, self._pairs))
         except BaseException:
             os.close(self._pairs)
             self._remove_folder()
