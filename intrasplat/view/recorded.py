@@ -61,8 +61,11 @@ class ClipPictures:
 
     def picture(self, eye: int, frame: int) -> tuple[Picture, Mask]:
         """See TrainingPictures."""
-        rgb, tool = _picture(self._eyes[eye], frame)
-        return rgb, ~tool
+        return self.rgb(eye, frame), ~_tool(self._eyes[eye], frame)
+
+    def rgb(self, eye: int, frame: int) -> Picture:
+        """R G B [h, w, 3] of a frame."""
+        return _rgb(self._eyes[eye], frame)
 
 
 def recorded_files(
@@ -78,9 +81,7 @@ def recorded_files(
     frames, chosen = spread(looked_at, MAX_MOMENTS), set(trained)
     pictures = ClipPictures(clip, len(eyes), [frame for frame in frames if frame in chosen])
     filmed = pictures.frames
-    video = (
-        encoded(filmed, pictures.eyes, lambda eye, frame: coded(pictures.picture(eye, frame)[0])) if filmed else None
-    )
+    video = encoded(filmed, pictures.eyes, lambda eye, frame: coded(pictures.rgb(eye, frame)))
     zipped, is_masked = _zipped(clip, eyes, frames, set() if video is None else set(filmed))
     lens = pictures.eyes[0].lens
     summary = Recorded(
@@ -103,10 +104,11 @@ def _zipped(
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name in eyes:
             for index in frames:
-                rgb, tool = _picture(_eye(clip, name), index)
+                eye = _eye(clip, name)
+                tool = _tool(eye, index)
                 is_masked = is_masked or bool(tool.any())
                 if index not in filmed:
-                    archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(rgb))
+                    archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(_rgb(eye, index)))
                 masks[name_of(name, index, MASK)] = _png(tool)
         for path, png in masks.items() if is_masked else ():
             archive.writestr(zipfile.ZipInfo(path), png)
@@ -122,10 +124,11 @@ def live_frame(
         InputError: the clip has no such eye.
     """
     index = nearest(clip.used, t, clip.frame_count)
-    rgb, tool = _picture(_eye(clip, eye), index)
+    of = _eye(clip, eye)
     if masks is RecordedMasks.ONLY:
-        return index, _png(tool)
-    return index, _jpeg(_marked(rgb, tool) if masks is RecordedMasks.MARKED else rgb)
+        return index, _png(_tool(of, index))
+    rgb = _rgb(of, index)
+    return index, _jpeg(_marked(rgb, _tool(of, index)) if masks is RecordedMasks.MARKED else rgb)
 
 
 def stored_frame(
@@ -163,16 +166,23 @@ def _eye(clip: DepthClip, name: EyeName) -> Eye:
         raise InputError("eye", f"this clip has no {name} eye.", "Ask for eye=left.") from None
 
 
-def _picture(eye: Eye, index: int) -> tuple[Picture, Mask]:
-    """A frame [h, w, 3] and where it shows instruments [h, w]."""
-    rgb, tool = eye.rgb[index].copy(), ~eye.tissue[index]
+def _rgb(eye: Eye, index: int) -> Picture:
+    """A frame [h, w, 3]."""
+    rgb, size = np.array(eye.rgb[index], np.uint8), _shown_size(eye)
     let_go(eye.rgb[index])
-    let_go(eye.tissue[index])
-    size = _shown_size(eye)
-    if size != tool.shape[::-1]:
+    if size != rgb.shape[1::-1]:
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return rgb
+
+
+def _tool(eye: Eye, index: int) -> Mask:
+    """Where a frame shows instruments [h, w]."""
+    size = _shown_size(eye)
+    tool: Mask = np.logical_not(eye.tissue[index])
+    let_go(eye.tissue[index])
+    if size != tool.shape[::-1]:
         tool = cv2.resize(tool.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return rgb, tool
+    return tool
 
 
 def _shown_size(eye: Eye) -> tuple[int, int]:

@@ -45,7 +45,7 @@ def detail_sections(rows: Path, pictures: Path) -> list[str]:
     if not found:
         return []
     cells = [
-        [*run[:2], run[2], run[3], view, str(len(group)), *(_shown(group, *each) for each in _COLUMNS.items())]
+        [*run, view, str(len(group)), *(_shown(group, *each) for each in _COLUMNS.items())]
         for (run, view), group in _groups(found).items()
     ]
     header = ["clip", "preset", "limit", "held out", "view", "seeds", *(name for name, _ in _COLUMNS.values())]
