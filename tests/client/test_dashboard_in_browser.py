@@ -184,6 +184,7 @@ def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewh
         "camera": CAMERA.model_dump(mode="json"),
         "depthRangeMm": [45, 78],
         "isMoving": False,
+        "hasDetail": False,
     }
     page.find("#stage").send_keys("+")  # a turn or an approach goes on from the endoscope
     page.until(lambda: "1.10×" in page.view)
