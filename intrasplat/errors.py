@@ -30,6 +30,7 @@ class ErrorCode(StrEnum):
     LIMIT = "limit"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"
+    FEEDS_FULL = "feeds_full"
     QUEUE_FULL = "queue_full"
     RECORD_UNREADABLE = "record_unreadable"
     RESUME_MISMATCH = "resume_mismatch"

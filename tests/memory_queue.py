@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Collection
 
 from contract.queue.deliveries import OWED_FOR_S, ClaimedDelivery
+from contract.queue.feeds import FEED_LEASE_S, FeedClaim
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -36,20 +37,28 @@ from contract.queue.interface import (
     trainers,
     worker_died,
 )
+from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
 from contract.wire.job import TERMINAL_STATES, TRANSITIONS, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
 from contract.wire.webhooks import Delivery, DeliveryStatus
 from tests.memory_deliveries import MemoryDeliveries
+from tests.memory_feeds import MemoryFeeds
 
 LEASE_CHECK_S = 0.05
 """How often a waiting claim looks for leases that have run out."""
 
 
 class MemoryQueue:
-    """A Queue; one lock makes each method atomic. lease_s and preempt_after_s are for tests that cannot wait."""
+    """A Queue; one lock makes each method atomic. The arguments are for tests that cannot wait."""
 
-    def __init__(self, *, lease_s: float = LEASE_S, preempt_after_s: float = PREEMPT_AFTER_S) -> None:
+    def __init__(
+        self,
+        *,
+        lease_s: float = LEASE_S,
+        preempt_after_s: float = PREEMPT_AFTER_S,
+        feed_lease_s: float = FEED_LEASE_S,
+    ) -> None:
         self._lease_s = lease_s
         self._preempt_after_s = preempt_after_s
         self._changed = threading.Condition(threading.RLock())
@@ -72,6 +81,7 @@ class MemoryQueue:
         """By tenant: the number of the last claim that gave it a new job."""
         self._workers: dict[str, tuple[WorkerAddress, float]] = {}
         self._deliveries = MemoryDeliveries()
+        self._feeds = MemoryFeeds(feed_lease_s)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         with self._changed:
@@ -240,6 +250,38 @@ class MemoryQueue:
 
     def rewrite_log(self) -> bool:
         return True
+
+    def open_feed(self, record: FeedRecord, most: int, most_of_tenant: int) -> FeedRecord:
+        with self._changed:
+            return self._feeds.open(record, most, most_of_tenant)
+
+    def claim_feed(self, owner: str) -> FeedRecord | None:
+        with self._changed:
+            return self._feeds.claim(owner)
+
+    def beat_feed(self, claim: FeedClaim, report: FeedReport) -> FeedWish | None:
+        with self._changed:
+            return self._feeds.beat(claim, report)
+
+    def release_feed(self, claim: FeedClaim) -> bool:
+        with self._changed:
+            return self._feeds.leave(claim, has_ended=False)
+
+    def forget_feed(self, claim: FeedClaim) -> bool:
+        with self._changed:
+            return self._feeds.leave(claim, has_ended=True)
+
+    def wish_feed(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
+        with self._changed:
+            return self._feeds.wish(feed_id, wish)
+
+    def feed(self, feed_id: str) -> FeedRecord | None:
+        with self._changed:
+            return self._feeds.one(feed_id)
+
+    def feeds(self, tenant: str | None = None) -> list[FeedRecord]:
+        with self._changed:
+            return self._feeds.all(tenant)
 
     def announce(self, address: WorkerAddress) -> None:
         with self._changed:

@@ -22,7 +22,14 @@ from pydantic import ValidationError
 from zmq.auth.thread import ThreadAuthenticator
 
 from contract.access.render_keys import service_keys, worker_keys
-from contract.wire.rendering import CancelRequest, ReplyError, WorkerReply, WorkerRequest
+from contract.wire.rendering import (
+    CancelRequest,
+    CutRequest,
+    PushRequest,
+    ReplyError,
+    WorkerReply,
+    WorkerRequest,
+)
 from intrasplat.errors import InputError, SceneError, UnavailableError
 from worker.job_errors import FAULT_REMEDY
 from worker.reply import NotYetError, Reply
@@ -145,6 +152,10 @@ class RequestServer:
         request = envelope.request
         if isinstance(request, CancelRequest):
             self._scheduler.give_up(caller, request_id)
+            return
+        if isinstance(request, CutRequest | PushRequest):
+            error = _reply_error(SceneError("This process follows no feed."))
+            self._send(caller, request_id, WorkerReply(error=error))
             return
         try:
             wait_s = self._scheduler.take_in(caller, request_id, request, envelope.trace)

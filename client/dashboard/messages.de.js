@@ -122,6 +122,7 @@ export const DE = {
     "limit:clip": "Der Clip ist größer oder länger, als dieser Dienst annimmt.",
     "not_yet": "Es gibt noch nichts zu sehen.",
     "out_of_memory": "Der Clip braucht mehr Speicher, als der Dienst hat. Senden Sie einen kürzeren oder kleineren.",
+    "feeds_full": "Zu viele Live-Quellen sind offen. Beenden Sie eine.",
     "queue_full": "Zu viele Clips warten. Senden Sie ihn später noch einmal.",
     "record_unreadable": "Der Dienst kann seine Notizen zu diesem Clip nicht lesen. Senden Sie den Clip noch einmal.",
     "resume_mismatch": "Das Begonnene lässt sich nicht fortsetzen. Senden Sie den Clip noch einmal.",

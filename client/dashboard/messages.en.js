@@ -122,6 +122,7 @@ export const EN = {
     "limit:clip": "The clip is larger or longer than this service accepts.",
     "not_yet": "There is nothing to show yet.",
     "out_of_memory": "The clip needs more memory than the service has. Send a shorter or smaller one.",
+    "feeds_full": "Too many live feeds are open. End one of them.",
     "queue_full": "Too many clips are waiting. Send it again later.",
     "record_unreadable": "The service cannot read its notes on this clip. Send the clip again.",
     "resume_mismatch": "What was begun cannot be continued. Send the clip again.",

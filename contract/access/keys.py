@@ -54,6 +54,8 @@ class KeyScope(StrEnum):
     """Jobs of high priority, which go before others' and in place of them."""
     LONG = "long"
     """Jobs that train longer than others may (Settings.long_training_s)."""
+    FEEDS = "feeds"
+    """Open, pause and end live feeds, push into them and cut clips out of them."""
     OPERATE = "operate"
     """Read the metrics."""
 

@@ -19,6 +19,7 @@ from statistics import median
 from typing import Protocol
 
 from contract.queue.deliveries import Deliveries
+from contract.queue.feeds import Feeds
 from contract.wire.job import Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
 from contract.wire.rendering import WorkerAddress
@@ -127,7 +128,7 @@ class QueueFullError(UnavailableError):
         self.tenant = tenant
 
 
-class Queue(Deliveries, Protocol):
+class Queue(Deliveries, Feeds, Protocol):
     """Every method is atomic, and may be repeated when its answer was lost.
 
     All raise UnavailableError when the queue cannot be reached or its memory is full.

@@ -22,6 +22,7 @@ from intrasplat.names import BUDGETS_S
 NAMES = (
     *("submit", "restore", "claim", "beat", "settle", "release", "cancel", "retry", "relabel", "forget"),
     *("claim_delivery", "record_try", "again", "announce"),
+    *("open_feed", "claim_feed", "beat_feed", "leave_feed", "wish_feed"),
 )
 
 UNREADABLE = JobError(

@@ -1,4 +1,4 @@
-"""The queue on Redis 7+ or Valkey Streams. This file, redis_deliveries.py and scripts/ are all that touches keys.
+"""The queue on Redis 7+ or Valkey Streams. Only this file, redis_deliveries.py, redis_feeds.py and scripts/ touch keys.
 
 Keys (the braces put all of them in one cluster slot, so that a script may touch several):
     {intrasplat}:jobs:high|standard     stream; an entry has one field, `job` = job id. Group `workers`; an entry stays
@@ -19,10 +19,13 @@ Keys (the braces put all of them in one cluster slot, so that a script may touch
         restored                        token of the call that put it back
     {intrasplat}:events:<id>            stream; each entry is what a change left of the hash (EVENT_FIELDS)
     {intrasplat}:deliveries:<id>        hash, JSON of Delivery by event: the webhooks of the job's ends
+    {intrasplat}:feed:<id>              hash of a live feed: document (its FeedRecord when it was opened), tenant, wish,
+                                        owner, epoch, lease (UNIX s until when it is owned), report and reported
 Indexes, written by the same scripts as the hashes:
     {intrasplat}:index                  sorted set of job ids by time of submission; and tenant:<tenant>:index
     {intrasplat}:waiting:high|standard  sorted set of queued jobs by sequence: the order in which they will be claimed
     {intrasplat}:queued                 sorted set of the same jobs by `queued`; and set tenant:<tenant>:waiting
+    {intrasplat}:feeds                  sorted set of the live feeds by time of creation; and feeds:<tenant>
     {intrasplat}:held                   hash of the running jobs, by owner
     {intrasplat}:served                 sorted set of tenants, by when each was last given a job; expires after a day
     {intrasplat}:dead                   sorted set of dead letters, by time of failure
@@ -40,6 +43,7 @@ These expire:
     {intrasplat}:idempotency:<tenant>:<hash>  id of the job submitted under that key
     {intrasplat}:yield:<id>             worker that was ordered to yield to that job
     {intrasplat}:forgotten:<id>         token of the call that removed it
+    {intrasplat}:left:<id>              token of the call by which a worker left that feed
     {intrasplat}:lent:<token>           event of the delivery that this call claimed
     {intrasplat}:trying:<event>         while a service tries to deliver it
 
@@ -62,6 +66,7 @@ from collections.abc import Sequence
 
 import redis
 
+from contract.queue.feeds import FEED_LEASE_S
 from contract.queue.interface import (
     IDEMPOTENCY_S,
     LEASE_S,
@@ -85,6 +90,7 @@ from contract.queue.interface import (
 from contract.queue.lua import UNREADABLE, Scripts
 from contract.queue.redis_client import PATIENCE_S, connect, reachable
 from contract.queue.redis_deliveries import RedisDeliveries
+from contract.queue.redis_feeds import RedisFeeds
 from contract.queue.redis_hash import BESIDE_EVENTS, label_fields, new_record, record_of, table_of
 from contract.wire.job import TERMINAL_STATES, Forecast, JobError, JobProgress, JobRecord, JobState
 from contract.wire.labels import LabelChange
@@ -109,12 +115,13 @@ LEASE_CHECK_S = 0.5
 logger = logging.getLogger("intrasplat.queue")
 
 
-class RedisQueue(RedisDeliveries):
+class RedisQueue(RedisDeliveries, RedisFeeds):
     """A Queue on a Redis 7+ or Valkey server (`redis://`, `rediss://` or `unix://`); safe to share among threads.
 
     patience_s: how long, in total, a call waits for a server that does not answer. A claim needs more than BLOCK_S for
     each of the client's attempts; the default allows that.
-    lease_s and preempt_after_s are for tests that cannot wait. All clients of one queue must agree on them.
+    lease_s, preempt_after_s and feed_lease_s are for tests that cannot wait. All clients of one queue must agree on
+    them.
     """
 
     def __init__(
@@ -124,9 +131,12 @@ class RedisQueue(RedisDeliveries):
         patience_s: float = PATIENCE_S,
         lease_s: float = LEASE_S,
         preempt_after_s: float = PREEMPT_AFTER_S,
+        feed_lease_s: float = FEED_LEASE_S,
     ) -> None:
         client = connect(url, patience_s)
-        super().__init__(client, Scripts(client, PREFIX, lease_s, preempt_after_s), PREFIX)
+        scripts = Scripts(client, PREFIX, lease_s, preempt_after_s)
+        RedisDeliveries.__init__(self, client, scripts, PREFIX)
+        RedisFeeds.__init__(self, client, scripts, PREFIX, feed_lease_s)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         limits = (admission.queued, admission.queued_per_tenant) if admission else ("", "")

@@ -1,6 +1,7 @@
 """What the service asks of the worker that holds a scene, and what comes back, over ZeroMQ.
 
 Wire, service (DEALER) to worker (ROUTER):  [request id, WorkerRequest as JSON]
+                                            A PushRequest has a third part: the pushed bytes.
 Wire, worker to service:                    [request id, WorkerReply as JSON, body]
 The body is the encoded image or file; requests on one connection may be answered in any order. A CancelRequest has the
 id of the request that it gives up, and gets no answer.
@@ -14,6 +15,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
+from contract.wire.feeds import FeedShown, FeedTime
 from intrasplat.formats import ExportOptions
 from intrasplat.measuring import MAX_POINTS, Point
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
@@ -29,6 +31,7 @@ from intrasplat.picture import (
 )
 from intrasplat.pose import MatrixPose, OrbitPose
 
+MAX_PUSH_BYTES = 48 * 1024
 GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
 
@@ -43,7 +46,8 @@ class PictureCamera(ClipCamera):
 class RenderRequest(BaseModel):
     """One view of one scene. t in [0, 1], later times clamp with a warning; pose None is the endoscope's own at t.
 
-    attempt is the one whose scene was published; None asks for the newest snapshot of the job while it trains.
+    attempt is the one whose scene was published; None asks for the newest snapshot of the job while it trains, or for a
+    moment of a live feed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -52,6 +56,10 @@ class RenderRequest(BaseModel):
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int | None = None
     t: float = Field(ge=0, le=1e6)
+    moment: FeedTime | None = Field(default=None, exclude_if=lambda moment: moment is None)
+    """Of a live feed, in place of t."""
+    newer_than_s: float | None = Field(default=None, exclude_if=lambda seconds: seconds is None)
+    """The answer is empty if the feed's newest moment is not later than this second of its source."""
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
     eye: Eye = "left"
     """Whose pose and lens are taken where the caller gives none; with a pose it must be left."""
@@ -100,6 +108,9 @@ class ExportRequest(BaseModel):
     kind: Literal["export"] = "export"
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int
+    """0 of a live feed."""
+    moment: FeedTime | None = Field(default=None, exclude_if=lambda moment: moment is None)
+    """Of a live feed: its segment of the past is exported."""
     format: str = Field(default="ply", max_length=32)
     options: ExportOptions = ExportOptions()
     export_id: str = Field(pattern=r"^[0-9a-f]{32}$")
@@ -116,6 +127,7 @@ class RecordedRequest(BaseModel):
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int | None = None
     t: float = Field(ge=0, le=1e6)
+    moment: FeedTime | None = Field(default=None, exclude_if=lambda moment: moment is None)
     eye: Eye = "left"
     masks: RecordedMasks = RecordedMasks.MARKED
 
@@ -129,10 +141,55 @@ class MeasureRequest(BaseModel):
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
     attempt: int
     t: float = Field(ge=0, le=1e6)
+    moment: FeedTime | None = Field(default=None, exclude_if=lambda moment: moment is None)
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
     camera: IntrinsicsOverride = IntrinsicsOverride()
     points: tuple[Point, ...] = Field(min_length=1, max_length=MAX_POINTS)
     max_pixels: int = Field(default=4096 * 2160, gt=0)
+
+
+class CutRequest(BaseModel):
+    """One part of the recording of a live feed as a video file, asked for one after the other while `more` follow.
+
+    from_s and to_s are UNIX times of the arrival of pairs. The file begins and ends at key frames.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["cut"] = "cut"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    from_s: float
+    to_s: float
+    export_id: str = Field(pattern=r"^[0-9a-f]{32}$")
+    """Chosen by the asker, the same for all parts."""
+    part: int = Field(default=0, ge=0)
+
+    @property
+    def attempt(self) -> None:
+        """A feed has none."""
+        return None
+
+
+class PushRequest(BaseModel):
+    """The next bytes of the video that a caller pushes, as the body of the message: at most MAX_PUSH_BYTES.
+
+    The answer comes when the feed has taken them. is_last: the caller's connection has ended.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["push"] = "push"
+    scene_id: str = Field(pattern=JOB_ID_PATTERN)
+    push_id: str = Field(pattern=r"^[0-9a-f]{32}$")
+    """Of the connection. A feed takes one at a time; a new one takes the place of the one before."""
+    pictures: bool = False
+    """Each picture is a PICTURE_HEADER and a JPEG or WebP of both eyes."""
+    is_last: bool = False
+
+    @property
+    def attempt(self) -> None:
+        """A feed has none."""
+        return None
 
 
 class CancelRequest(BaseModel):
@@ -145,12 +202,14 @@ class CancelRequest(BaseModel):
 
 SceneRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest | CamerasRequest | MeasureRequest
 """What is asked of a scene."""
+FeedRequest: TypeAlias = RenderRequest | ExportRequest | RecordedRequest | MeasureRequest | CutRequest | PushRequest
+"""What is asked of a live feed."""
 
 
 class WorkerRequest(BaseModel):
     """The envelope: one of the requests above."""
 
-    request: SceneRequest | CancelRequest = Field(discriminator="kind")
+    request: SceneRequest | CutRequest | PushRequest | CancelRequest = Field(discriminator="kind")
     trace: str | None = None
     """The W3C traceparent of who asks. A worker that knows no traces ignores it."""
 
@@ -187,6 +246,8 @@ class WorkerReply(BaseModel):
     """Width and height of the clip in pixels: the image's where the request names none."""
     camera: PictureCamera | None = None
     """The camera of a render; None for other answers."""
+    feed: FeedShown | None = None
+    """The moment that is shown, of a live feed."""
     more: bool = False
     """More parts of the export follow."""
     depth_range_mm: tuple[float, float] | None = None
@@ -214,3 +275,5 @@ class WorkerAddress(BaseModel):
     """Scenes it holds in memory."""
     renders_only: bool = False
     """It claims no jobs."""
+    feed_id: str | None = None
+    """The live feed that it follows: it answers requests for that alone."""

@@ -17,6 +17,8 @@ from intrasplat.intake.limits import ClipLimits
 
 FIELD = "source"
 MAX_URL_CHARACTERS = 2000
+MAX_KEEP_S = 7 * 86400.0
+"""The longest past of a feed."""
 FeedLayout = Literal["auto", "sbs", "tb", "two"]
 """How two eyes arrive: side by side, top-bottom, as two streams of one source; auto finds it."""
 

@@ -41,6 +41,10 @@ class FeedReason(StrEnum):
     DECODER_MEMORY = "decoder_memory"
     TOO_SLOW = "too_slow"
     FAULT = "fault"
+    NO_WORKER = "no_worker"
+    """No worker has a free place for the feed."""
+    UNCLASSIFIED = "unclassified"
+    """A reason that a later version names."""
     BY_HAND = "by_hand"
     END_OF_FILE = "end_of_file"
     # of the recording alone

@@ -162,3 +162,17 @@ local function index(id, tenant, created)
 end
 
 local function idempotency(tenant, hash) return P .. 'idempotency:' .. tenant .. ':' .. hash end
+
+local function feed_key(id) return P .. 'feed:' .. id end
+
+-- Who follows a feed; nil if nobody does, or the lease has expired.
+local function feed_owner(id)
+  local found = redis.call('HMGET', feed_key(id), 'owner', 'lease')
+  return found[1] and found[2] and tonumber(found[2]) > tonumber(now()) and found[1] or nil
+end
+
+-- Whether a feed's last claim is this one. A late beat is accepted as long as nobody else has claimed the feed.
+local function is_feed_of(id, owner, epoch)
+  local found = redis.call('HMGET', feed_key(id), 'owner', 'epoch')
+  return found[1] == owner and tonumber(found[2]) == tonumber(epoch)
+end

@@ -1,0 +1,180 @@
+"""A live feed: what its caller asked for, who follows it, what that worker last said of it, and the moments of it that
+a view may show."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from contract.wire.job import LOCAL_TENANT, TENANT_PATTERN
+from contract.wire.labels import LABEL_ABOUT, Label
+from intrasplat.codes import known_code
+from intrasplat.errors import InputError
+from intrasplat.live.spec import MAX_KEEP_S, MAX_URL_CHARACTERS
+from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.names import JOB_ID_PATTERN
+
+LIVE = "live"
+_NUMBER = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
+T_REMEDY = (
+    "Give live, seconds before live (-12.5), seconds of the source (31.4), or a time such as 2026-05-04T10:20:30Z."
+)
+
+
+class FeedWish(StrEnum):
+    """What the caller wants of a feed."""
+
+    RUN = "run"
+    PAUSE = "pause"
+    END = "end"
+    """Its worker stops, deletes all that belongs to it, and removes the record."""
+
+
+class FeedOptions(BaseModel):
+    """The options of POST /feeds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: str | None = Field(
+        default=None,
+        max_length=MAX_URL_CHARACTERS,
+        repr=False,
+        description="where the video is: rtsp(s)://, tcp:// or udp:// (MPEG-TS), http(s)://; left out, you push it: "
+        "PUT /feeds/{id}/video, or the WebSocket /feeds/{id}/pictures",
+    )
+    layout: Literal["auto", "sbs", "tb", "two"] = Field(
+        default="auto",
+        description="two eyes in one picture, side by side or top-bottom, or in two streams of one source",
+    )
+    label: Label = Field(default=None, description=LABEL_ABOUT)
+    keep_s: float = Field(
+        default=300.0, gt=0, le=MAX_KEEP_S, description="seconds of the past that can be viewed and cut out"
+    )
+    width: int | None = Field(
+        default=None,
+        ge=64,
+        le=4096,
+        description="width in pixels of the pictures that the model learns; left out, what the machine keeps up with",
+    )
+    camera: Literal["fixed", "moving"] = Field(
+        default="fixed", description="fixed: the endoscope's motion counts as the tissue's"
+    )
+
+
+class FeedReport(BaseModel):
+    """What the worker that follows a feed says of it. Moments are UNIX times, s, of the arrival of pairs.
+
+    Fields that only a later version knows are ignored.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    state: FeedState
+    reason: Annotated[FeedReason, known_code(FeedReason)] | None = Field(
+        default=None, description="why it is in this state; null while all is well"
+    )
+    text: str = Field(default="", description="the same for people; its words may change")
+    since_s: float = Field(description="when the state began")
+    recording: Annotated[FeedReason, known_code(FeedReason)] | None = Field(
+        default=None, description="why nothing is recorded at the moment; null: it is recorded"
+    )
+    received_fps: float = Field(default=0.0, description="pairs that came in a second, over the last seconds")
+    used_fps: float = Field(default=0.0, description="pairs that the model learnt a second, over the last seconds")
+    dropped: int = Field(default=0, description="whole pairs that came in and that the model did not learn, in all")
+    model_age_s: float | None = Field(
+        default=None, description="from the arrival of the newest pair that the model knows until this report"
+    )
+    decode_lag_s: float | None = Field(default=None, description="from the arrival of a pair to its picture")
+    reconnects: int = Field(default=0, description="connections after the first")
+    last_frame_at_s: float | None = Field(default=None, description="when the newest pair arrived")
+    kept_bytes: int = Field(default=0, description="bytes of the recording and of the model's past on disk")
+    begins_s: float | None = Field(default=None, description="the oldest moment that can be viewed; null: none yet")
+    ends_s: float | None = Field(default=None, description="the newest moment that can be viewed")
+    source_begins_s: float | None = Field(default=None, description="begins_s in seconds of the source")
+    source_ends_s: float | None = Field(default=None, description="ends_s in seconds of the source")
+    width: int | None = Field(default=None, description="of the pictures that the model learns, in pixels")
+    height: int | None = None
+    gaussians: int = 0
+
+
+class FeedRecord(BaseModel):
+    """A feed as the queue has it. owner follows it in its epoch-th turn, as long as it beats."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    feed_id: str = Field(pattern=JOB_ID_PATTERN)
+    tenant: str = Field(default=LOCAL_TENANT, pattern=TENANT_PATTERN)
+    options: FeedOptions
+    calibration: str = Field(repr=False)
+    """The text of the caller's file."""
+    calibration_name: str
+    """calibration with the ending that names its format."""
+    created_at_s: float
+    wish: FeedWish = FeedWish.RUN
+    owner: str | None = None
+    epoch: int = 0
+    report: FeedReport | None = None
+    reported_at_s: float | None = None
+
+
+class FeedTime(BaseModel):
+    """The moment of a feed that is asked for: exactly one of these.
+
+    before_live_s  seconds before the newest moment that the model knows; 0: that one
+    source_s       seconds of the source since the feed's first pair
+    at_s           UNIX time, s, of the arrival of a pair
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    before_live_s: float | None = Field(default=None, ge=0, le=MAX_KEEP_S)
+    source_s: float | None = Field(default=None, ge=0, le=1e9)
+    at_s: float | None = Field(default=None, ge=0, le=1e11)
+
+    @model_validator(mode="after")
+    def _one(self) -> FeedTime:
+        if sum(each is not None for each in (self.before_live_s, self.source_s, self.at_s)) != 1:
+            raise ValueError("give exactly one of before_live_s, source_s and at_s")
+        return self
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the newest moment is asked for."""
+        return self.before_live_s == 0
+
+
+class FeedShown(BaseModel):
+    """The moment of a feed that an answer shows, and how fresh it is."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    state: FeedState
+    source_s: float = Field(description="seconds of the source")
+    captured_at_s: float = Field(description="UNIX time at which its pair arrived")
+    age_s: float = Field(description="seconds from then until the answer")
+    is_newest: bool = Field(description="whether it is the newest moment that the model knew")
+
+
+def feed_time(text: str) -> FeedTime:
+    """The moment that a caller's t names.
+
+    Raises:
+        InputError: it names none.
+    """
+    if text == LIVE:
+        return FeedTime(before_live_s=0)
+    if _NUMBER.fullmatch(text):
+        seconds = float(text)
+        if seconds >= -MAX_KEEP_S:
+            return FeedTime(before_live_s=-seconds) if text.startswith("-") else FeedTime(source_s=seconds)
+    try:
+        moment = datetime.fromisoformat(text)
+        if moment.tzinfo is not None and moment.timestamp() >= 0:
+            return FeedTime(at_s=moment.timestamp())
+    except (ValueError, OverflowError):
+        pass
+    raise InputError("t", f"{text[:40]!r} is no moment of a feed.", T_REMEDY)
