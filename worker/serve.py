@@ -154,8 +154,8 @@ class RequestServer:
             self._scheduler.give_up(caller, request_id)
             return
         if isinstance(request, CutRequest | PushRequest):
-            error = _reply_error(SceneError("This process follows no feed."))
-            self._send(caller, request_id, WorkerReply(error=error))
+            no_feed = WorkerReply(error=_reply_error(SceneError("This process follows no feed.")))
+            self._send(caller, request_id, no_feed)
             return
         try:
             wait_s = self._scheduler.take_in(caller, request_id, request, envelope.trace)
