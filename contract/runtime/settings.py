@@ -137,16 +137,16 @@ class Settings(BaseModel):
     """Feeds that a worker follows at the same time."""
     max_feeds: int = Field(default=8, ge=0)
     """Open feeds of all callers."""
-    max_feeds_per_tenant: int = Field(default=4, ge=0)
+    feeds_of_tenant: int = Field(default=4, ge=0)
     feed_hosts: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
     """Where feeds may be read from, such as rtsp://camera.example.org or udp://0.0.0.0:5000; nowhere by default."""
     feed_private: Literal["no", "yes"] = "no"
     """yes: those hosts may have private addresses, and those of this machine."""
     feed_devices: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
     """Capture devices and files of the worker's machine that feeds may be read from, as absolute paths."""
-    max_feed_keep_s: float = Field(default=3600.0, gt=0, le=MAX_KEEP_S)
+    feed_keep_s: float = Field(default=3600.0, gt=0, le=MAX_KEEP_S)
     """Longest past of a feed."""
-    max_feed_bytes: int = Field(default=8 * GIB, gt=0)
+    feed_disk_bytes: int = Field(default=8 * GIB, gt=0)
     """Most bytes of one feed's recording; the oldest go first."""
 
     # renders
