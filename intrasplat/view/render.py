@@ -243,7 +243,9 @@ def _add_detail(view: ViewRequest, picture: _Picture) -> Parts[tuple[float, tupl
     added, warnings = Added.nothing(picture.depth_mm.shape), tuple[Notice, ...]()
     try:
         if (detail := renderer.detail) is not None:
-            added = yield from detail.added(renderer, view.shown_t, view.pose, lens, picture.depth_mm)
+            added = yield from detail.added(
+                renderer, view.shown_t, view.pose, lens, picture.depth_mm, highlights=view.highlights
+            )
     except SceneError as error:
         warnings = (Notice.warning(NoticeCode.DETAIL_MISSING, f"The model is shown alone: {error}"),)
     yield

@@ -119,7 +119,7 @@ export class Player {
     const deformed = performance.now();
     const lens = this.cameras.resized(view.width, view.height);
     this.#blend(t, view.pose, lens, view.highlights !== false);
-    const added = hasDetail ? this.detail.add(t, view.pose, lens) : null;
+    const added = hasDetail ? this.detail.add(t, view.pose, lens, view.highlights !== false) : null;
     this.drawing.show(view.isMarked !== false, added);
     if (hasDetail) {
       await this.settled();
@@ -139,7 +139,7 @@ export class Player {
     if (view.isRefined) await this.opening;
     const { detail } = this;
     if (detail === null || !(view.isRefined || this.detailMs < MAX_DETAIL_MS)) return false;
-    const { residuals, flows } = detail.wanted(t, view.pose);
+    const { residuals, flows } = detail.wanted(t, view.pose, view.highlights !== false);
     const { pictures } = detail;
     if (view.isMoving) for (const { eye, frame } of residuals) pictures.ahead(eye, frame);
     const missing = residuals.filter((each) => !detail.has(each));
