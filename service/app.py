@@ -59,7 +59,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
         background = (deps.sweep.run, deps.retention.run, deps.webhooks.run, renderer.run)
         tasks = [asyncio.create_task(_restart_on_error(run)) for run in background]
         yield
-        deps.feeds.end()
+        deps.end_channels()
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)

@@ -24,7 +24,7 @@ from intrasplat.version import version
 
 NO_ROUTE = "none"
 """The label of the page's files and of unknown paths. Callers choose paths, so a path is never a label."""
-METHODS = frozenset({"GET", "HEAD", "POST", "PATCH", "DELETE", "OPTIONS"})
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 DURATIONS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 600.0)
 RENDER_DURATIONS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 5.0)
 REASONS = {
