@@ -59,7 +59,9 @@ class MemoryFeeds:
 
     def wish(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
         record = self._records.get(feed_id)
-        if record is not None and record.wish is not FeedWish.END:
+        if record is not None and wish is FeedWish.END and record.epoch == 0:
+            del self._records[feed_id]
+        elif record is not None and record.wish is not FeedWish.END:
             self._records[feed_id] = record.model_copy(update={"wish": wish})
         return self.one(feed_id)
 

@@ -65,7 +65,10 @@ class Feeds(Protocol):
         ...
 
     def wish_feed(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
-        """Change what the caller wants. END is never taken back. Returns the record; None if there is none."""
+        """Change what the caller wants. END is never taken back. Returns the record; None if there is none.
+
+        A feed that no worker ever claimed ends at once: its record is removed.
+        """
         ...
 
     def forget_feed(self, claim: FeedClaim) -> bool:

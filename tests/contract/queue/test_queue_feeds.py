@@ -129,6 +129,14 @@ def test_an_end_is_final_and_its_worker_removes_the_feed(queue: Queue) -> None:
     assert queue.wish_feed(record.feed_id, FeedWish.RUN) is None
 
 
+def test_a_feed_that_no_worker_ever_claimed_ends_at_once(queue: Queue) -> None:
+    record = opened(queue)
+    assert queue.wish_feed(record.feed_id, FeedWish.END) is None
+    assert queue.feeds() == []
+    assert queue.claim_feed("worker-1.a") is None
+    assert opened(queue, record).epoch == 0
+
+
 def test_a_reason_of_a_later_version_can_be_read(queue: Queue) -> None:
     document = LIVE.model_dump(mode="json") | {"reason": "solar_flare", "flares": 3}
     assert FeedReport.model_validate(document).reason is FeedReason.UNCLASSIFIED
