@@ -17,6 +17,7 @@ from intrasplat.version import version
 from service import (
     check,
     exports,
+    feeds,
     imports,
     jobs,
     measure,
@@ -83,7 +84,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
     scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
-    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, system):
+    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")

@@ -1,4 +1,4 @@
-"""The bodies of POST /reconstruct and POST /scenes as /openapi.json describes them: schemas with names."""
+"""The bodies of POST /reconstruct, POST /scenes and POST /feeds as /openapi.json describes them: schemas with names."""
 
 from __future__ import annotations
 
@@ -74,6 +74,15 @@ SCENE_FORM["properties"] = {
     **{name: each for name, each in SCENE_FORM["properties"].items() if name != CLIP_OF},
 }
 
+FEED_FORM: dict[str, Any] = {
+    "title": "FeedForm",
+    "description": "A live feed to be opened.",
+    "type": "object",
+    "properties": {"calibration": _of_file("calibration"), "options": {"$ref": "#/components/schemas/FeedOptions"}},
+    "required": ["calibration"],
+    "additionalProperties": False,
+}
+
 BODIES: dict[str, dict[str, Any]] = {
     "ClipForm": _body("ClipForm", "A clip in one request", {part: _of_file(part) for part in PARTS}),
     "ClipOfUploads": _body(
@@ -81,6 +90,7 @@ BODIES: dict[str, dict[str, Any]] = {
     ),
     **models_json_schema([(DescribedClip, "validation")], ref_template="#/components/schemas/{model}")[1]["$defs"],
     "SceneForm": SCENE_FORM,
+    "FeedForm": FEED_FORM,
 }
 """Schemas by name. They do not say which parts go together, because generators do not read conditions."""
 
@@ -91,6 +101,18 @@ SCENE_BODY: dict[str, Any] = {
         "description": "the archive; options may hold priority and retention_hours alone",
         "content": {
             "multipart/form-data": {"schema": {"$ref": "#/components/schemas/SceneForm"}, "encoding": JSON_PARTS}
+        },
+    }
+}
+FEED_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "the calibration, and where the video is; without options.source it is pushed",
+        "content": {
+            "multipart/form-data": {
+                "schema": {"$ref": "#/components/schemas/FeedForm"},
+                "encoding": {"options": {"contentType": "application/json"}},
+            }
         },
     }
 }

@@ -17,6 +17,7 @@ from starlette.requests import HTTPConnection
 from contract.access.audit import AuditLog
 from contract.queue.interface import Queue
 from contract.runtime.settings import Settings
+from contract.store.feed_files import FeedFiles
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
 from contract.wire.feeds import FeedRecord
@@ -69,6 +70,7 @@ class Deps:
         self.purger = Purger(queue, store, self.audit, self.done)
         # live feeds
         self.feed_channels = FeedChannels(queue)
+        self.feed_files = FeedFiles(settings.data_dir)
         self.feeds = FeedRecords(queue, self.questions)
         self.followed = FollowedFeeds()
         self.retention = Retention(settings, queue, store, self.purger)

@@ -51,3 +51,9 @@ def test_all_else_is_refused(source: str) -> None:
     assert refused.value.field == "source"
     with pytest.raises(InputError):
         allowed_hosts(source, Settings())
+
+
+@pytest.mark.parametrize("host", ["camera.example.org", "/dev/video0", "tcp://camera.example.org", "ftp://x"])
+def test_a_setting_that_names_no_host_is_refused(host: str) -> None:
+    with pytest.raises(InputError, match="FEED_HOSTS"):
+        Settings.from_environment({"INTRASPLAT_FEED_HOSTS": host})
