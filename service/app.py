@@ -17,6 +17,8 @@ from intrasplat.version import version
 from service import (
     check,
     exports,
+    feed_cut,
+    feed_push,
     feeds,
     imports,
     jobs,
@@ -84,7 +86,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
     scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
-    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, system):
+    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, feed_cut, feed_push, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")

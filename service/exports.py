@@ -16,7 +16,7 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.wire.rendering import ExportRequest
+from contract.wire.rendering import CutRequest, ExportRequest
 from intrasplat.errors import UnavailableError
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
 from intrasplat.scene.stored_exports import stored_parts
@@ -82,7 +82,7 @@ async def export_scene(
     first, part, until_s = await services.renderer.ask(request), 0, time.monotonic() + FIRST_BYTES_S
     while first.head.error is None and first.head.more and not first.body and time.monotonic() < until_s:
         part += 1
-        first = await _part(services, request.model_copy(update={"part": part}), first.worker)
+        first = await next_part(services, request.model_copy(update={"part": part}), first.worker)
     response = image_response(scene_id, first)
     if first.head.more:
         head = {name: value for name, value in response.headers.items() if name != "content-length"}
@@ -136,14 +136,14 @@ async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: i
         if time.monotonic() > until_s:
             raise UnavailableError(f"The export took more than {MAX_EXPORT_S:g} s.", "Ask for fewer frames.")
         part += 1
-        answer = await _part(services, request.model_copy(update={"part": part}), answer.worker)
+        answer = await next_part(services, request.model_copy(update={"part": part}), answer.worker)
         if answer.head.error is not None:
             logger.warning("an export was cut off: %s", answer.head.error.kind)
             raise problem_of_reply(answer.head.error)
         yield answer.body
 
 
-async def _part(services: Deps, request: ExportRequest, worker: str | None) -> Answer:
+async def next_part(services: Deps, request: ExportRequest | CutRequest, worker: str | None) -> Answer:
     """The answer of the worker, waiting while it is busy.
 
     Raises:

@@ -12,13 +12,15 @@ import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TypeAlias, TypeVar
 
 from service.connection import Answer
 
 POLLS_PER_S = 20.0
 
-Ask = Callable[[float], Awaitable[Answer]]
-"""Asks the worker for a picture of a moment that is newer than this second of the source."""
+Shown = TypeVar("Shown")
+Ask: TypeAlias = Callable[[float], Awaitable[tuple[Shown, Answer]]]
+"""Asks the worker for a picture of a moment that is newer than this second of the source; raises its errors."""
 
 
 @dataclass(eq=False)
@@ -37,28 +39,21 @@ class FollowedFeeds:
     def __init__(self) -> None:
         self._feeds: dict[str, _Followed] = {}
 
-    async def newer(self, feed_id: str, after_s: float, ask: Ask) -> Answer:
-        """The first answer that shows a moment after `after_s`, or that is an error."""
+    async def newer(self, feed_id: str, after_s: float, ask: Ask[Shown]) -> tuple[Shown, Answer]:
+        """The first view of a moment after `after_s`. Raises what `ask` raises."""
         with self._followed(feed_id) as feed:
             while True:
-                if feed.newest_s <= after_s:
-                    answer = await self._poll(feed, after_s, ask)
-                else:
-                    answer = await ask(after_s)
-                if answer is None:
+                view = await (self._poll(feed, after_s, ask) if feed.newest_s <= after_s else ask(after_s))
+                if view is None:
                     continue
-                if answer.head.error is not None:
-                    return answer
-                shown = answer.head.feed
-                if shown is None:
-                    return answer
-                # A worker that began anew counts from where it is: what was known before does not matter.
-                feed.newest_s = shown.source_s
-                if answer.body:
-                    return answer
+                _, answer = view
+                if answer.head.feed is not None:
+                    feed.newest_s = answer.head.feed.source_s
+                if answer.body or answer.head.feed is None:
+                    return view
 
-    async def _poll(self, feed: _Followed, after_s: float, ask: Ask) -> Answer | None:
-        """The worker's answer; None: another viewer has seen a newer moment meanwhile."""
+    async def _poll(self, feed: _Followed, after_s: float, ask: Ask[Shown]) -> tuple[Shown, Answer] | None:
+        """What the worker shows; None: another viewer has seen a newer moment meanwhile."""
         async with feed.polling:
             if feed.newest_s > after_s:
                 return None

@@ -343,7 +343,7 @@ async def answer_to(services: Deps, caller: Caller, request: RenderRequest, show
             if shown.attempt is not None:
                 answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
     services.render_limits.learn(shown.scene_id, answer.head)
-    if answer.head.error is None:
+    if answer.head.error is None and answer.body:
         services.metrics.rendered("feed" if shown.is_feed else shown.state.value, answer.head.render_ms)
     return shown, answer
 

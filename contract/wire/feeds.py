@@ -186,6 +186,23 @@ class CutRange(BaseModel):
     )
 
 
+class GivenCut(BaseModel):
+    """The body of POST /feeds/{id}/cut."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    from_: float | str = Field(
+        alias="from",
+        union_mode="left_to_right",
+        description="a moment as t has it: -30, seconds of the source, or a time of RFC 3339",
+    )
+    to: float | str = Field(default=LIVE, union_mode="left_to_right", description="the same; live: until now")
+    options: dict[str, object] = Field(default={}, description="as POST /reconstruct has them")
+    label: str | None = Field(default=None, description=LABEL_ABOUT)
+    metadata: dict[str, object] | None = Field(default=None, description="as POST /reconstruct has it")
+    callback_url: str | None = None
+
+
 class CutJob(JobView):
     """The job of a part of a feed's recording."""
 
