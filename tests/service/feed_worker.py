@@ -43,6 +43,7 @@ class FeedWorker:
         self.obeys = True
         self.asked: list[Any] = []
         self.pushed: dict[str, bytes] = {}
+        self.bodies: list[bytes] = []
         self.replaced: set[str] = set()
         self.clip = clip
         self.cut = CutRange(from_s=BEGAN_S + 30, to_s=BEGAN_S + 60, frames=900)
@@ -136,6 +137,7 @@ class FeedWorker:
         if isinstance(request, PushRequest):
             if request.push_id in self.replaced:
                 raise InputError("push", "Another connection pushes this feed.", "Push over one connection.")
+            self.bodies.append(content)
             self.pushed[request.push_id] = self.pushed.get(request.push_id, b"") + content
             return Reply(b"", "application/octet-stream", 0.0)
         if request.from_s < BEGAN_S:
