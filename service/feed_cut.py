@@ -57,8 +57,8 @@ async def cut_feed(
     """
     caller.require(KeyScope.FEEDS)
     caller.require(KeyScope.RECONSTRUCT)
-    given = await read_json(request, services, GivenCut, MAX_BODY_BYTES, REMEDY)
     feed = await run_in_threadpool(owned_feed, services, caller, feed_id)
+    given = await read_json(request, services, GivenCut, MAX_BODY_BYTES, REMEDY)
     from_s, to_s = _range(given, feed, services.settings.max_clip_s)
     received = Received(
         options=json.dumps(_options(given, feed)),

@@ -156,6 +156,9 @@ def test_changes_need_the_scope_and_another_tenants_feed_does_not_exist(
     assert service.http.get("/render", params={"scene": feed_id}, headers=viewer).status_code == 200
     for method, path in [("POST", "/pause"), ("POST", "/resume"), ("POST", "/cut"), ("PUT", "/video"), ("DELETE", "")]:
         assert_problem(service.http.request(method, f"/feeds/{feed_id}{path}", headers=viewer), 403, "Authorization")
+    for scopes in ({KeyScope.FEEDS}, {KeyScope.RECONSTRUCT}):  # a cut changes a feed and makes a job
+        some = bearer(service, "ward-1", scopes)
+        assert_problem(service.http.post(f"/feeds/{feed_id}/cut", headers=some), 403, "Authorization")
     assert_problem(posted(service, headers=viewer), 403, "Authorization")
     assert_problem(service.http.get(f"/feeds/{feed_id}", headers=other), 404, "feed_id")
     assert_problem(service.http.post(f"/feeds/{feed_id}/pause", headers=other), 404, "feed_id")
