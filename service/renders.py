@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.runtime.settings import Settings
+from contract.store.shelf import is_job_id
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
 from intrasplat.names import Detail, Eye, Light, Smoke
@@ -24,16 +25,31 @@ from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 from intrasplat.pose import Pose, parse_pose
 from intrasplat.version import version
-from service.access import Caller
+from service.access import AccessRefusal, Caller
 from service.bodies import BINARY
 from service.connection import Answer
-from service.deps import AnyCaller, Deps, Services, owned_scene
+from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
 from service.listing import SceneSearch
+from service.moments import AskedTime, moment_of, moment_text, scene_time
 from service.problems import Problem
 from service.request_log import GONE
 
 router = APIRouter(tags=["renders"])
 
+FEED_HEADERS: dict[str, object] = {
+    "X-Intrasplat-Captured-At": {
+        "description": "of a live feed: when the pair of the moment that is shown arrived (RFC 3339)",
+        "schema": {"type": "string", "format": "date-time"},
+    },
+    "X-Intrasplat-Age-S": {
+        "description": "of a live feed: seconds from then until the answer",
+        "schema": {"type": "number"},
+    },
+    "X-Intrasplat-Source-S": {
+        "description": "of a live feed: the moment in seconds of the source",
+        "schema": {"type": "number"},
+    },
+}
 IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
     200: {
         "description": "the image",
@@ -62,6 +78,7 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "description": "of layer=depth in false colours: depths of the brightest and of the darkest colour",
                 "schema": {"type": "string", "pattern": "^-?[0-9]+ -?[0-9]+$"},
             },
+            **FEED_HEADERS,
         },
     },
     304: {"description": "it is the one that the caller has"},
@@ -73,9 +90,6 @@ NOT_YET_RETRY_S = "1"
 
 Result = TypeVar("Result")
 
-ModelTime = Annotated[
-    float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
-]
 Pixels = Annotated[int | None, Field(ge=8, le=8192, description="size of the image in pixels; default: the clip's")]
 FocalLength = Annotated[
     float | None,
@@ -106,7 +120,7 @@ class ViewQuery(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    t: ModelTime = 0.0
+    t: AskedTime = None
     pose: PoseText = None
     width: Pixels = None
     height: Pixels = None
@@ -170,14 +184,24 @@ class RenderQuery(ViewQuery):
 
 @dataclass(frozen=True)
 class Shown:
-    """What a caller sees: the scene that `attempt` finished; None: the running job's newest snapshot."""
+    """What a caller sees: the scene that `attempt` finished; None: the running job's newest snapshot, or a feed."""
 
     scene_id: str
     attempt: int | None
+    is_feed: bool = False
 
     @property
     def state(self) -> JobState:
+        """Of a scene or job."""
         return JobState.RUNNING if self.attempt is None else JobState.DONE
+
+    def time_fields(self, asked: float | str | None) -> dict[str, Any]:
+        """The fields of a request to the worker that name the time.
+
+        Raises:
+            InputError: it is no time of a scene, or no moment of a feed.
+        """
+        return {"t": 0.0, "moment": moment_of(asked)} if self.is_feed else {"t": scene_time(asked)}
 
 
 @router.get("/render", operation_id="render", response_class=Response, responses=IMAGE_RESPONSES)
@@ -188,9 +212,12 @@ async def render(
     http_request: Request,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot."""
+    """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot.
+
+    `scene` may be a live feed's id.
+    """
     start = time.perf_counter()
-    shown = await find_shown(services, caller, query.scene)
+    shown = await find_shown(services, caller, query.scene, with_feeds=True)
     request = request_of(query, shown, services.settings)
     tag = tag_of(request)
     if shown.attempt is not None and matches(if_none_match, tag):
@@ -217,8 +244,10 @@ async def render(
     return response
 
 
-async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown:
+async def find_shown(services: Deps, caller: Caller, scene: str | None, *, with_feeds: bool = False) -> Shown:
     """Find the named scene, or the tenant's only one, and record in the audit log that the caller views it.
+
+    with_feeds: `scene` may be a live feed.
 
     Raises:
         Problem: 400: no scene is named and the tenant has not exactly one (never show another patient by accident).
@@ -227,15 +256,21 @@ async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown
     """
     caller.require(KeyScope.VIEW)
     with traces.span("find"):
-        shown = await run_in_threadpool(_find, services, caller, scene)
+        shown = await run_in_threadpool(_find, services, caller, scene, with_feeds)
     traces.describe(get_current_span(), job_id=shown.scene_id)
     await services.audit.viewed(caller, shown.scene_id)
     return shown
 
 
-def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
+def _find(services: Deps, caller: Caller, scene: str | None, with_feeds: bool) -> Shown:
     if scene is None:
         return _only(services, caller)
+    if with_feeds:
+        return scene_or_feed(services, caller, scene, _find_scene)
+    return _find_scene(services, caller, scene)
+
+
+def _find_scene(services: Deps, caller: Caller, scene: str) -> Shown:
     record = owned_scene(services, caller, scene)
     if record.state is JobState.DONE:
         return Shown(scene, record.attempt)
@@ -248,6 +283,22 @@ def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
     waits = record.state is JobState.QUEUED
     remedy = f"Wait for its first view: GET /jobs/{scene}/events." if waits else f"GET /jobs/{scene} says why."
     raise Problem(409, detail, field="scene", remedy=remedy)
+
+
+def scene_or_feed(
+    services: Deps, caller: Caller, scene: str, find_scene: Callable[[Deps, Caller, str], Shown]
+) -> Shown:
+    """What find_scene finds, or the caller's live feed of that id. Scenes cost no look for a feed."""
+    if not services.feeds.is_known(scene):
+        try:
+            return find_scene(services, caller, scene)
+        except Problem as problem:
+            if problem.status != 404 or isinstance(problem, AccessRefusal) or not is_job_id(scene):
+                raise
+    record = services.feeds.record(scene)
+    if record is None or not caller.owns(record):
+        raise no_such_scene(scene, caller, record)
+    return Shown(scene, None, is_feed=True)
 
 
 def _only(services: Deps, caller: Caller) -> Shown:
@@ -287,13 +338,13 @@ async def answer_to(services: Deps, caller: Caller, request: RenderRequest, show
     """
     with services.render_limits.admitted(caller, request):
         answer = await services.renderer.ask(request)
-        if answer.head.error is not None and answer.head.error.kind == "not-yet":
+        if not shown.is_feed and answer.head.error is not None and answer.head.error.kind == "not-yet":
             shown = await find_shown(services, caller, shown.scene_id)
             if shown.attempt is not None:
                 answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
     services.render_limits.learn(shown.scene_id, answer.head)
-    if answer.head.error is None:
-        services.metrics.rendered(shown.state.value, answer.head.render_ms)
+    if answer.head.error is None and answer.body:
+        services.metrics.rendered("feed" if shown.is_feed else shown.state.value, answer.head.render_ms)
     return shown, answer
 
 
@@ -301,12 +352,12 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
     """The request to the worker.
 
     Raises:
-        InputError: the pose is not valid.
+        InputError: time or pose is not valid.
     """
     return RenderRequest(
         scene_id=shown.scene_id,
         attempt=shown.attempt,
-        t=query.t,
+        **shown.time_fields(query.t),
         pose=query.asked_pose,
         eye=query.eye,
         camera=query.camera,
@@ -329,6 +380,13 @@ def image_response(scene_id: str, answer: Answer) -> Response:
         raise problem_of_reply(head.error)
     state = JobState.DONE if head.iteration is None else JobState.RUNNING
     headers = {"X-Intrasplat-Scene": scene_id, "X-Intrasplat-State": state.value, "X-Intrasplat-T": f"{head.t:.6g}"}
+    if (feed := head.feed) is not None:
+        headers |= {
+            "X-Intrasplat-State": feed.state.value,
+            "X-Intrasplat-Captured-At": moment_text(feed.captured_at_s),
+            "X-Intrasplat-Age-S": f"{feed.age_s:.3f}",
+            "X-Intrasplat-Source-S": f"{feed.source_s:.3f}",
+        }
     if head.iteration is not None:
         headers["X-Intrasplat-Iteration"] = str(head.iteration)
     if head.warnings:

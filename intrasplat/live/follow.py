@@ -29,7 +29,7 @@ from intrasplat.live.motion import Carried, FlowStart
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.window import Moment, Window
 from intrasplat.machine.cores import cores
-from intrasplat.machine.hooks import ignore
+from intrasplat.machine.hooks import always, ignore
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.methods.fast import INSTANT
 from intrasplat.scene.scene import TrainedScene
@@ -70,6 +70,8 @@ class Added(StrEnum):
     FOLLOWED = "followed"
     NO_SCENE = "no_scene"
     """It shows too little tissue with depth, or nothing that the eyes can be registered by."""
+    NO_TISSUE = "no_tissue"
+    """It does not show tissue."""
     LOST = "lost"
     """The moving camera's pose was not found."""
     RESTARTED = "restarted"
@@ -107,7 +109,8 @@ class FollowSettings:
 class Follower:
     """Follows one feed. One thread calls add(); any thread asks for scenes.
 
-    on_segment is called with every segment as the thread of add() writes it off.
+    on_segment is called with every segment as the thread of add() writes it off. A pair for which is_tissue is False is
+    not learnt.
     """
 
     def __init__(
@@ -116,8 +119,10 @@ class Follower:
         settings: FollowSettings | None = None,
         device: Device = CPU,
         on_segment: Callable[[TrainedScene], None] = ignore,
+        is_tissue: Callable[[DepthClip], bool] = always,
     ) -> None:
         self.settings = settings or FollowSettings()
+        self._is_tissue = is_tissue
         self.segments: tuple[TrainedScene, ...] = ()
         self.used = 0
         self.iteration = 0
@@ -168,6 +173,13 @@ class Follower:
             return ready if isinstance(ready, Added) else self._begin(ready, end_s)
         return Added.FOLLOWED
 
+    def write_off(self) -> None:
+        """Make all that the model knows a segment; the next pair begins another model."""
+        scene = None if self._window is None else self._current()
+        if scene is not None:
+            self._keep(scene)
+            self._window = None
+
     def close(self) -> None:
         """End the thread that reads pairs. Scenes can still be had; no pair can be added."""
         self._reader.shutdown()
@@ -213,6 +225,8 @@ class Follower:
             clip = self.read(pair)
             if clip is None:
                 return Added.NO_SCENE
+            if not self._is_tissue(clip):
+                return Added.NO_TISSUE
             window = self._window
             if window is not None and self.settings.camera == "moving":
                 placed = self._placer.placed(clip)
@@ -227,8 +241,7 @@ class Follower:
     def _begin(self, ready: _Ready, end_s: float) -> Added:
         """Begin a model with a frame; the one that was there becomes a segment."""
         moment, settings, is_first = ready.moment, self.settings, self.used == 0
-        if self._window is not None:
-            self._keep(self._window.scene(0, len(self._window.moments), seed=settings.seed))
+        self.write_off()
         stride = stride_for(settings.points, moment.clip.intrinsics)
         fusion = FusionSettings(mode="fill", stride=stride)
         cloud = fuse(moment.clip, [0], fusion, seed=settings.seed, right=moment.clip.right)

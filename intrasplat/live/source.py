@@ -43,8 +43,12 @@ class Source:
         parts: what is recorded; None if nothing is.
     """
 
-    def __init__(self, spec: SourceSpec) -> None:
-        """Raises InputError as SourceSpec.target; OSError: the folder of the recording cannot be used."""
+    def __init__(self, spec: SourceSpec, place: tuple[float, float] | None = None) -> None:
+        """place: source time, s, and arrival (UNIX time, s) of the last frame of an earlier run, after which this one
+        goes on; the recording may know a later one.
+
+        Raises InputError as SourceSpec.target; OSError: the folder of the recording cannot be used.
+        """
         self._spec, self._target = spec, spec.target()
         self.parts = None if spec.recording is None else Parts(spec.recording)
         self._changed = threading.Condition()
@@ -57,10 +61,10 @@ class Source:
         self._ended_for: FeedReason | None = None
         self._expected: tuple[int, int, str] | None = None
         self._sequence = 0
-        self._place: tuple[float, float] | None = None
+        self._place = place
         index = self.parts.index() if self.parts else ()
         if index:  # goes on after an earlier run
-            self._place = (index[-1].to_s, index[-1].last_arrived_at)
+            self._place = max((index[-1].to_s, index[-1].last_arrived_at), place or (0.0, 0.0))
             self._segments = index[-1].segment + 1
         self._numbers = Numbers()
         self._used = 0

@@ -37,6 +37,8 @@ SLOT_WIDTH = 0.2
 SCENE_WIDTH = 0.5
 """Width of a basis in a scene, in frames: half-way between two frames it is nearly linear."""
 WEIGHT, SECOND_MOMENTS, STEPS = "motion.weight", "motion.second", "motion.steps"
+ARRIVED_AT = "arrived_at"
+"""Setting of a scene of a feed: UNIX times, s, at which its frames came in."""
 SIDES = (-0.5, 0.5)
 """Camera.side of the left and the right eye, for the gloss."""
 
@@ -182,5 +184,6 @@ class Window:
             seen=torch.zeros(len(gaussians)),
             right_eye_mm=tuple(right_mm),
             seed=seed,
+            settings={ARRIVED_AT: [moment.arrived_at for moment in moments]},
             pictures=WindowPictures(moments),
         )

@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from lab.phantom import Phantom
 
 HEIGHT, WIDTH = 48, 64  # of an eye
 RATE_HZ = 30
@@ -168,3 +170,28 @@ def video_file(path: Path, frames: int, **options: str) -> Path:
     """A Matroska file of moving pictures."""
     path.write_bytes(recorded(frames, "matroska", **options))
     return path
+
+
+class PhantomSender:
+    """Sends a small phantom's pictures, to and fro, in real time. `cover`: a picture to send instead; None: the phantom.
+
+    url  of the server that sends to whoever connects
+    """
+
+    def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
+        frames = [phantom.frame(index) for index in range(phantom.settings.frames)]
+        self._pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
+        self.calibration, self.cover, self.url = phantom.settings.calibration, cover, ""
+
+    @contextmanager
+    def serving(self) -> Iterator[Self]:
+        """Serve at `url`."""
+        with tcp_server(self._serve) as self.url:
+            yield self
+
+    def _serve(self, connection: socket.socket) -> None:
+        stream, last = Stream(), len(self._pictures) - 1
+        for index in in_real_time():
+            place = index % (2 * last)
+            shown = self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
+            connection.sendall(stream.frame(shown))
