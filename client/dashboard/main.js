@@ -21,6 +21,7 @@ import { currentKey, keyEvents, showKeyForm } from "./key.js";
 import { listenToKeys, onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { drawStrip } from "./lightstrip.js";
+import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure.js";
 import { languageEvents, showWords, words } from "./messages.js";
 import { hush, prepareNews } from "./news.js";
@@ -205,6 +206,7 @@ const list = new JobList(
 );
 const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "";
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
+listOpenFeeds(get("open-feeds"), () => drawers.isOpen === "library");
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
