@@ -84,8 +84,8 @@ export class Keeping {
     const text = this.#text();
     line.hidden = text === "";
     const link = line.querySelector("a") ?? element("a");
-    if (!line.firstChild) line.append(element("span"), document.createTextNode(" "), link);
-    setText(line.firstChild, text);
+    if (!line.firstChild) line.append(link, document.createTextNode(" "), element("span"));
+    setText(line.lastChild, text);
     link.hidden = kept === null || kept.job.state === "failed";
     if (kept) link.href = `./#/scene/${kept.job.id}`;
     setText(link, words("live.kept_open"));

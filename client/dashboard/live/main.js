@@ -9,7 +9,6 @@ import { lightMark, trustOf } from "../light.js";
 import { figure, language, languageEvents, noticeWords, setLanguage, showWords, words } from "../messages.js";
 import { hush } from "../news.js";
 import { placeInPicture } from "../pointer.js";
-import { showProblem } from "../problem.js";
 import { Scopes } from "../scopes.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
@@ -35,7 +34,7 @@ const HIDDEN_STATES = ["no_tissue"];
 const ICONS = {
   live: "M12 4a8 8 0 1 0 .01 0z",
   behind: "M12 2 23 21H1z",
-  frozen: "M12 2a10 10 0 1 0 .01 0zm0 2.4a7.6 7.6 0 1 1-.01 0zM10.8 7h2.4v4.6l3 3-1.6 1.6-3.8-3.8zM3 1 23 21l-2 2L1 3z",
+  frozen: "M12 2a10 10 0 1 0 .01 0zm0 2.4a7.6 7.6 0 1 1-.01 0zM10.8 6.5h2.4v4.7h5v2.4h-7.4z",
   back: "M11 4v5h11v6H11v5L1 12z",
   lost: "M4 1l8 8 8-8 3 3-8 8 8 8-3 3-8-8-8 8-3-3 8-8-8-8z",
   paused: "M4 2h6v20H4zM14 2h6v20h-6z",
@@ -219,7 +218,8 @@ async function act(button, work) {
     const told = await work();
     if (told?.state && told.id === feedId) take(told);
   } catch (error) {
-    showProblem(get("message"), error);
+    get("message").classList.add("bad");
+    setText(get("message"), error.message);
   }
   button.disabled = false;
 }
