@@ -530,7 +530,7 @@ export const EN = {
     "freeze": "Freeze",
     "look": "Rock",
     "measure": "Measure",
-    "keep": "Keep last 30 s",
+    "keep": "Keep last 30 s",
     "back": "Back to live",
     "measure_first": "Touch the first point.",
     "measure_second": "Touch the second point.",

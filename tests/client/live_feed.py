@@ -20,6 +20,7 @@ from contract.wire.rendering import MeasureRequest, RecordedRequest, RenderReque
 from intrasplat.errors import InputError
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.notices import NoticeCode
+from tests.client.local_service import CLIP
 from tests.client.page import CAMERA, Page, Site
 from tests.measurements import measurement_reply
 from tests.reports import a_warning
@@ -69,7 +70,7 @@ class LivePainter(FeedWorker):
     """Follows feeds in real time. Its pictures are of now less a lag, at FPS; `stops_s`: nothing comes in after it."""
 
     def __init__(self, site: Site, folder: Path) -> None:
-        super().__init__(site.queue, folder, clip=b"clip")
+        super().__init__(site.queue, folder, clip=CLIP.read_bytes())
         self.began_s = time.time() - PAST_S
         self.stops_s: float | None = None
         self.reason: FeedReason | None = None
