@@ -537,7 +537,7 @@ export const DE = {
     "measure_asking": "Es wird gemessen.",
     "measured": "{mm} ± {sigma} mm",
     "keeping": "Die letzten Sekunden werden behalten.",
-    "kept": "Behalten: {from} bis {to} ({s} s):",
+    "kept": "behalten: {from} bis {to} ({s} s)",
     "kept_open": "Öffnen",
     "kept_failed": "Nichts wurde behalten. {why}",
     "pause": "Pause",

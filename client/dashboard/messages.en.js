@@ -537,7 +537,7 @@ export const EN = {
     "measure_asking": "Measuring.",
     "measured": "{mm} ± {sigma} mm",
     "keeping": "Keeping the last seconds.",
-    "kept": "Kept {from} to {to} ({s} s):",
+    "kept": "kept {from} to {to} ({s} s)",
     "kept_open": "Open it",
     "kept_failed": "Nothing was kept. {why}",
     "pause": "Pause",

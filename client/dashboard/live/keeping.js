@@ -98,6 +98,6 @@ export class Keeping {
     const { fromS, toS, job } = this.kept;
     const range = { from: clockTime(1000 * fromS), to: clockTime(1000 * toS), s: figure(toS - fromS) };
     const how = failureOf(job) || progressOf(job, this.times);
-    return `${words("live.kept", range)} ${how}`;
+    return `${how} · ${words("live.kept", range)}`;
   }
 }

@@ -245,7 +245,9 @@ model.addEventListener("answered", () => (answeredMs = performance.now()));
 model.addEventListener("shown", () => {
   refused = null;
   showTrust();
+  refresh(); // a new picture never stands beside the age of the one before
 });
+picture.addEventListener("shown", refresh);
 model.addEventListener("refused", ({ detail }) => (refused = detail));
 look.addEventListener("changed", () => {
   refused = null;

@@ -9,7 +9,7 @@ const AFTER_TROUBLE_MS = 400;
 const HIDDEN_MS = 500;
 const LOST = 0;
 
-/** Tells "answered" whenever the service has said anything, and "gone" when it has no such feed. */
+/** Tells "shown", and "answered" whenever the service has said anything. */
 export class LivePicture extends EventTarget {
   /** @param {HTMLCanvasElement} canvas @param {import("./clock.js").FeedClock} clock */
   constructor(canvas, clock) {
@@ -87,6 +87,7 @@ export class LivePicture extends EventTarget {
       canvas.hidden = false;
       this.isBlank = false;
       this.capturedAtS = capturedAtS;
+      this.dispatchEvent(new Event("shown"));
     }
     bitmap.close();
   }
