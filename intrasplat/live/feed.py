@@ -14,6 +14,7 @@ from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
 from intrasplat.live.looking import FeedView, find_view, range_of
 from intrasplat.live.model import FeedModel
+from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
 from intrasplat.live.source import Source
 from intrasplat.live.spec import SourceSpec
@@ -146,6 +147,10 @@ class Feed:
     def segments(self) -> tuple[KeptSegment, ...]:
         """The past's segments, oldest first."""
         return self._past.segments()
+
+    def recorded(self) -> tuple[Part, ...]:
+        """What is recorded, oldest first."""
+        return self._source.index()
 
     def cut(self, from_s: float, to_s: float, path: Path) -> Cut:
         """One playable file of the recorded packets of [from_s, to_s] in source time; see cut_parts."""

@@ -39,6 +39,8 @@ SCENE_WIDTH = 0.5
 WEIGHT, SECOND_MOMENTS, STEPS = "motion.weight", "motion.second", "motion.steps"
 ARRIVED_AT = "arrived_at"
 """Setting of a scene of a feed: UNIX times, s, at which its frames came in."""
+RIGHT_EYE = "right_eye"
+"""Setting of a scene of a feed: a RightEye of intrasplat/report.py."""
 SIDES = (-0.5, 0.5)
 """Camera.side of the left and the right eye, for the gloss."""
 
@@ -184,6 +186,9 @@ class Window:
             seen=torch.zeros(len(gaussians)),
             right_eye_mm=tuple(right_mm),
             seed=seed,
-            settings={ARRIVED_AT: [moment.arrived_at for moment in moments]},
+            settings={
+                ARRIVED_AT: [moment.arrived_at for moment in moments],
+                RIGHT_EYE: clip.registration and clip.registration.model_dump(),
+            },
             pictures=WindowPictures(moments),
         )
