@@ -1,4 +1,4 @@
-"""One process that follows a feed, as the supervisor runs it: start it, give it orders, read what it says, replace it."""
+"""Run the process that follows a feed from the supervisor: start it, give it orders, watch it, and replace it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Live feeds on the supervisor's side: claim them, beat for them, keep a process for each, and delete what has ended."""
+"""The supervisor's side of live feeds: claim them, beat for them, keep a process for each, delete what has ended."""
 
 from __future__ import annotations
 
@@ -187,11 +187,8 @@ class FeedHost:
 
 
 @contextlib.contextmanager
-def following(host: FeedHost | None) -> Iterator[None]:
-    """Follow feeds while the context lasts. None: there is no place for any."""
-    if host is None:
-        yield
-        return
+def following(host: FeedHost) -> Iterator[None]:
+    """Follow feeds while the context lasts."""
     end = threading.Event()
     thread = threading.Thread(target=host.run, args=(end,), name="feeds")
     thread.start()

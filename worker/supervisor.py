@@ -64,14 +64,14 @@ def run_supervisor(
     # The owner's name is new at each start, so that late messages of an earlier process of this name have no effect.
     owner = f"{name}.{secrets.token_hex(4)}"
     consumer = Consumer(queue, store, keeper, name, owner, end, settings.min_free_bytes)
-    files, places = FeedFiles(store.data_dir), 0 if renders_only else settings.feeds
-    host = FeedHost(queue, files, owner, places, environment) if places else None
+    # A worker without a place for feeds ends those that it has followed before.
+    host = FeedHost(queue, FeedFiles(store.data_dir), owner, settings.feeds, environment)
     try:
         check_queue(queue)
         with (
             announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
             periodic_tidy(store),
-            following(host),
+            contextlib.nullcontext() if renders_only else following(host),
         ):
             if renders_only:
                 keep_rendering(keeper, end)
