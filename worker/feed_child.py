@@ -27,6 +27,8 @@ GRACE_S = 6.0
 """For a process to close its feed in order."""
 FOLLOWS = (FeedState.LIVE, FeedState.BEHIND)
 
+IPC = "ipc://"
+
 logger = logging.getLogger("intrasplat.worker")
 
 
@@ -69,10 +71,15 @@ class FeedChild:
     """
 
     def __init__(
-        self, record: FeedRecord, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None
+        self,
+        record: FeedRecord,
+        folder: Path,
+        endpoints: tuple[str, ...],
+        command: Sequence[str],
+        environment: Mapping[str, str] | None,
     ) -> None:
         self.wish = record.wish
-        self._record, self._folder = record, folder
+        self._record, self._folder, self._endpoints = record, folder, endpoints
         self._supervised = Supervised(
             "process of a feed",
             command,
@@ -92,13 +99,14 @@ class FeedChild:
         if ended is not None:
             logger.warning("the process of a feed %s; another starts", ended.cause, extra=self._about)
             self._note_end()
+            self._remove_sockets()
         process = self._supervised.process
         if process is None:
             return
         if self._running is None or self._running.process is not process:
             self._running = FeedProcess(process)
             record = self._record.model_copy(update={"wish": self.wish})
-            self._running.send(FollowFeed(record=record, folder=self._folder))
+            self._running.send(FollowFeed(record=record, folder=self._folder, endpoints=self._endpoints))
         if self._running.report is not None:
             self._last, self._last_s = self._running.report, time.monotonic()
         if self._running.ready is not None:
@@ -139,15 +147,21 @@ class FeedChild:
     def stop(self) -> None:
         """End the process in order, and start no other."""
         self._supervised.stop()
+        self._remove_sockets()
 
     def kill(self) -> None:
         """End the process at once, and start no other."""
         self._supervised.kill()
-        self._supervised.stop()
+        self.stop()
 
     @property
     def _about(self) -> dict[str, str]:
         return {"job_id": self._record.feed_id}
+
+    def _remove_sockets(self) -> None:
+        for each in self._endpoints:
+            if each.startswith(IPC):
+                Path(each.removeprefix(IPC)).unlink(missing_ok=True)
 
     def _note_end(self) -> None:
         if self._running is not None and self._running.report is not None:

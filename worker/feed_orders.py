@@ -16,11 +16,12 @@ from worker.orders import Message
 
 
 class FollowFeed(Message):
-    """Follow the record's feed, whose files are in `folder`."""
+    """Follow the record's feed, whose files are in `folder`; answer at the first of `endpoints` that is free."""
 
     kind: Literal["follow"] = "follow"
     record: FeedRecord
     folder: Path
+    endpoints: tuple[str, ...]
 
 
 class WishFeed(Message):

@@ -13,14 +13,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 from typing import BinaryIO
-from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
-from contract.queue.embedded import short_socket_path
 from contract.queue.feeds import FEED_BEAT_S
 from contract.runtime import traces
 from contract.runtime.settings import Settings
@@ -34,14 +31,13 @@ from intrasplat.splat.cpu import compile_kernels
 from intrasplat.splat.cpu.threads import alone, cpu_time_s, thread_count
 from worker.aside import Aside
 from worker.channel import TRACES_PATIENCE_S, Channel
-from worker.device import MAX_WAIT_SHARE
 from worker.feed_cuts import FeedCuts
 from worker.feed_orders import FeedReady, FeedReported, FollowFeed, WishFeed, read_feed_order
 from worker.feed_pushes import FeedPushes
 from worker.feed_views import FeedViews
 from worker.hosted_feed import HostedFeed
 from worker.pace import RenderPace
-from worker.scheduler import Scheduler
+from worker.scheduler import MAX_WAIT_SHARE, Scheduler
 from worker.serve import RequestServer
 
 LOOK_PERIOD_S = 0.1
@@ -50,8 +46,6 @@ SHARE = 0.4
 """Renders' share of the CPU time: the rest follows the feed."""
 MAX_CLOSE_S = 4.0
 """For the feed to end in order."""
-PORTS = 16
-"""A process that answers over TCP takes the first free one of so many ports after the worker's own."""
 
 logger = logging.getLogger("intrasplat.worker")
 
@@ -70,9 +64,10 @@ def run_feed(settings: Settings) -> None:
     hosted = HostedFeed(order.record, order.folder, settings, device)
     hosted.wish(order.record.wish)
     hosted.begin()
+    _Wishes(lines, hosted)
+    threading.Thread(target=_report, args=(hosted, channel), name="reports", daemon=True).start()
     if device == CPU:
         compile_kernels()  # the feed connects meanwhile
-    _Wishes(lines, hosted)
     views = FeedViews(hosted, device)
     pace = RenderPace(thread_count(), used_s=time.process_time, share=SHARE)
     scheduler = Scheduler(
@@ -90,10 +85,10 @@ def run_feed(settings: Settings) -> None:
         views.forget_idle()
         cuts.forget_idle()
 
-    with pace.training(), _serving(settings, hosted.feed_id, scheduler, aside, forget_idle) as server:
+    with pace.training(), _serving(settings, order.endpoints, scheduler, aside, forget_idle) as server:
         channel.send(FeedReady(endpoint=server.endpoint, device=str(device)))
         logger.info("a feed is followed on %s", device, extra={"job_id": hosted.feed_id})
-        _report(hosted, channel)
+        threading.Event().wait()  # the end of the orders ends this process
 
 
 def _first(lines: BinaryIO) -> FollowFeed:
@@ -105,7 +100,7 @@ def _first(lines: BinaryIO) -> FollowFeed:
 
 
 def _report(hosted: HostedFeed, channel: Channel) -> None:
-    """Report what the feed does, for ever."""
+    """Report what the feed does, for ever. A process that cannot is replaced."""
     last, next_s = None, 0.0
     while True:
         report = hosted.report()
@@ -147,11 +142,11 @@ class _Wishes:
 
 @contextlib.contextmanager
 def _serving(
-    settings: Settings, feed_id: str, scheduler: Scheduler, aside: Aside, between: Callable[[], None]
+    settings: Settings, endpoints: Sequence[str], scheduler: Scheduler, aside: Aside, between: Callable[[], None]
 ) -> Iterator[RequestServer]:
     """Answer requests at the first address that is free."""
     refused: UnavailableError | None = None
-    for endpoint in endpoints(settings, feed_id):
+    for endpoint in endpoints:
         server = RequestServer(endpoint, scheduler, aside=aside, between=between, render_secret=settings.render_secret)
         with contextlib.ExitStack() as stack:
             try:
@@ -163,20 +158,3 @@ def _serving(
             return
     assert refused is not None
     raise refused
-
-
-def endpoints(settings: Settings, feed_id: str) -> list[str]:
-    """Where the process of a feed may answer, the first choice first."""
-    if settings.render_endpoint is not None:
-        parts = urlsplit(settings.render_endpoint)
-        host, port = settings.render_endpoint.rpartition(":")[0], parts.port or 0
-        return [f"{host}:{each}" for each in range(port + 1, min(port + PORTS, 65535) + 1)]
-    run_dir = Path(settings.data_dir).expanduser().resolve() / "run"
-    path = short_socket_path(run_dir, f"{feed_name(settings.worker_name, feed_id)}.sock")
-    path.unlink(missing_ok=True)
-    return [f"ipc://{path}"]
-
-
-def feed_name(worker_name: str, feed_id: str) -> str:
-    """The name under which the process of a feed is announced."""
-    return f"{worker_name}-feed-{feed_id[:8]}"

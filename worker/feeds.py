@@ -7,9 +7,11 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
+from contract.queue.embedded import short_socket_path
 from contract.queue.feeds import FEED_BEAT_S, FeedClaim
 from contract.queue.interface import Queue
 from contract.store.feed_files import FeedFiles
@@ -23,6 +25,8 @@ FEED_COMMAND = (sys.executable, "-m", "worker", "feed")
 LOOK_PERIOD_S = 0.1
 CLAIM_PERIOD_S = 0.5
 RETRY_S = 1.0
+PORTS, MAX_PORT = 16, 65535
+"""Over TCP the processes of feeds take the first free ones of so many ports after the worker's own."""
 TIDY_PERIOD_S = 30.0
 """Between two looks for files of feeds that ended while another machine followed them."""
 
@@ -46,7 +50,8 @@ class _Followed:
 class FeedHost:
     """Follows up to `places` feeds. One thread calls run().
 
-    owner: the name of the worker, a dot, and a token that is new at each start of the supervisor.
+    owner      the name of the worker, a dot, and a token that is new at each start of the supervisor
+    endpoints  where the process that is announced under a name may answer, the first choice first
     """
 
     def __init__(
@@ -55,11 +60,12 @@ class FeedHost:
         files: FeedFiles,
         owner: str,
         places: int,
+        endpoints: Callable[[str], tuple[str, ...]],
         environment: Mapping[str, str] | None = None,
         command: Sequence[str] = FEED_COMMAND,
     ) -> None:
         self._queue, self._files, self._owner, self._places = queue, files, owner, places
-        self._environment, self._command = environment, command
+        self._endpoints, self._environment, self._command = endpoints, environment, command
         self._followed: dict[str, _Followed] = {}
         self._claim_at_s = self._tidy_at_s = 0.0
         self._away = False
@@ -120,9 +126,10 @@ class FeedHost:
             self._followed[record.feed_id] = _Followed(claim, record, None, ending=True)
             return
         logger.info("a feed is claimed", extra={"job_id": record.feed_id})
-        child = FeedChild(record, self._files.make(record.feed_id), self._command, self._environment)
-        followed = _Followed(claim, record, child)
         name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id[:8]}"
+        folder, endpoints = self._files.make(record.feed_id), self._endpoints(name)
+        child = FeedChild(record, folder, endpoints, self._command, self._environment)
+        followed = _Followed(claim, record, child)
         followed.announcing.enter_context(announced(self._queue, name, lambda: child.address(name)))
         self._followed[record.feed_id] = followed
 
@@ -184,6 +191,14 @@ class FeedHost:
             with self._reaching():
                 self._queue.release_feed(each.claim)
         self._followed.clear()
+
+
+def endpoints_of(name: str, run_dir: Path, render_endpoint: str | None) -> tuple[str, ...]:
+    """Where the process of a feed may answer: a socket, or a port after that of the worker."""
+    if render_endpoint is None:
+        return (f"ipc://{short_socket_path(run_dir, f'{name}.sock')}",)
+    host, _, port = render_endpoint.rpartition(":")
+    return tuple(f"{host}:{each}" for each in range(int(port) + 1, min(int(port) + PORTS, MAX_PORT) + 1))
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import secrets
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 from contract.queue.installed import check_queue
 from contract.queue.redis_queue import RedisQueue
@@ -24,7 +25,7 @@ from intrasplat.errors import UnavailableError
 from worker.announce import LOOK_PERIOD_S, announced
 from worker.child import ChildKeeper
 from worker.consume import Consumer
-from worker.feeds import FeedHost, following
+from worker.feeds import FeedHost, endpoints_of, following
 
 TIDY_PERIOD_S = 600.0
 """Time between two clean-ups of the store: so long a local copy may outlive a scene purged on another machine."""
@@ -65,7 +66,8 @@ def run_supervisor(
     owner = f"{name}.{secrets.token_hex(4)}"
     consumer = Consumer(queue, store, keeper, name, owner, end, settings.min_free_bytes)
     # A worker without a place for feeds ends those that it has followed before.
-    host = FeedHost(queue, FeedFiles(store.data_dir), owner, settings.feeds, environment)
+    endpoints = partial(endpoints_of, run_dir=store.run_dir, render_endpoint=settings.render_endpoint)
+    host = FeedHost(queue, FeedFiles(store.data_dir), owner, settings.feeds, endpoints, environment)
     try:
         check_queue(queue)
         with (
