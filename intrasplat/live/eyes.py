@@ -26,6 +26,7 @@ from intrasplat.clip.splashes import Splashes
 from intrasplat.clip.types import Eye, RgbFrame
 from intrasplat.errors import InputError
 from intrasplat.instruments import Finder
+from intrasplat.intake.calibration.fit import fitted
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
 from intrasplat.names import Fov
 from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
@@ -72,7 +73,7 @@ class LiveEyes:
         self._size = new_width, max(1, round(height * new_width / width))
         nothing = np.zeros((*self._size[::-1], 3), np.uint8)
         self._pair = nothing, nothing
-        self._rectified = rectify(self._stereo_clip(), calibration.resized(*self._size))
+        self._rectified = rectify(self._stereo_clip(), fitted(calibration, width, height).resized(*self._size))
         self._work: FrameWork | None = None
 
     def moment(self, left: RgbFrame, right: RgbFrame, time_s: float) -> DepthClip | None:

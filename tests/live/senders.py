@@ -173,9 +173,10 @@ def video_file(path: Path, frames: int, **options: str) -> Path:
 
 
 class PhantomSender:
-    """Sends a small phantom's pictures, to and fro, in real time. `cover`: a picture to send instead; None: the phantom.
+    """Sends a small phantom's pictures, to and fro, in real time.
 
-    url  of the server that sends to whoever connects
+    cover  a picture to send instead; None: the phantom
+    url    of the server that sends to whoever connects
     """
 
     def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
