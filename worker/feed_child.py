@@ -25,6 +25,8 @@ MAX_LOST_S = 20.0
 """A process hangs if pairs come in and its model has learnt none for longer."""
 GRACE_S = 6.0
 """For a process to close its feed in order."""
+HEALTHY_AFTER_S = 10.0
+"""A process that ends sooner is replaced after a pause."""
 FOLLOWS = (FeedState.LIVE, FeedState.BEHIND)
 
 IPC = "ipc://"
@@ -87,6 +89,7 @@ class FeedChild:
             pipes=True,
             dies_with_parent=False,  # the child arranges that itself
             grace_s=GRACE_S,
+            healthy_after_s=HEALTHY_AFTER_S,
         )
         self._running: FeedProcess | None = None
         self._last = record.report or FeedReport(state=FeedState.CONNECTING, since_s=time.time())
@@ -109,8 +112,6 @@ class FeedChild:
             self._running.send(FollowFeed(record=record, folder=self._folder, endpoints=self._endpoints))
         if self._running.report is not None:
             self._last, self._last_s = self._running.report, time.monotonic()
-        if self._running.ready is not None:
-            self._supervised.mark_healthy()
         if (cause := self._hang()) is not None:
             logger.warning("the process of a feed %s and is killed", cause, extra=self._about)
             self._supervised.kill()
