@@ -181,7 +181,8 @@ def test_what_is_pushed_is_followed_and_a_new_push_takes_the_place_of_the_one_be
         for index, content in enumerate(sender.stream()):
             reply, _ = asker.ask(push(record, first), content)
             assert reply.error is None, reply.error
-            if index % 10 == 0 and hosted.known_s(record.feed_id) > 1:
+            assert index < 1200, hosted.report(record.feed_id)
+            if hosted.known_s(record.feed_id) > 1:
                 break
         reply, _ = asker.ask(push(record, second), next(sender.stream()))
         assert reply.error is None
@@ -192,7 +193,8 @@ def test_what_is_pushed_is_followed_and_a_new_push_takes_the_place_of_the_one_be
         assert last.error is None
 
         ends_s = hosted.known_s(record.feed_id)
-        for content in sender.pictures():
+        for index, content in enumerate(sender.pictures()):
+            assert index < 600, hosted.report(record.feed_id)
             half = len(content) // 2
             for piece in (content[:half], content[half:]):
                 reply, _ = asker.ask(push(record, third, pictures=True), piece)
