@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
@@ -71,7 +71,7 @@ class Feed:
     def __init__(
         self,
         source: SourceSpec,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FeedSettings | None = None,
         device: Device = CPU,
     ) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 from threading import Lock
 from typing import Literal
 
@@ -21,7 +22,7 @@ import torch
 from intrasplat.clip import DepthClip
 from intrasplat.errors import TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.camera import Placer
 from intrasplat.live.cover import Cover, with_spares
 from intrasplat.live.eyes import EyesSettings, LiveEyes
@@ -60,6 +61,8 @@ MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
 MANY_CORES = 4
 """With fewer cores, steps beside the reading of a pair use one."""
+LOOK_EVERY = 2
+"""Used frames from one look at what is to be trusted to the next."""
 MIN_STEPS = 2
 """Steps that a pair gets, however short the time is."""
 
@@ -116,7 +119,7 @@ class Follower:
 
     def __init__(
         self,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FollowSettings | None = None,
         device: Device = CPU,
         on_segment: Callable[[TrainedScene], None] = ignore,
@@ -228,7 +231,8 @@ class Follower:
     def _look(self, window: Window) -> None:
         """Look at how the model shows what it has just learnt; from now on its scene is another one."""
         with self._lock:
-            self._trusted.look(window)
+            if self.used % LOOK_EVERY == 1:
+                self._trusted.look(window)
             self._version += 1
 
     def _prepared(self, pair: FeedPair) -> _Ready | Added:

@@ -11,10 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 
 from intrasplat.errors import InputError
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past import Past
@@ -66,7 +67,7 @@ class FeedModel:
     def __init__(
         self,
         source: Source,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FollowSettings,
         past: Past,
         device: Device = CPU,

@@ -80,7 +80,7 @@ def sees(on_tissue: NDArray[np.floating], drawn: NDArray[np.floating]) -> NDArra
 
 
 def weights_in(
-    model: Model, camera: NDArray[np.float32], t: float, eye: Eye, index: int, scale: float
+    model: Model, camera: NDArray[np.float64], t: float, eye: Eye, index: int, scale: float
 ) -> NDArray[np.floating]:
     """[3, N]: each Gaussian's blending weights in an eye's frame `index`, summed over tissue, over all pixels, and over
     tissue times the pixel's error.
