@@ -53,17 +53,13 @@ from worker.orders import (
     job_progress,
 )
 from worker.pace import SHARE, RenderPace
-from worker.scheduler import Scheduler
+from worker.scheduler import MAX_WAIT_SHARE, Scheduler
 from worker.serve import RequestServer
 from worker.snapshot import Snapshots
 from worker.views import Views
 
 REPORT_PERIOD_S = 0.1
 """Minimum time between two reports within a stage."""
-
-MAX_WAIT_SHARE = 0.4
-"""Share of the time after which the service gives up a render. A request that would wait longer is refused, with the
-time at which to ask again."""
 
 MAX_GPU_REST_S = 0.5
 """Longest rest after a render beside training on a GPU (worker/pace.py)."""

@@ -11,15 +11,18 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 
 from intrasplat.errors import InputError
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past import Past
 from intrasplat.live.source import Source
-from intrasplat.live.state import FeedReason, ModelNumbers
+from intrasplat.live.state import FeedReason, FeedState, ModelNumbers
+from intrasplat.live.tissue import TissueWatch, has_colours_of_tissue, is_near
+from intrasplat.machine.hooks import always
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 
@@ -64,13 +67,18 @@ class FeedModel:
     def __init__(
         self,
         source: Source,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FollowSettings,
         past: Past,
         device: Device = CPU,
         budget_s: float | None = None,
+        watch: TissueWatch | None = None,
     ) -> None:
-        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device."""
+        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device.
+
+        watch: learns what shows tissue; pairs without it are not learnt. None: all are.
+        """
+        self._watch = watch
         self._source, self._calibration, self._settings, self._past = source, calibration, settings, past
         self._device, self._budget_s = device, budget_s
         self.changed = threading.Condition()
@@ -136,10 +144,13 @@ class FeedModel:
                 pair = self._source.newest(after, POLL_S)
                 self._past.prune()
                 if pair is None:
+                    if self._watch is not None and self._source.state is FeedState.ENDED:
+                        self._watch.end()
                     self._rest(IDLE_S)
                     continue
                 after = pair.sequence
-                self._take(pair)
+                if self._is_tissue(pair):
+                    self._take(pair)
                 failures = 0
             except Exception as error:
                 failures += 1
@@ -151,8 +162,9 @@ class FeedModel:
         """Learn a pair."""
         follower = self._follower or self._begun()
         before = follower.iteration
-        self._given += 1
         became = follower.add(pair, self._budget())
+        if became is not Added.NO_SCENE or self._used:  # without a scene so far, the calibration may be wrong
+            self._saw(pair, is_tissue=became not in (Added.NO_TISSUE, Added.NO_SCENE))
         if became not in (Added.FIRST, Added.FOLLOWED, Added.RESTARTED):
             return
         with self.changed:
@@ -165,11 +177,31 @@ class FeedModel:
             self.changed.notify_all()
         self._choose_width(pair.left.shape[1])
 
+    def _is_tissue(self, pair: FeedPair) -> bool:
+        """Whether a pair is to be learnt, by its colours."""
+        self._given += 1
+        if self._watch is None:
+            return True
+        if has_colours_of_tissue(pair.left):
+            return self._watch.may_be_back()
+        self._saw(pair, is_tissue=False)
+        self._rest(IDLE_S)
+        return False
+
+    def _saw(self, pair: FeedPair, *, is_tissue: bool) -> None:
+        """Note what a pair shows. When the endoscope goes out, the model ends, and what it recorded is deleted."""
+        if self._watch is not None and self._watch.see(pair.source_s, is_tissue=is_tissue):
+            if self._follower is not None:
+                self._follower.write_off()
+            if self._source.parts is not None:
+                self._source.parts.forget(self._watch.tissue_until_s)
+
     def _begun(self) -> Follower:
         """Another follower."""
         width = self._width or FIRST_WIDTH
         settings = replace(self._settings, eyes=replace(self._settings.eyes, width=width), keep_s=0.0)
-        self._follower = Follower(self._calibration, settings, self._device, self._past.add)
+        judge = always if self._watch is None else is_near
+        self._follower = Follower(self._calibration, settings, self._device, self._past.add, judge)
         return self._follower
 
     def _budget(self) -> float:
