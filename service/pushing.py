@@ -16,7 +16,7 @@ from service.deps import Deps
 from service.problems import Problem
 from service.renders import problem_of_reply
 
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 """How long a push waits for a process that follows the feed: when it begins, and when another takes its place."""
 RETRY_S = 0.2
 END_TIMEOUT_S = 2.0
