@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from client.cli import main
+from intrasplat.commands.exits import ExitCode
 from intrasplat_client import AsyncClient, Client, FeedState, InputError, JobState, NotFound, RequestRefused
 from tests.client.local_service import CLIP, LocalService, local_service
 from tests.service.feed_worker import BEGAN_S, following, wait_until
@@ -79,3 +82,26 @@ def test_the_asynchronous_client_has_the_same_calls(service: LocalService, calib
             assert (await client.end_feed(feed.id)).record
 
     asyncio.run(use())
+
+
+def test_the_commands_open_list_pause_cut_and_end_feeds(
+    service: LocalService, calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*arguments: str) -> str:
+        assert main(["feeds", *arguments, "--url", service.url]) == ExitCode.OK
+        return capsys.readouterr().out.strip()
+
+    feed_id = run("open", "--calibration", str(calibration), "--label", "room 4", "--keep-s", "60")
+    assert run("list") == f"{feed_id}  connecting  [room 4]  no_worker"
+    with following(service.queue, service.store.run_dir, CLIP.read_bytes()):
+        wait_until(lambda: "live" in run("list"))
+        assert "5.0 of 30.0 pairs/s" in run("list")
+        assert run("pause", feed_id) == "paused"
+        assert run("resume", feed_id) == "live"
+        job = service.queue.get(run("cut", feed_id, "-30", "--iterations", "30"))
+        assert job is not None
+        assert job.options.iterations == 30
+        assert json.loads(run("end", feed_id))["verified"]
+    assert run("list") == ""
+    assert main(["feeds", "pause", feed_id, "--url", service.url]) == ExitCode.BAD_INPUT
+    assert "intrasplat feeds list" in capsys.readouterr().err
