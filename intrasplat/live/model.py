@@ -210,7 +210,7 @@ class FeedModel:
             return self._budget_s
         if self._device.kind != CPU.kind:
             return 0.03
-        return 0.18 if (self._width or FIRST_WIDTH) <= 400 else 0.28
+        return 0.165 if (self._width or FIRST_WIDTH) <= 400 else 0.28
 
     def _choose_width(self, recorded_width: int) -> None:
         """Once, after some pairs, the width that the machine keeps up with; later a smaller one if it does not."""
