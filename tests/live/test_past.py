@@ -111,7 +111,7 @@ def test_segments_are_stored_and_loaded_when_they_are_looked_at(tmp_path: Path) 
     past = Past(PastSpec(tmp_path, keep_s=1000.0, cached=2))
     for number in range(5):
         past.add(scene(0.6 * number))
-    until(lambda: all(each.path is not None for each in past.segments()))
+        until(lambda: all(each.path is not None for each in past.segments()))
     past.add(scene(3.0))
     assert len(past._scenes) <= 3
     first = past.segments()[0]
