@@ -96,7 +96,7 @@ class Feed:
 
     def report(self) -> FeedReport:
         """State, numbers, model and past of now."""
-        status, numbers, window = self._source.status, self._source.numbers(), self._model.scene()
+        status, numbers, window = self._source.status, self._source.numbers(), self._model.span()
         past = range_of(window, self._past)
         age_s = None if past is None else time.time() - past.ends_at
         state, reason, text = status.state, status.reason, status.text
@@ -106,7 +106,7 @@ class Feed:
                 state, reason, text = FeedState.NO_TISSUE, None, "the pictures show no tissue: nothing is kept of them"
             elif trouble is not None:
                 state, reason, text = FeedState.STALLED, trouble.reason, trouble.text
-            elif window is None or age_s is None:
+            elif age_s is None or not self._model.has_begun:
                 state, reason, text = FeedState.CONNECTING, None, "the model begins"
             elif age_s > self.settings.max_age_s:
                 state, reason, text = FeedState.BEHIND, FeedReason.TOO_SLOW, "the model does not keep up"
@@ -141,7 +141,7 @@ class Feed:
         """The source time of the newest known moment as soon as that is after source_s; None: not in time."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            known = range_of(self._model.scene(), self._past)
+            known = range_of(self._model.span(), self._past)
             if known is not None and known.ends_s > source_s:
                 return known.ends_s
             left_s = deadline_s - time.monotonic()

@@ -148,6 +148,18 @@ class Follower:
         """The newest moment that the model knows; None: none so far."""
         return None if self._window is None else self._window.newest
 
+    @property
+    def span(self) -> tuple[Moment, Moment] | None:
+        """The oldest and the newest moment of the window; None: nothing is known so far."""
+        with self._lock:
+            return None if self._window is None else (self._window.moments[0], self._window.newest)
+
+    @property
+    def gaussians(self) -> int:
+        """The number of Gaussians of the model."""
+        window = self._window
+        return 0 if window is None else window.model.count
+
     def add(self, pair: FeedPair, budget_s: float = 0.2) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
 

@@ -17,6 +17,8 @@ from statistics import median
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
+from intrasplat.live.kept import KeptSegment
+from intrasplat.live.looking import WINDOW
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past import Past
 from intrasplat.live.source import Source
@@ -108,6 +110,15 @@ class FeedModel:
         found = None if follower is None else follower.scene_at()
         return None if found is None else found[0]
 
+    def span(self) -> KeptSegment | None:
+        """What the scene of the newest frames covers."""
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if found is None:
+            return None
+        first, newest = found
+        return KeptSegment(WINDOW, (first.source_s, newest.source_s), (first.arrived_at, newest.arrived_at))
+
     def used_fps(self) -> float:
         """Pairs that were learnt a second, over the last seconds."""
         with self.changed:
@@ -117,18 +128,23 @@ class FeedModel:
             return len(self._used_at) / min(WINDOW_S, max(age_s, 1.0))
 
     @property
+    def has_begun(self) -> bool:
+        """Whether it has learnt a pair."""
+        return self._used > 0
+
+    @property
     def left_out(self) -> int:
         """Pairs that the source handed over and no model has learnt."""
         return self._given - self._used
 
     def numbers(self) -> ModelNumbers | None:
         """Iteration, size and steps; None: there is no model yet."""
-        follower, scene = self._follower, self.scene()
-        if follower is None or scene is None:
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if follower is None or found is None:
             return None
-        width, height = scene.intrinsics.width, scene.intrinsics.height
-        steps = float(median([*self._steps] or [0]))
-        return ModelNumbers(follower.iteration, len(scene.gaussians), width, height, steps)
+        camera, steps = found[1].clip.intrinsics, float(median([*self._steps] or [0]))
+        return ModelNumbers(follower.iteration, follower.gaussians, camera.width, camera.height, steps)
 
     def close(self) -> None:
         """End. What the model knows becomes a segment."""
@@ -210,7 +226,7 @@ class FeedModel:
             return self._budget_s
         if self._device.kind != CPU.kind:
             return 0.03
-        return 0.18 if (self._width or FIRST_WIDTH) <= 400 else 0.28
+        return 0.165 if (self._width or FIRST_WIDTH) <= 400 else 0.28
 
     def _choose_width(self, recorded_width: int) -> None:
         """Once, after some pairs, the width that the machine keeps up with; later a smaller one if it does not."""

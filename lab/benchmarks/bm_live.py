@@ -33,6 +33,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import av
+import av.error
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,7 +115,7 @@ def send(path: Path, fps: float, port: int) -> None:
         print(listener.getsockname()[1], flush=True)
         while True:
             connection, _ = listener.accept()
-            with suppress(OSError), connection, connection.makefile("wb", buffering=0) as sink:
+            with suppress(OSError, av.error.FFmpegError), connection, connection.makefile("wb", buffering=0) as sink:
                 _send(packets, template, fps, sink)
 
 
