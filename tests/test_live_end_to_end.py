@@ -94,9 +94,6 @@ def test_video_pushed_over_http_is_shown_cut_and_deleted(tmp_path: Path, sender:
 
         job = client.cut_feed(feed.id, -3, iterations=20, preset="instant")
         assert job.cut.frames > 20
-        assert client.wait(job.id).state is JobState.DONE
-        assert_picture(client.render(0.5, scene=job.id, format="jpeg").content, 128, 96)
-
         assert client.pause_feed(feed.id).state is FeedState.PAUSED
         resumed = client.resume_feed(feed.id)
         assert resumed.state is not FeedState.PAUSED
@@ -111,7 +108,8 @@ def test_video_pushed_over_http_is_shown_cut_and_deleted(tmp_path: Path, sender:
         assert os.listdir(data_dir / "feeds") == []
         with pytest.raises(NotFound):
             client.feed(feed.id)
-        assert client.job(job.id).state is JobState.DONE
+        assert client.wait(job.id).state is JobState.DONE
+        assert_picture(client.render(0.5, scene=job.id, format="jpeg").content, 128, 96)
 
 
 def assert_follows(client: Client, feed_id: str) -> None:
