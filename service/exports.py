@@ -25,8 +25,9 @@ from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.moments import AskedTime, moment_of, scene_time
-from service.renders import Shown, image_response, problem_of_reply
+from service.renders import image_response, problem_of_reply
 from service.scenes import find_finished, finished_job
+from service.shown import Shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 

@@ -38,6 +38,8 @@ router = APIRouter(prefix="/feeds", tags=["feeds"])
 MAX_BODY_BYTES = 128 * 1024
 REMEDY = 'Send {"from": -30, "to": "live"}, and options as POST /reconstruct has them.'
 SUFFIXES = {"video/mp4": ".mp4", "video/x-matroska": ".mkv"}
+REPORTED_WITHIN_S = 2.0
+"""Pairs that came since its worker's last report belong to a cut until live."""
 MAX_WAIT_S = 120.0
 """How long the worker may take until the first bytes come."""
 
@@ -105,7 +107,7 @@ def _range(given: GivenCut, feed: FeedRecord, most_s: float) -> tuple[float, flo
     from_s, to_s = _at_s("from", given.from_, feed), _at_s("to", given.to, feed)
     if not from_s < to_s:
         raise InputError("from", f"{given.from_!r} is not before {given.to!r}.", "Give an earlier moment.")
-    if to_s - from_s > most_s:
+    if to_s - from_s > most_s + REPORTED_WITHIN_S:
         problem = f"the part lasts {to_s - from_s:.1f} s; a clip may last {most_s:g} s."
         raise LimitError("from", problem, "Ask for a shorter part.")
     return from_s, to_s
@@ -124,7 +126,7 @@ def _at_s(field: str, asked: float | str, feed: FeedRecord) -> float:
         remedy = f"Wait until it is live: GET /feeds/{feed.feed_id}/events."
         raise Problem(409, "The feed has recorded nothing yet.", field="feed_id", remedy=remedy)
     if moment.is_live:
-        return max(time.time(), newest_s)
+        return max(newest_s, min(time.time(), newest_s + REPORTED_WITHIN_S))
     if moment.before_live_s is not None:
         return newest_s - moment.before_live_s
     assert moment.source_s is not None

@@ -13,15 +13,24 @@ from intrasplat.live.state import FeedState
 ID_CHARACTERS = 8
 
 GAUGES: dict[str, tuple[str, Callable[[FeedView], float | None]]] = {
-    "received_fps": ("Pairs that come in a second.", lambda feed: feed.received_fps),
-    "used_fps": ("Pairs that the model learns a second.", lambda feed: feed.used_fps),
-    "model_age_seconds": ("Age of the newest pair that the model knows.", lambda feed: feed.model_age_s),
-    "decode_lag_seconds": ("From the arrival of a pair to its picture.", lambda feed: feed.decode_lag_s),
-    "kept_bytes": ("Recording and past of the model on disk.", lambda feed: feed.kept_bytes),
+    "intrasplat_feed_received_fps": ("Pairs that come in a second.", lambda feed: feed.received_fps),
+    "intrasplat_feed_used_fps": ("Pairs that the model learns a second.", lambda feed: feed.used_fps),
+    "intrasplat_feed_model_age_seconds": (
+        "Age of the newest pair that the model knows.",
+        lambda feed: feed.model_age_s,
+    ),
+    "intrasplat_feed_decode_lag_seconds": (
+        "From the arrival of a pair to its picture.",
+        lambda feed: feed.decode_lag_s,
+    ),
+    "intrasplat_feed_kept_bytes": ("Recording and past of the model on disk.", lambda feed: feed.kept_bytes),
 }
 COUNTERS: dict[str, tuple[str, Callable[[FeedView], float]]] = {
-    "dropped": ("Whole pairs that came in and that the model did not learn.", lambda feed: feed.dropped),
-    "reconnects": ("Connections after the first.", lambda feed: feed.reconnects),
+    "intrasplat_feed_dropped": (
+        "Whole pairs that came in and that the model did not learn.",
+        lambda feed: feed.dropped,
+    ),
+    "intrasplat_feed_reconnects": ("Connections after the first.", lambda feed: feed.reconnects),
 }
 
 
@@ -38,13 +47,13 @@ def of_feeds(records: Sequence[FeedRecord], now_s: float) -> Iterator[Metric]:
         is_in.add_metric((feed.id[:ID_CHARACTERS], feed.state.value), 1)
     yield is_in
     for name, (about, gauge_of) in GAUGES.items():
-        gauge = GaugeMetricFamily(f"intrasplat_feed_{name}", about, labels=("feed",))
+        gauge = GaugeMetricFamily(name, about, labels=("feed",))
         for feed in feeds:
             if (value := gauge_of(feed)) is not None:
                 gauge.add_metric((feed.id[:ID_CHARACTERS],), value)
         yield gauge
     for name, (about, count_of) in COUNTERS.items():
-        counter = CounterMetricFamily(f"intrasplat_feed_{name}", about, labels=("feed",))
+        counter = CounterMetricFamily(name, about, labels=("feed",))
         for feed in feeds:
             counter.add_metric((feed.id[:ID_CHARACTERS],), count_of(feed))
         yield counter

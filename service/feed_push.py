@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from fastapi import APIRouter, Request, WebSocket
 from pydantic import BaseModel, Field
@@ -38,7 +38,7 @@ router = APIRouter(prefix="/feeds", tags=["feeds"])
 
 KEY_PERIOD_S = 2.0
 """How often it is looked whether the key of whoever pushes is still valid."""
-MAX_PICTURE_BYTES = 16 * 2**20
+MAX_PICTURE_BYTES = 8 * 2**20
 FRAMING_REMEDY = "Send for each picture its time (float64), its length (uint32), both little-endian, and its bytes."
 
 
@@ -99,13 +99,13 @@ async def _take_pictures(services: Deps, feed_id: str, entrance: Entrance) -> No
     try:
         await run_in_threadpool(_begin, services, entrance.caller(), feed_id)
         async with Push(services, feed_id, pictures=True) as push:
-            still, counter = _StillAllowed(entrance.caller), PictureCounter()
+            still, pictures, taken = _StillAllowed(entrance.caller), PictureStream(), 0
             while (piece := await _piece(entrance, services.settings.upload_silence_s)) is not None:
                 still.check()
-                new = counter.add(piece)
-                await push.send(piece)
-                if new:
-                    await entrance.send(json.dumps({"taken": counter.count}))
+                for picture in pictures.add(piece):
+                    await push.send(picture)
+                    taken += 1
+                    await entrance.send(json.dumps({"taken": taken}))
     except (Problem, UnavailableError) as error:
         problem = problem_of(error)
         assert problem is not None
@@ -127,37 +127,29 @@ async def _piece(entrance: Entrance, silence_s: float) -> bytes | None:
         entrance.authorize(document)
 
 
-class PictureCounter:
-    """Counts the pictures that are complete in a stream of bytes."""
+class PictureStream:
+    """Finds the pictures in a stream of bytes."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self._head = b""
-        self._left_bytes = 0
+        self._bytes = bytearray()
 
-    def add(self, piece: bytes) -> int:
-        """How many pictures end in the next piece.
+    def add(self, piece: bytes) -> Iterator[bytes]:
+        """The pictures that end in the next piece, each with its header.
 
         Raises:
             HangUpError: a length is 0 or larger than MAX_PICTURE_BYTES.
         """
-        before = self.count
-        while piece:
-            if self._left_bytes:
-                taken = min(self._left_bytes, len(piece))
-                self._left_bytes -= taken
-                piece = piece[taken:]
-                self.count += self._left_bytes == 0
-                continue
-            missing = PICTURE_HEADER.size - len(self._head)
-            self._head, piece = self._head + piece[:missing], piece[missing:]
-            if len(self._head) == PICTURE_HEADER.size:
-                _, self._left_bytes = PICTURE_HEADER.unpack(self._head)
-                self._head = b""
-                if not 0 < self._left_bytes <= MAX_PICTURE_BYTES:
-                    detail = f"A picture has {self._left_bytes} bytes; the limit is {MAX_PICTURE_BYTES}."
-                    raise HangUpError(MALFORMED, Problem(422, detail, remedy=FRAMING_REMEDY))
-        return self.count - before
+        self._bytes += piece
+        while len(self._bytes) >= PICTURE_HEADER.size:
+            _, length = PICTURE_HEADER.unpack_from(self._bytes)
+            if not 0 < length <= MAX_PICTURE_BYTES:
+                detail = f"A picture has {length} bytes; the limit is {MAX_PICTURE_BYTES}."
+                raise HangUpError(MALFORMED, Problem(422, detail, remedy=FRAMING_REMEDY))
+            end = PICTURE_HEADER.size + length
+            if len(self._bytes) < end:
+                return
+            yield bytes(self._bytes[:end])
+            del self._bytes[:end]
 
 
 class _StillAllowed:

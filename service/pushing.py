@@ -8,13 +8,15 @@ import time
 import uuid
 from types import TracebackType
 
+from starlette.concurrency import run_in_threadpool
+
 from contract.wire.rendering import MAX_PUSH_BYTES, PushRequest, ReplyError
 from intrasplat.errors import UnavailableError
 from service.deps import Deps
 from service.problems import Problem
 from service.renders import problem_of_reply
 
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 """How long a push waits for a process that follows the feed: when it begins, and when another takes its place."""
 RETRY_S = 0.2
 END_TIMEOUT_S = 2.0
@@ -49,7 +51,7 @@ class Push:
                 await self._services.renderer.ask(last, body=b"")
 
     async def send(self, piece: bytes) -> None:
-        """Return when the feed has taken the bytes.
+        """Return when the feed has taken the bytes; of pictures, all of one.
 
         Raises:
             Problem: 404: the feed has ended. 409: another push has taken the place of this one. 422: it cannot be used.
@@ -57,26 +59,33 @@ class Push:
         """
         if not self.bytes and piece[:1] == bytes([MPEG_TS]):
             self._can_be_joined = True
-        for start in range(0, len(piece), MAX_PUSH_BYTES):
-            await self._send(piece[start : start + MAX_PUSH_BYTES])
+        start, until_s = 0, time.monotonic() + PATIENCE_S
+        while start < len(piece):
+            body = piece[start : start + MAX_PUSH_BYTES]
+            if await self._is_taken(body, until_s):
+                start, until_s = start + len(body), time.monotonic() + PATIENCE_S
+            elif self._request.pictures:
+                start = 0
 
-    async def _send(self, body: bytes) -> None:
-        until_s = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                answer = await self._services.renderer.ask(self._request, body=body)
-            except UnavailableError:
-                if not self._may_wait(until_s):
-                    raise
-            else:
-                error = answer.head.error
-                if error is None:
-                    self.bytes += len(body)
-                    return
-                if error.kind != "busy" and not (error.kind == "not-yet" and self._may_wait(until_s)):
-                    raise _problem_of(error)
-            self._check_is_open()
-            await asyncio.sleep(RETRY_S)
+    async def _is_taken(self, body: bytes, until_s: float) -> bool:
+        """Whether the feed has taken the bytes. False: another push goes on in place of this one from now."""
+        try:
+            answer = await self._services.renderer.ask(self._request, body=body)
+            error = answer.head.error
+            if error is None:
+                self.bytes += len(body)
+                return True
+            if error.kind not in ("busy", "not-yet"):
+                raise _problem_of(error)
+            if not self._may_wait(until_s):
+                raise problem_of_reply(error)
+        except UnavailableError:
+            if not self._may_wait(until_s):
+                raise
+        await run_in_threadpool(self._check_is_open)
+        await asyncio.sleep(RETRY_S)
+        self._request = self._request.model_copy(update={"push_id": uuid.uuid4().hex})
+        return False
 
     def _may_wait(self, until_s: float) -> bool:
         return time.monotonic() < until_s and (self._can_be_joined or not self.bytes)

@@ -15,7 +15,8 @@ from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.moments import AskedTime
-from service.renders import FEED_HEADERS, find_shown, image_response
+from service.renders import FEED_HEADERS, image_response
+from service.shown import find_shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 

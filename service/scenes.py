@@ -22,8 +22,9 @@ from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
 from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
 from service.purge import Receipt
-from service.renders import Shown, find_shown, image_response, scene_or_feed
+from service.renders import image_response
 from service.reuse import others_with_clip
+from service.shown import Shown, find_shown, scene_or_feed
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 

@@ -38,7 +38,8 @@ from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services
 from service.moments import moment_text
 from service.problems import API_REMEDY, Problem, fault, problem_of
-from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_of_reply, request_of
+from service.renders import RenderQuery, answer_to, problem_of_reply, request_of
+from service.shown import Shown, find_shown
 from service.sockets import GONE, NOT_ALLOWED, NOT_TEXT, TOO_LARGE, Entrance, HangUpError, document_of
 
 router = APIRouter()

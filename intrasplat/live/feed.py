@@ -8,17 +8,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
 from intrasplat.live.looking import FeedView, find_view, range_of
 from intrasplat.live.model import FeedModel
+from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
 from intrasplat.live.source import Source
 from intrasplat.live.spec import SourceSpec
 from intrasplat.live.state import FeedReason, FeedReport, FeedState
 from intrasplat.live.times import LIVE, FeedTime
+from intrasplat.live.tissue import TissueWatch
 from intrasplat.splat.backend import CPU, Device
 
 
@@ -33,6 +35,7 @@ class FeedSettings:
     max_bytes    of the past on disk
     max_age_s    a feed whose model is older is behind, and its newest moment is stale
     budget_s     seconds for each pair; None: chosen by size and device
+    finds_tissue whether nothing is learnt, shown or kept while the pictures show no tissue
     follow       the other settings of the follower; its width, camera and keep_s are not used
     """
 
@@ -43,6 +46,7 @@ class FeedSettings:
     max_bytes: int = 8 << 30
     max_age_s: float = 2.5
     budget_s: float | None = None
+    finds_tissue: bool = True
     follow: FollowSettings = field(default_factory=FollowSettings)
 
     def of_follower(self) -> FollowSettings:
@@ -67,7 +71,7 @@ class Feed:
     def __init__(
         self,
         source: SourceSpec,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FeedSettings | None = None,
         device: Device = CPU,
     ) -> None:
@@ -76,9 +80,10 @@ class Feed:
         self._past = Past(self.settings.of_past())
         earlier = self._past.segments()
         place = (earlier[-1].source_s[1], earlier[-1].arrived_at[1]) if earlier else None
-        self._source = Source(source, place)
+        self._watch = TissueWatch() if self.settings.finds_tissue else None
+        self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
         of_follower, budget_s = self.settings.of_follower(), self.settings.budget_s
-        self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s)
+        self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
         self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())
 
     def __enter__(self) -> Self:
@@ -91,15 +96,17 @@ class Feed:
 
     def report(self) -> FeedReport:
         """State, numbers, model and past of now."""
-        status, numbers, window = self._source.status, self._source.numbers(), self._model.scene()
+        status, numbers, window = self._source.status, self._source.numbers(), self._model.span()
         past = range_of(window, self._past)
         age_s = None if past is None else time.time() - past.ends_at
         state, reason, text = status.state, status.reason, status.text
         if state in (FeedState.LIVE, FeedState.BEHIND):
             trouble = self._model.trouble
-            if trouble is not None:
+            if self._watch is not None and self._watch.is_out:
+                state, reason, text = FeedState.NO_TISSUE, None, "the pictures show no tissue: nothing is kept of them"
+            elif trouble is not None:
                 state, reason, text = FeedState.STALLED, trouble.reason, trouble.text
-            elif window is None or age_s is None:
+            elif age_s is None or not self._model.has_begun:
                 state, reason, text = FeedState.CONNECTING, None, "the model begins"
             elif age_s > self.settings.max_age_s:
                 state, reason, text = FeedState.BEHIND, FeedReason.TOO_SLOW, "the model does not keep up"
@@ -134,7 +141,7 @@ class Feed:
         """The source time of the newest known moment as soon as that is after source_s; None: not in time."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            known = range_of(self._model.scene(), self._past)
+            known = range_of(self._model.span(), self._past)
             if known is not None and known.ends_s > source_s:
                 return known.ends_s
             left_s = deadline_s - time.monotonic()
@@ -146,6 +153,10 @@ class Feed:
     def segments(self) -> tuple[KeptSegment, ...]:
         """The past's segments, oldest first."""
         return self._past.segments()
+
+    def recorded(self) -> tuple[Part, ...]:
+        """What is recorded, oldest first."""
+        return self._source.index()
 
     def cut(self, from_s: float, to_s: float, path: Path) -> Cut:
         """One playable file of the recorded packets of [from_s, to_s] in source time; see cut_parts."""
@@ -173,8 +184,10 @@ class Feed:
 
     def close(self) -> None:
         """End it. What is on disk stays, and is the past of a feed that is made with the same folders."""
-        self._source.close()
         self._model.close()
+        if self._watch is not None:
+            self._watch.end()
+        self._source.close()
         self._past.close()
 
     def _since(self, state: FeedState, reason: FeedReason | None) -> float:

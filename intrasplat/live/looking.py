@@ -20,6 +20,8 @@ MAX_STEP_S = 1.0
 """Between used frames that are farther apart nothing is known: the nearest one is shown."""
 TOLERANCE_S = 0.05
 """A moment that is shown in place of one that is so near needs no notice."""
+WINDOW = -1
+"""Number of what the window covers, which is no segment yet."""
 Axis = Literal["source_s", "arrived_at"]
 
 
@@ -46,8 +48,8 @@ class FeedView:
     notices: tuple[Notice, ...] = ()
 
 
-def range_of(window: TrainedScene | None, past: Past) -> PastRange | None:
-    """What can be looked at; None: nothing. window: the scene of the newest frames."""
+def range_of(window: KeptSegment | None, past: Past) -> PastRange | None:
+    """What can be looked at; None: nothing. window: what the newest frames cover."""
     spans = _spans(window, past)
     if not spans:
         return None
@@ -61,7 +63,8 @@ def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_
     Raises:
         InputError: the time lies before all that is kept.
     """
-    while spans := _spans(window, past):
+    newest = None if window is None else KeptSegment.of(WINDOW, window)
+    while spans := _spans(newest, past):
         newest_s = spans[-1].source_s[1]
         axis: Axis = "arrived_at" if asked.kind is FeedTimeKind.UNIX else "source_s"
         wanted = {FeedTimeKind.LIVE: newest_s, FeedTimeKind.BEFORE_LIVE: newest_s - asked.seconds}.get(
@@ -71,19 +74,17 @@ def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_
         if wanted < begins - TOLERANCE_S:
             raise _too_early(asked, spans)
         chosen = _chosen(spans, axis, wanted)
-        scene = window if chosen.number < 0 else past.load(chosen)
+        scene = window if chosen is newest else past.load(chosen)
         if scene is not None:
             return _view(asked, scene, axis, wanted, newest_s, max_age_s)
     return None
 
 
-def _spans(window: TrainedScene | None, past: Past) -> list[KeptSegment]:
-    """What each scene covers, oldest first; the window's has the number -1."""
+def _spans(window: KeptSegment | None, past: Past) -> list[KeptSegment]:
+    """What each scene covers, oldest first."""
     spans = [*past.segments()]
-    if window is not None:
-        newest = KeptSegment.of(-1, window)
-        if not spans or spans[-1].source_s[1] < newest.source_s[1]:
-            spans.append(newest)
+    if window is not None and (not spans or spans[-1].source_s[1] < window.source_s[1]):
+        spans.append(window)
     return spans
 
 

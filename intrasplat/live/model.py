@@ -11,15 +11,20 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 
 from intrasplat.errors import InputError
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
+from intrasplat.live.kept import KeptSegment
+from intrasplat.live.looking import WINDOW
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past import Past
 from intrasplat.live.source import Source
-from intrasplat.live.state import FeedReason, ModelNumbers
+from intrasplat.live.state import FeedReason, FeedState, ModelNumbers
+from intrasplat.live.tissue import TissueWatch, has_colours_of_tissue, is_near
+from intrasplat.machine.hooks import always
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 
@@ -64,13 +69,18 @@ class FeedModel:
     def __init__(
         self,
         source: Source,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FollowSettings,
         past: Past,
         device: Device = CPU,
         budget_s: float | None = None,
+        watch: TissueWatch | None = None,
     ) -> None:
-        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device."""
+        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device.
+
+        watch: learns what shows tissue; pairs without it are not learnt. None: all are.
+        """
+        self._watch = watch
         self._source, self._calibration, self._settings, self._past = source, calibration, settings, past
         self._device, self._budget_s = device, budget_s
         self.changed = threading.Condition()
@@ -100,6 +110,15 @@ class FeedModel:
         found = None if follower is None else follower.scene_at()
         return None if found is None else found[0]
 
+    def span(self) -> KeptSegment | None:
+        """What the scene of the newest frames covers."""
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if found is None:
+            return None
+        first, newest = found
+        return KeptSegment(WINDOW, (first.source_s, newest.source_s), (first.arrived_at, newest.arrived_at))
+
     def used_fps(self) -> float:
         """Pairs that were learnt a second, over the last seconds."""
         with self.changed:
@@ -109,18 +128,23 @@ class FeedModel:
             return len(self._used_at) / min(WINDOW_S, max(age_s, 1.0))
 
     @property
+    def has_begun(self) -> bool:
+        """Whether it has learnt a pair."""
+        return self._used > 0
+
+    @property
     def left_out(self) -> int:
         """Pairs that the source handed over and no model has learnt."""
         return self._given - self._used
 
     def numbers(self) -> ModelNumbers | None:
         """Iteration, size and steps; None: there is no model yet."""
-        follower, scene = self._follower, self.scene()
-        if follower is None or scene is None:
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if follower is None or found is None:
             return None
-        width, height = scene.intrinsics.width, scene.intrinsics.height
-        steps = float(median([*self._steps] or [0]))
-        return ModelNumbers(follower.iteration, len(scene.gaussians), width, height, steps)
+        camera, steps = found[1].clip.intrinsics, float(median([*self._steps] or [0]))
+        return ModelNumbers(follower.iteration, follower.gaussians, camera.width, camera.height, steps)
 
     def close(self) -> None:
         """End. What the model knows becomes a segment."""
@@ -136,10 +160,13 @@ class FeedModel:
                 pair = self._source.newest(after, POLL_S)
                 self._past.prune()
                 if pair is None:
+                    if self._watch is not None and self._source.state is FeedState.ENDED:
+                        self._watch.end()
                     self._rest(IDLE_S)
                     continue
                 after = pair.sequence
-                self._take(pair)
+                if self._is_tissue(pair):
+                    self._take(pair)
                 failures = 0
             except Exception as error:
                 failures += 1
@@ -151,8 +178,9 @@ class FeedModel:
         """Learn a pair."""
         follower = self._follower or self._begun()
         before = follower.iteration
-        self._given += 1
         became = follower.add(pair, self._budget())
+        if became is not Added.NO_SCENE or self._used:  # without a scene so far, the calibration may be wrong
+            self._saw(pair, is_tissue=became not in (Added.NO_TISSUE, Added.NO_SCENE))
         if became not in (Added.FIRST, Added.FOLLOWED, Added.RESTARTED):
             return
         with self.changed:
@@ -165,11 +193,31 @@ class FeedModel:
             self.changed.notify_all()
         self._choose_width(pair.left.shape[1])
 
+    def _is_tissue(self, pair: FeedPair) -> bool:
+        """Whether a pair is to be learnt, by its colours."""
+        self._given += 1
+        if self._watch is None:
+            return True
+        if has_colours_of_tissue(pair.left):
+            return self._watch.may_be_back()
+        self._saw(pair, is_tissue=False)
+        self._rest(IDLE_S)
+        return False
+
+    def _saw(self, pair: FeedPair, *, is_tissue: bool) -> None:
+        """Note what a pair shows. When the endoscope goes out, the model ends, and what it recorded is deleted."""
+        if self._watch is not None and self._watch.see(pair.source_s, is_tissue=is_tissue):
+            if self._follower is not None:
+                self._follower.write_off()
+            if self._source.parts is not None:
+                self._source.parts.forget(self._watch.tissue_until_s)
+
     def _begun(self) -> Follower:
         """Another follower."""
         width = self._width or FIRST_WIDTH
         settings = replace(self._settings, eyes=replace(self._settings.eyes, width=width), keep_s=0.0)
-        self._follower = Follower(self._calibration, settings, self._device, self._past.add)
+        judge = always if self._watch is None else is_near
+        self._follower = Follower(self._calibration, settings, self._device, self._past.add, judge)
         return self._follower
 
     def _budget(self) -> float:
@@ -178,7 +226,7 @@ class FeedModel:
             return self._budget_s
         if self._device.kind != CPU.kind:
             return 0.03
-        return 0.18 if (self._width or FIRST_WIDTH) <= 400 else 0.28
+        return 0.165 if (self._width or FIRST_WIDTH) <= 400 else 0.28
 
     def _choose_width(self, recorded_width: int) -> None:
         """Once, after some pairs, the width that the machine keeps up with; later a smaller one if it does not."""

@@ -165,6 +165,8 @@ class Past:
     def _write(self) -> None:
         while (waiting := self._queue.get()) is not None:
             segment, scene = waiting
+            if segment.number not in {each.number for each in self.segments()}:
+                continue  # it was forgotten meanwhile
             self.problem = self._written(segment, scene)
 
     def _written(self, segment: KeptSegment, scene: TrainedScene) -> FeedReason | None:

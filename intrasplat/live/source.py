@@ -16,7 +16,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.connecting import Connection, ConnectionFailed, connect
 from intrasplat.live.cut import Cut, cut_parts
 from intrasplat.live.pair import FeedPair
-from intrasplat.live.parts import Part, Parts
+from intrasplat.live.parts import Keeps, Part, Parts
 from intrasplat.live.process import HandedOver, Numbers, ReadingProcess
 from intrasplat.live.push import Push
 from intrasplat.live.spec import FIELD, PICTURE_HEADER, SourceKind, SourceSpec
@@ -43,14 +43,14 @@ class Source:
         parts: what is recorded; None if nothing is.
     """
 
-    def __init__(self, spec: SourceSpec, place: tuple[float, float] | None = None) -> None:
+    def __init__(self, spec: SourceSpec, place: tuple[float, float] | None = None, keeps: Keeps | None = None) -> None:
         """place: source time, s, and arrival (UNIX time, s) of the last frame of an earlier run, after which this one
-        goes on; the recording may know a later one.
+        goes on; the recording may know a later one. keeps: as for Parts.
 
         Raises InputError as SourceSpec.target; OSError: the folder of the recording cannot be used.
         """
         self._spec, self._target = spec, spec.target()
-        self.parts = None if spec.recording is None else Parts(spec.recording)
+        self.parts = None if spec.recording is None else Parts(spec.recording, keeps)
         self._changed = threading.Condition()
         self._status = FeedStatus(FeedState.CONNECTING, None, "", time.time())
         self._process: ReadingProcess | None = None
@@ -208,6 +208,7 @@ class Source:
         except Exception as error:
             logger.exception("a live source failed")
             self._set(FeedState.ENDED, FeedReason.FAULT, f"a fault of the program ({type(error).__name__})")
+        self._wait(lambda: False, None)  # what is recorded still grows old
 
     def _read(self) -> None:
         failures = 0
@@ -227,13 +228,12 @@ class Source:
             is_over = reason is FeedReason.END_OF_FILE
             if is_over or (self._target.kind is SourceKind.FILE and reason is not FeedReason.DECODER_ENDED):
                 self._set(FeedState.ENDED, reason, text)
-                break
+                return
             self._set(FeedState.STALLED, reason, text)
             failures = 0 if self._sequence > before else failures + 1
             if self._push is None:
                 self._wait(lambda: self._paused, self._back_off_s(failures))
-        if self._status.state is not FeedState.ENDED:
-            self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
+        self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
 
     def _is_interrupted(self) -> bool:
         """Whether the caller wants no connection any more."""
@@ -264,6 +264,7 @@ class Source:
                 if not self._closed and not enough():
                     self._changed.wait(min(left_s, PRUNE_PERIOD_S))
             if self.parts is not None:
+                self.parts.adopt()
                 self.parts.prune()
         return not self._closed
 

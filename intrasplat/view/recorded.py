@@ -27,6 +27,7 @@ from intrasplat.picture import RecordedMasks
 from intrasplat.report import Recorded
 from intrasplat.scene.recorded_file import EYES, MASK, PICTURE, name_of, nearest, read_frame
 from intrasplat.scene.recorded_video import RecordedEye, encoded
+from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.training_pictures import coded
 
 MAX_MOMENTS = 120
@@ -129,6 +130,24 @@ def live_frame(
         return index, mask_png(_tool(of, index))
     rgb = _rgb(of, index)
     return index, _jpeg(_marked(rgb, _tool(of, index)) if masks is RecordedMasks.MARKED else rgb)
+
+
+def pictured_frame(
+    scene: TrainedScene, t: float, eye: EyeName = "left", masks: RecordedMasks = RecordedMasks.MARKED
+) -> tuple[int, bytes]:
+    """As live_frame, from the training pictures that a scene has in memory.
+
+    Raises:
+        InputError: it has none, or none of this eye.
+    """
+    pictures, place = scene.pictures, EYES.index(eye)
+    if pictures is None or place >= len(pictures.eyes):
+        raise InputError("eye", f"the scene has no recorded frames of the {eye} eye.", "Ask for eye=left.")
+    index = nearest(pictures.frames, t, scene.frame_count)
+    rgb, tissue = pictures.picture(place, index)
+    if masks is RecordedMasks.ONLY:
+        return index, mask_png(~tissue)
+    return index, _jpeg(_marked(rgb.copy(), ~tissue) if masks is RecordedMasks.MARKED else rgb)
 
 
 def stored_frame(

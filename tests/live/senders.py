@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from intrasplat.live.spec import PICTURE_HEADER
 from lab.phantom import Phantom
 
 HEIGHT, WIDTH = 48, 64  # of an eye
@@ -173,9 +174,10 @@ def video_file(path: Path, frames: int, **options: str) -> Path:
 
 
 class PhantomSender:
-    """Sends a small phantom's pictures, to and fro, in real time. `cover`: a picture to send instead; None: the phantom.
+    """Sends a small phantom's pictures, to and fro, in real time.
 
-    url  of the server that sends to whoever connects
+    cover  a picture to send instead; None: the phantom
+    url    of the server that sends to whoever connects
     """
 
     def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
@@ -189,9 +191,24 @@ class PhantomSender:
         with tcp_server(self._serve) as self.url:
             yield self
 
-    def _serve(self, connection: socket.socket) -> None:
-        stream, last = Stream(), len(self._pictures) - 1
+    def stream(self) -> Iterator[bytes]:
+        """The pieces of an MPEG-TS, each when it is due."""
+        stream = Stream()
         for index in in_real_time():
-            place = index % (2 * last)
-            shown = self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
-            connection.sendall(stream.frame(shown))
+            yield stream.frame(self._shown(index))
+
+    def pictures(self) -> Iterator[bytes]:
+        """JPEG pictures of both eyes, each after its header and when it is due."""
+        for index in in_real_time():
+            bgr = cv2.cvtColor(self._shown(index), cv2.COLOR_RGB2BGR)
+            content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+            yield PICTURE_HEADER.pack(time.time(), len(content)) + content
+
+    def _shown(self, index: int) -> NDArray[np.uint8]:
+        last = len(self._pictures) - 1
+        place = index % (2 * last)
+        return self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
+
+    def _serve(self, connection: socket.socket) -> None:
+        for content in self.stream():
+            connection.sendall(content)

@@ -21,7 +21,7 @@ from contract.wire.rendering import (
     RenderRequest,
     WorkerAddress,
 )
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, UnavailableError
 from intrasplat.live.state import FeedReason, FeedState
 from tests.answers import at_once
 from tests.measurements import measurement_reply
@@ -44,6 +44,8 @@ class FeedWorker:
         self.asked: list[Any] = []
         self.pushed: dict[str, bytes] = {}
         self.bodies: list[bytes] = []
+        self.losses: list[int] = []
+        """Which bodies, counted from 0, are refused as by a process that has just begun."""
         self.replaced: set[str] = set()
         self.clip = clip
         self.cut = CutRange(from_s=BEGAN_S + 30, to_s=BEGAN_S + 60, frames=900)
@@ -138,6 +140,9 @@ class FeedWorker:
             if request.push_id in self.replaced:
                 raise InputError("push", "Another connection pushes this feed.", "Push over one connection.")
             self.bodies.append(content)
+            if len(self.bodies) - 1 in self.losses:
+                self.replaced.add(request.push_id)
+                raise UnavailableError("The push was cut off.", "Begin it anew.")
             self.pushed[request.push_id] = self.pushed.get(request.push_id, b"") + content
             return Reply(b"", "application/octet-stream", 0.0)
         if request.from_s < BEGAN_S:

@@ -143,10 +143,36 @@ def test_pictures_are_handed_on_and_counted(service: LiveService, worker: FeedWo
     with connected(service, f"/feeds/{opened(service)}/pictures") as socket:
         for start in range(0, len(stream), 60_000):
             socket.send(stream[start : start + 60_000])
-        assert [json.loads(socket.recv(timeout=TIMEOUT_S)) for _ in range(1)] == [{"taken": 3}]
+        assert [json.loads(socket.recv(timeout=TIMEOUT_S))["taken"] for _ in range(3)] == [1, 2, 3]
     assert pushed(worker) == stream
     assert all(each.pictures for each in worker.asked if isinstance(each, PushRequest))
     wait_until(lambda: worker.asked[-1].is_last)
+
+
+def test_a_picture_that_was_cut_off_by_the_feeds_process_comes_again_whole(
+    service: LiveService, worker: FeedWorker
+) -> None:
+    worker.losses = [2]  # the third part of the push is lost, which is in the second picture
+    first, second = picture(b"a"), picture(b"b" * 70_000)
+    with connected(service, f"/feeds/{opened(service)}/pictures") as socket:
+        for piece in (first, second[:60_000], second[60_000:]):
+            socket.send(piece)
+        assert [json.loads(socket.recv(timeout=TIMEOUT_S))["taken"] for _ in range(2)] == [1, 2]
+    pushes = list(worker.pushed.values())
+    assert pushes == [first + second[:MAX_PUSH_BYTES], second]
+
+
+def test_a_push_of_mpeg_ts_goes_on_with_another_process_and_one_of_mp4_ends(
+    service: LiveService, worker: FeedWorker
+) -> None:
+    worker.losses = [1]
+    url = f"{service.url}/feeds/{opened(service)}/video"
+    stream = b"\x47" * (3 * MAX_PUSH_BYTES)
+    assert httpx.put(url, content=stream, timeout=TIMEOUT_S).json() == {"bytes": len(stream)}
+    assert len(worker.pushed) == 2
+    assert pushed(worker) == stream
+    worker.losses = [len(worker.bodies) + 1]
+    assert httpx.put(url, content=b"ftyp" * MAX_PUSH_BYTES, timeout=TIMEOUT_S).status_code == 503
 
 
 @pytest.mark.parametrize(

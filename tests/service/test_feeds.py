@@ -350,6 +350,16 @@ def test_a_cut_becomes_a_job_with_the_calibration(service: ServiceUnderTest, wor
     assert ("feed-cut", feed_id) in actions(service)
 
 
+def test_a_cut_until_live_ends_with_the_newest_pairs(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    response = service.http.post(f"/feeds/{feed_id}/cut", json={"from": 20})
+    assert response.status_code == 202, response.text
+    (asked,) = {(each.from_s, each.to_s) for each in worker.asked if isinstance(each, CutRequest)}
+    assert asked[0] == BEGAN_S + 20
+    assert 60 <= asked[1] - BEGAN_S < 65
+
+
 @pytest.mark.parametrize(
     ("given", "status", "field"),
     [
