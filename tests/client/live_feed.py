@@ -47,7 +47,8 @@ if (canvas.hidden || canvas.width === 0) return null;
 const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, 16);
 const cell = canvas.width / 25;
 let ms = 0;
-for (let bit = 0; bit < 24; bit++) ms = ms * 2 + (data[4 * (canvas.width * 8 + Math.floor((bit + .5) * cell))] > 127 ? 1 : 0);
+const row = canvas.width * 8;
+for (let bit = 0; bit < 24; bit++) ms = ms * 2 + (data[4 * (row + Math.floor((bit + .5) * cell))] > 127 ? 1 : 0);
 const age = (Date.now() - ms) % 2 ** 24;
 return { ms, ageMs: age < 2 ** 23 ? age : age - 2 ** 24, text: document.getElementById(arguments[1]).textContent };
 """

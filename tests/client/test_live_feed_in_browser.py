@@ -15,9 +15,9 @@ from tests.client.live_feed import LivePage
 from tests.client.page import browser
 from tests.client.test_live_in_browser import CLICK, DRAG_TAPE
 from tests.client.words import say
+from tests.live.senders import PhantomSender
 from tests.test_live_end_to_end import Push, eventually
 from tests.test_live_end_to_end import sender as sender
-from tests.live.senders import PhantomSender
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import pytest
 from selenium import webdriver
 
 from client.page import DASHBOARD
-from contract.wire.feeds import FeedWish
 from contract.wire.job import JobState
 from intrasplat.live.state import FeedReason, FeedState
 from tests.client.live_feed import PAST_S, READ_TIME, LivePage, LivePainter, live_painter, opened_feed
@@ -355,7 +354,9 @@ def test_every_state_and_reason_has_words() -> None:
     assert all(f"{state.value}:" in source for state in FeedState if state not in (FeedState.LIVE, FeedState.BEHIND))
 
 
-@pytest.mark.parametrize(("width", "height", "language"), [(*size, LANGUAGES[n % 2]) for n, size in enumerate(LIVE_SIZES)])
+@pytest.mark.parametrize(
+    ("width", "height", "language"), [(*size, LANGUAGES[n % 2]) for n, size in enumerate(LIVE_SIZES)]
+)
 def test_it_is_accessible_and_fits_in_every_state(
     site: Site, page: LivePage, painter: LivePainter, axe: str, width: int, height: int, language: str
 ) -> None:
@@ -406,9 +407,3 @@ def test_it_asks_nobody_else(site: Site, page: LivePage, painter: LivePainter) -
     watched(site, page)
     names = page.script("return performance.getEntriesByType('resource').map((each) => each.name)")
     assert [each for each in names if not each.startswith((site.url, "blob:"))] == []
-
-
-def test_wishes_are_told_to_the_worker(site: Site, page: LivePage, painter: LivePainter) -> None:
-    feed_id = watched(site, page)
-    page.click("#pause")
-    page.until(lambda: (site.queue.feed(feed_id) or pytest.fail()).wish is FeedWish.PAUSE)

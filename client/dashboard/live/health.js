@@ -8,7 +8,8 @@ const RECORDED = ["live", "behind"];
 const MB = 1e6;
 
 /** @param {string | null} reason @returns {string} */
-const reasonWords = (reason) => words(hasWords(`live.reason_${reason}`) ? `live.reason_${reason}` : "live.reason_unclassified");
+const reasonWords = (reason) =>
+  words(hasWords(`live.reason_${reason}`) ? `live.reason_${reason}` : "live.reason_unclassified");
 
 /** Why the feed is in its state; "" while all is well. @param {import("./feeds.js").Feed} feed */
 export const whyOf = ({ reason }) => (reason === null ? "" : reasonWords(reason));

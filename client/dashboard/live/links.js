@@ -22,7 +22,11 @@ export function feedLink(feed) {
   return element("li", {}, link, document.createTextNode(" "), state);
 }
 
-/** Anew only where something changed, so that the focus stays. @param {HTMLElement} list @param {import("./feeds.js").Feed[]} feeds */
+/**
+ * Anew only where something changed, so that the focus stays.
+ * @param {HTMLElement} list
+ * @param {import("./feeds.js").Feed[]} feeds
+ */
 export function showFeeds(list, feeds) {
   const key = JSON.stringify([language(), ...feeds.map(({ id, label, state }) => [id, label, state])]);
   if (list.dataset.of !== key) list.replaceChildren(...feeds.map(feedLink));

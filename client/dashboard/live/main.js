@@ -56,11 +56,8 @@ const light = new ScreenLight();
 const keeping = new Keeping({ button: get("keep"), line: get("kept") }, clock, (fromS, toS) => {
   tape.mark({ atS: toS, fromS, kind: "kept" });
 });
-const measuring = new LiveMeasure(
-  { stage: get("model-stage"), canvas: get("model-picture"), over: get("model-over"), told: get("measured"), button: get("measure") },
-  look,
-  model,
-);
+const over = { stage: get("model-stage"), canvas: get("model-picture"), over: get("model-over") };
+const measuring = new LiveMeasure({ ...over, told: get("measured"), button: get("measure") }, look, model);
 
 /** @type {import("./feeds.js").Feed | null} as it was reported last */
 let feed = null;
@@ -76,7 +73,13 @@ let answeredMs = performance.now();
 let refused = null;
 
 const opening = new Opening(
-  { section: get("opening"), form: get("open-feed"), list: get("feeds"), none: get("no-feeds"), message: get("open-message") },
+  {
+    section: get("opening"),
+    form: get("open-feed"),
+    list: get("feeds"),
+    none: get("no-feeds"),
+    message: get("open-message"),
+  },
   (id, media) => {
     push?.end();
     if (media) push = new Push(id, media, () => (push = null));
@@ -142,9 +145,9 @@ function known() {
     isGone,
     mode: look.mode,
     answerAgeS: document.hidden ? 0 : (performance.now() - answeredMs) / 1000,
+    pictureAtS: picture.capturedAtS,
     pictureAgeS: picture.ageS,
-    isPictureRepeated: picture.isRepeated,
-    hasPictureFailed: picture.problem !== null,
+    pictureProblem: picture.problem,
     modelAgeS,
     frozenAt: clockTime(1000 * look.atS),
     backS: look.behindS,
@@ -182,7 +185,7 @@ function refresh() {
 function blankWords({ kind }) {
   if (kind === "empty") return words("live.nothing_recorded");
   if (kind === "ended") return words("live.ended_note");
-  return picture.problem && kind === "lost" ? picture.problem.message : "";
+  return picture.problem && feed?.begins_s != null ? picture.problem.message : "";
 }
 
 function refreshModel({ modelAgeS }) {
@@ -232,7 +235,8 @@ function freeze() {
 function askToEnd() {
   if (feed === null) return;
   const dialog = get("confirm");
-  const about = { min: figure(Math.max(0, clock.nowS - (feed.begins_s ?? clock.nowS)) / 60, 1), mb: figure(feed.kept_bytes / 1e6, 1) };
+  const pastS = Math.max(0, clock.nowS - (feed.begins_s ?? clock.nowS));
+  const about = { min: figure(pastS / 60, 1), mb: figure(feed.kept_bytes / 1e6, 1) };
   setText(get("confirm-question"), words("live.end_question", about));
   dialog.showModal();
 }
@@ -293,7 +297,8 @@ onKeys("live_rock", { r: [] }, () => isShown() && look.rock());
 onKeys("live_step", arrows, (byS) => isShown() && look.step(byS));
 onKeys("turn", { ArrowLeft: [TURN, 0], ArrowRight: [-TURN, 0], ArrowUp: [0, TURN], ArrowDown: [0, -TURN] },
   (dx, dy) => look.turn((orbit) => orbit.turn(dx, dy)), true);
-onKeys("approach", { "+": [NEARER], "=": [NEARER], "-": [1 / NEARER] }, (factor) => look.turn((orbit) => orbit.approach(factor)));
+onKeys("approach", { "+": [NEARER], "=": [NEARER], "-": [1 / NEARER] },
+  (factor) => look.turn((orbit) => orbit.approach(factor)));
 onKeys("full_screen", { f: [] }, prepareFullScreen(get("full-screen")));
 listenToKeys();
 

@@ -106,7 +106,8 @@ export class LiveMeasure {
   #take(points, readings, distance) {
     const last = readings.at(-1);
     const second = this.chosen.length > 0;
-    if (last.refusal) return this.#tell(second ? "measure.refused_second" : "measure.refused_first", { why: readingOf(last) });
+    const why = { why: readingOf(last) };
+    if (last.refusal) return this.#tell(second ? "measure.refused_second" : "measure.refused_first", why);
     this.chosen = points;
     const places = readings.map((each) => each.point_mm);
     this.found = distance && { mm: distance.distance_mm, sigma: distance.uncertainty_mm, places };

@@ -23,7 +23,6 @@ export class LivePicture extends EventTarget {
     this.isBlank = true;
     /** @type {number | null} of what is on the screen */
     this.capturedAtS = null;
-    this.isRepeated = false;
     /** @type {Error | null} in place of the newest answer */
     this.problem = null;
     this.canvas.hidden = true;
@@ -66,8 +65,8 @@ export class LivePicture extends EventTarget {
       this.clock.note(image.capturedAtS + image.ageS, image.receivedMs, image.sentMs);
       this.dispatchEvent(new Event("answered"));
       this.problem = null;
-      this.isRepeated = image.capturedAtS === this.capturedAtS;
-      if (!this.isRepeated && this.mayShow) this.#show(await createImageBitmap(image.blob), image.capturedAtS, visit);
+      if (image.capturedAtS === this.capturedAtS || !this.mayShow) return true;
+      this.#show(await createImageBitmap(image.blob), image.capturedAtS, visit);
       return true;
     } catch (error) {
       if (visit !== this.visit) return false;

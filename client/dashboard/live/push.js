@@ -15,8 +15,10 @@ const RECONNECT_MS = 1000;
 const WISHED = { width: { ideal: 3840 }, height: { ideal: 1080 }, frameRate: { ideal: 30 } };
 
 /** @param {string} [deviceId] @returns {Promise<MediaStream>} throws as getUserMedia */
-export const openCapture = (deviceId) =>
-  navigator.mediaDevices.getUserMedia({ video: { ...WISHED, ...(deviceId && { deviceId: { exact: deviceId } }) }, audio: false });
+export function openCapture(deviceId) {
+  const video = deviceId ? { ...WISHED, deviceId: { exact: deviceId } } : WISHED;
+  return navigator.mediaDevices.getUserMedia({ video, audio: false });
+}
 
 /** @returns {boolean} whether this browser lets a page use a capture device: not without HTTPS, but for this machine */
 export const canCapture = () => navigator.mediaDevices?.getUserMedia !== undefined;
@@ -53,7 +55,7 @@ export class Push {
     this.unanswered = 0;
     socket.addEventListener("open", () => key && socket.send(JSON.stringify({ authorize: key })));
     socket.addEventListener("message", ({ data }) => this.#take(JSON.parse(data)));
-    socket.addEventListener("close", () => !this.isOver && setTimeout(() => !this.isOver && this.#connect(), RECONNECT_MS));
+    socket.addEventListener("close", () => setTimeout(() => !this.isOver && this.#connect(), RECONNECT_MS));
   }
 
   #take(message) {
@@ -65,7 +67,8 @@ export class Push {
 
   async #send() {
     const { socket, video, canvas } = this;
-    if (this.isBusy || socket.readyState !== WebSocket.OPEN || this.unanswered >= MAX_UNANSWERED || !video.videoWidth) return;
+    if (this.isBusy || this.unanswered >= MAX_UNANSWERED) return;
+    if (socket.readyState !== WebSocket.OPEN || !video.videoWidth) return;
     this.isBusy = true;
     const atS = performance.now() / 1000;
     if (canvas.width !== video.videoWidth || canvas.height !== video.videoHeight) {

@@ -56,8 +56,8 @@ export class Tape {
     this.slider.min = String(-this.spanS);
     const { behindS } = this.look;
     if (!this.isDragged) this.slider.value = String(-behindS);
-    const at = behindS > 0 ? words("live.tape_at", { s: figure(behindS), time: clockTime(1000 * (nowS - behindS)) }) : "";
-    this.slider.setAttribute("aria-valuetext", at || words("live.tape_now"));
+    const at = { s: figure(behindS), time: clockTime(1000 * (nowS - behindS)) };
+    this.slider.setAttribute("aria-valuetext", behindS > 0 ? words("live.tape_at", at) : words("live.tape_now"));
     this.#draw(nowS, pastS, feed?.ends_s ?? nowS);
     this.#label();
   }
@@ -71,10 +71,12 @@ export class Tape {
     for (const { atS, kind, fromS = atS } of this.marks) {
       if (place(atS) < 0) continue;
       const x = Math.max(0, place(fromS));
-      draw(svg, "rect", { class: kind, x, y: kind === "kept" ? 44 : 8, width: Math.max(3, place(atS) - x), height: kind === "kept" ? 8 : 14 });
+      const rows = kind === "kept" ? { y: 44, height: 8 } : { y: 8, height: 14 };
+      draw(svg, "rect", { class: kind, x, ...rows, width: Math.max(3, place(atS) - x) });
     }
     const { behindS } = this.look;
-    if (behindS > 0) draw(svg, "rect", { class: "gap", x: place(nowS - behindS), y: 22, width: (WIDTH * behindS) / this.spanS, height: 20 });
+    const gap = { x: place(nowS - behindS), y: 22, width: (WIDTH * behindS) / this.spanS, height: 20 };
+    if (behindS > 0) draw(svg, "rect", { class: "gap", ...gap });
     draw(svg, "rect", { class: "now", x: WIDTH - 4, y: 8, width: 4, height: 48 });
   }
 
