@@ -13,15 +13,18 @@ from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedReque
 from intrasplat.errors import SceneError
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.live.looking import FeedView
+from intrasplat.live.pair import FeedPair
+from intrasplat.live.state import FeedState
 from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.live.window import RIGHT_EYE
 from intrasplat.machine.parts import Parts, whole
+from intrasplat.names import Eye
 from intrasplat.picture import MEDIA_TYPES, ImageFormat, RecordedMasks
 from intrasplat.report import RightEye
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.encode import FOR_EYES
-from intrasplat.view.recorded import pictured_frame
+from intrasplat.view.recorded import frame_of_feed, pictured_frame
 from worker.answer_cache import ReplyCache
 from worker.exports import MAX_OPEN, OpenExports
 from worker.hosted_feed import HostedFeed
@@ -39,6 +42,7 @@ class FeedViews:
         self._replies = ReplyCache()  # of that scene
         self._exports = OpenExports()
         self._exported: OrderedDict[str, FeedView] = OrderedDict()
+        self._picture: tuple[tuple[int, Eye], bytes] | None = None  # the newest that was asked for
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
         """As answer_in_parts, in one call."""
@@ -54,6 +58,12 @@ class FeedViews:
         """
         if request.scene_id != self._hosted.feed_id or isinstance(request, CamerasRequest):
             raise SceneError("This process follows a feed, and answers renders, exports and measurements of it alone.")
+        if isinstance(request, RecordedRequest) and _is_of_now(request):
+            picture = self._hosted.feed.picture()
+            if picture is not None:
+                return self._pictured(picture, request.eye)
+            if self._hosted.state is FeedState.NO_TISSUE:
+                raise NotYetError("The endoscope shows no tissue.")
         view = self._view(request)
         if isinstance(request, RenderRequest):
             reply = yield from self._rendered(view, request, level)
@@ -118,6 +128,21 @@ class FeedViews:
             request = request.model_copy(update={"options": options})
         return export_reply(self._exports, view.scene, request, self._device)
 
+    def _pictured(self, pair: FeedPair, eye: Eye) -> Reply:
+        """One eye of a pair as it came in, not rectified."""
+        key = (pair.sequence, eye)
+        if self._picture is None or self._picture[0] != key:
+            self._picture = (key, frame_of_feed(pair.left if eye == "left" else pair.right))
+        age_s = max(0.0, time.time() - pair.arrived_at)
+        shown = FeedShown(
+            state=self._hosted.state,
+            source_s=pair.source_s,
+            captured_at_s=pair.arrived_at,
+            age_s=age_s,
+            is_newest=True,
+        )
+        return Reply(self._picture[1], MEDIA_TYPES[ImageFormat.JPEG], 0.0, is_untimed=True, feed=shown)
+
     def _of(self, view: FeedView) -> FeedShown:
         return FeedShown(
             state=self._hosted.state,
@@ -126,6 +151,11 @@ class FeedViews:
             age_s=max(0.0, time.time() - view.captured_at),
             is_newest=view.is_live,
         )
+
+
+def _is_of_now(request: RecordedRequest) -> bool:
+    """Whether the newest picture is asked for, rather than one that the model knows, or its mask."""
+    return (request.moment is None or request.moment.is_live) and request.masks is not RecordedMasks.ONLY
 
 
 def _looked_at(moment: AskedTime | None) -> FeedTime:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
 from intrasplat.live.looking import FeedView, find_view, range_of
 from intrasplat.live.model import FeedModel
+from intrasplat.live.pair import FeedPair
 from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
 from intrasplat.live.source import Source
@@ -22,6 +24,9 @@ from intrasplat.live.state import FeedReason, FeedReport, FeedState
 from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.live.tissue import TissueWatch
 from intrasplat.splat.backend import CPU, Device
+
+PEEK_S = 0.05
+"""How long a newer pair is waited for where somebody only looks: the model may wait for one, too."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,8 @@ class Feed:
         self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
         of_follower, budget_s = self.settings.of_follower(), self.settings.budget_s
         self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
+        self._looking = threading.Lock()
+        self._seen: FeedPair | None = None
         self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())
 
     def __enter__(self) -> Self:
@@ -136,6 +143,17 @@ class Feed:
             InputError: the time lies before the past that is kept; its field is "t".
         """
         return find_view(when, self._model.scene(), self._past, self.settings.max_age_s)
+
+    def picture(self) -> FeedPair | None:
+        """The newest pair that came in, whether or not the model learns it. None: there is none since this feed was
+        made, or it shows no tissue."""
+        with self._looking:
+            if self._watch is not None and self._watch.is_out:
+                self._seen = None
+                return None
+            after = 0 if self._seen is None else self._seen.sequence
+            self._seen = self._source.peek(after, PEEK_S) or self._seen
+            return self._seen
 
     def wait_for_newer(self, source_s: float, timeout_s: float) -> float | None:
         """The source time of the newest known moment as soon as that is after source_s; None: not in time."""

@@ -129,6 +129,18 @@ class Source:
             if pair is not None and pair.sequence > after_sequence:
                 return self._given(pair, process.numbers, segments, ended_for)
 
+    def peek(self, after_sequence: int, timeout_s: float) -> FeedPair | None:
+        """As newest, for somebody who only looks: it counts as no pair that was handed over, and is waited for only
+        while the source is read."""
+        with self._changed:
+            process = self._process
+        if process is None or process.end_reason is not None:
+            return None
+        pair = process.newest(after_sequence, timeout_s)
+        if pair is None or pair.sequence <= after_sequence:
+            return None
+        return FeedPair(pair.left, pair.right, pair.source_s, pair.arrived_at, pair.sequence)
+
     def pause(self) -> None:
         """Read, decode and keep nothing from now on. It returns when the reading process has ended."""
         with self._changed:

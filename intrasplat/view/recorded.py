@@ -37,6 +37,8 @@ MAX_WIDTH = 720
 MAX_HEIGHT = 4 * MAX_WIDTH
 """Pixels: limit of a picture that is decoded; it may come from another site."""
 QUALITY = 60
+MAX_LIVE_WIDTH, LIVE_QUALITY = 1280, 80
+"""Of frames of live feeds, which are shown and not kept. A wider one is shrunk as above."""
 MARK, MARK_SHARE = (0, 220, 255), 0.45
 """RGB that no tissue has, and its opacity on the masked parts; their outline is opaque."""
 AFTER_HEADER = 33
@@ -220,8 +222,17 @@ def _marked(rgb: Picture, tool: Mask) -> Picture:
     return rgb
 
 
-def _jpeg(rgb: Picture) -> bytes:
-    return cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+def frame_of_feed(rgb: Picture) -> bytes:
+    """The JPEG of one eye's frame of a live feed, at most MAX_LIVE_WIDTH wide."""
+    height, width = rgb.shape[:2]
+    factor = -(-width // MAX_LIVE_WIDTH)
+    if factor > 1:
+        rgb = np.asarray(cv2.resize(rgb, (width // factor, height // factor), interpolation=cv2.INTER_AREA), np.uint8)
+    return _jpeg(rgb, LIVE_QUALITY)
+
+
+def _jpeg(rgb: Picture, quality: int = QUALITY) -> bytes:
+    return cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _decoded(content: bytes, flags: int) -> Picture:

@@ -46,6 +46,39 @@ def test_a_feed_becomes_live_and_shows_the_newest_moment(followed: Follow, sende
     assert best_db > 22
 
 
+def test_the_newest_picture_is_that_of_the_source_and_counts_as_no_used_one(followed: Follow) -> None:
+    feed = followed()
+    until_known(feed, 1.0)
+    before = feed.report().numbers
+    pictures, late_s = [], []
+    for _ in range(20):
+        picture, view = feed.picture(), feed.view_of()
+        assert picture is not None
+        assert view is not None
+        late_s.append(picture.arrived_at - view.captured_at)
+        pictures.append(picture)
+        time.sleep(0.05)
+    assert min(late_s) >= -0.2  # the model may take the next one between both
+    assert pictures[0].left.shape == (96, 128, 3)
+    assert len({each.sequence for each in pictures}) >= 8
+    assert time.time() - pictures[-1].arrived_at < 0.5
+    after = feed.report().numbers
+    assert after.dropped > before.dropped
+    feed.pause()
+    paused = feed.picture()
+    assert paused is not None
+    assert feed.picture() is paused
+
+
+def test_a_picture_without_tissue_is_not_shown(followed: Follow, monkeypatch: pytest.MonkeyPatch) -> None:
+    feed = followed()
+    until_known(feed, 1.0)
+    assert feed.picture() is not None
+    assert feed._watch is not None
+    monkeypatch.setattr(feed._watch, "is_out", True)
+    assert feed.picture() is None
+
+
 def _frames() -> Iterator[object]:
     return (phantom().frame(index) for index in range(24))
 

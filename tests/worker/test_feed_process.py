@@ -18,6 +18,7 @@ import pytest
 from contract.runtime.settings import Settings
 from contract.wire.feeds import FeedRecord, FeedTime, FeedWish
 from contract.wire.rendering import CutRequest, ExportRequest, PushRequest, RecordedRequest, WorkerReply
+from intrasplat.picture import RecordedMasks
 from lab.phantom import Phantom, PhantomSettings, make_phantom
 from tests.live.senders import PhantomSender
 from tests.worker.feeds import LIVE, Asker, Hosted, eventually, feed_record, render_request
@@ -79,6 +80,12 @@ def test_a_feed_is_shown_cut_paused_killed_and_ended(tmp_path: Path, sender: Pha
         assert (refused.error.kind, refused.error.field) == ("input", "t")
         recorded, picture = asker.ask(RecordedRequest(scene_id=feed_id, t=0, moment=moment))
         assert recorded.feed is not None
+        assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (96, 128, 3)
+        live, picture = asker.ask(RecordedRequest(scene_id=feed_id, t=0, moment=LIVE, masks=RecordedMasks.OFF))
+        assert live.feed is not None
+        assert live.feed.is_newest
+        assert live.feed.age_s == pytest.approx(time.time() - live.feed.captured_at_s, abs=0.5)
+        assert live.feed.captured_at_s > newest.feed.captured_at_s
         assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (96, 128, 3)
         assert len(exported(asker, feed_id)) > 10_000
 
