@@ -32,6 +32,7 @@ import { Scale } from "./scale.js";
 import { Scopes } from "./scopes.js";
 import { Shelf } from "./shelf.js";
 import { steer } from "./steer.js";
+import { Verdict } from "./verdict.js";
 import { Viewer } from "./viewer.js";
 
 const get = (id) => document.getElementById(id);
@@ -44,7 +45,6 @@ export const viewer = new Viewer({
   badge: get("badge"),
   statusText: get("status-text"),
   message: get("stage-message"),
-  warning: get("picture-warning"),
   sceneId: get("scene-id"),
   readout: get("readout"),
   time: get("time"),
@@ -85,6 +85,7 @@ new Scale(viewer, { canvas: get("picture"), box: get("scale") });
 new Legend(viewer, get("legend"));
 const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") });
 const drawers = new Drawers(get("tools"));
+const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
 let awaited = null;
@@ -120,6 +121,7 @@ async function report(id) {
     const found = await getReport(id);
     if (!isStill()) return;
     compare.know(id, found);
+    verdict.know(found);
     showReport(get("report"), id, found, sendMasks);
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");

@@ -196,7 +196,7 @@ export const DE = {
     "first_picture": "ERSTES BILD, noch kein Modell",
     "training": "TRAINING, Schritt {iteration}",
     "extrapolated": "EXTRAPOLIERT",
-    "current": "AKTUELL",
+    "current": "MODELL AKTUELL",
     "unconfirmed": "AUS DEM SPEICHER",
     "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein"
   },
@@ -237,6 +237,7 @@ export const DE = {
     "figures": "{width} × {height}; Millisekunden: Entpacken {decode}, Bewegung {deform}, Sortieren {sort}, Zeichnen {draw}. {gpu}"
   },
   "light": {
+    "why": "Warum: Bericht öffnen",
     "good": "Gut",
     "care": "Mit Vorsicht",
     "bad": "Nicht verlässlich",

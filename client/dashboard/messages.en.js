@@ -196,7 +196,7 @@ export const EN = {
     "first_picture": "FIRST PICTURE, not yet a model",
     "training": "TRAINING, iteration {iteration}",
     "extrapolated": "EXTRAPOLATED",
-    "current": "CURRENT",
+    "current": "MODEL UP TO DATE",
     "unconfirmed": "FROM MEMORY",
     "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile"
   },
@@ -237,6 +237,7 @@ export const EN = {
     "figures": "{width} × {height}; milliseconds: decoding {decode}, motion {deform}, sorting {sort}, drawing {draw}. {gpu}"
   },
   "light": {
+    "why": "Why: open the report",
     "good": "Good",
     "care": "With care",
     "bad": "Do not rely on it",

@@ -16,7 +16,7 @@ const FIRST_PICTURE = "first_picture";
 export class Screen {
   /**
    * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, status: HTMLElement, badge: HTMLElement,
-   *   statusText: HTMLElement, message: HTMLElement, warning: HTMLElement, sceneId: HTMLElement}} parts
+   *   statusText: HTMLElement, message: HTMLElement, sceneId: HTMLElement}} parts
    */
   constructor(parts) {
     Object.assign(this, parts);
@@ -90,14 +90,13 @@ export class Screen {
   #look() {
     const [state, badge, message] = this.#state();
     this.stage.dataset.state = this.status.dataset.state = state;
+    this.status.toggleAttribute("data-recorded", this.shown?.isRecorded === true);
     this.canvas.hidden = this.shown === null;
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
     setText(this.statusText, this.#text(state));
     setText(this.message, message);
     this.message.hidden = message === "";
-    setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));
-    this.warning.title = this.warning.textContent;
   }
 
   /** @returns {[string, string, string]} state, badge, message over the picture */

@@ -1,6 +1,6 @@
 // The view of one scene: at most one picture is under way; the newest wish comes next. The service draws, or this browser
 // once it has the scene. Now and then the service is asked: for the newest picture of a job that trains, else only whether
-// the scene is still there, which notices a purge and keeps CURRENT true.
+// the scene is still there, which notices a purge and keeps the status true.
 
 import { stillThere } from "./api.js";
 import { Clip } from "./clip.js";

@@ -238,6 +238,7 @@ class Site:
         scored: bool = True,
         model: TrainedScene | None = None,
         beside: Mapping[str, bytes] | None = None,
+        report: Report = REPORT_OF_THE_PAGE,
     ) -> str:
         """The job's scene; model and the files beside it: as they are stored, for those who read them."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
@@ -245,8 +246,7 @@ class Site:
             (folder / MANIFEST).write_text('{"files": {}}')
         else:
             save_scene(folder, model, beside)
-        report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
-        (folder / REPORT).write_text(report.model_dump_json())
+        (folder / REPORT).write_text((report if scored else first_report_of_the_page()).model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)
