@@ -14,7 +14,7 @@ const WEIGHTS = {
   "care": [
     "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "calibration_scaled", "camera_or_tissue", "colour_changes",
     "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "detail_lost",
-    "detail_missing", "eyes_out_of_step", "eyes_unlike", "few_frames", "first_picture", "frames_show_nothing",
+    "detail_missing", "enlarged", "eyes_out_of_step", "eyes_unlike", "few_frames", "first_picture", "frames_show_nothing",
     "frames_without_tissue",
     "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "light_flickers", "little_depth", "mask_gaps",
     "mask_levels", "masks_mark_nothing", "masks_unsure", "motion_guessed", "no_instrument_masked", "no_texture",

@@ -17,7 +17,7 @@ const RECORDED = "recorded";
 
 const GUESSES = ["pose_far", "time_outside_clip"];
 /** What a view itself says; all other notices are of its scene. */
-const OF_VIEW = [...GUESSES, "unseen", "hardly_seen"];
+const OF_VIEW = [...GUESSES, "unseen", "hardly_seen", "enlarged"];
 
 /** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
 async function askOnce(path, signal) {
