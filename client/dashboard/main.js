@@ -185,6 +185,7 @@ function showJobs() {
 }
 
 function showConnection(text, kind) {
+  if (kind === "good" && jobs.byId.has(viewer.scene)) viewer.screen.keepAlive();
   get("connection").textContent = text;
   get("connection").className = `pill ${kind}`;
 }
@@ -205,7 +206,7 @@ const list = new JobList(
     },
   },
 );
-const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "";
+const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "" || viewer.isKeptWaiting;
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);

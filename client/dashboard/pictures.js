@@ -8,7 +8,8 @@ import { Stream } from "./stream.js";
 /** @typedef {import("./stream.js").View} View */
 /** @typedef {import("./stream.js").Picture} Picture */
 
-const ANSWER_MS = 15000;
+/** Longer than the service waits for a worker (render_timeout_s). */
+const ANSWER_MS = 25000;
 const FIRST_RETRY_MS = 1000;
 const MAX_RETRY_MS = 15000;
 

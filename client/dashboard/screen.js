@@ -1,4 +1,4 @@
-// The picture and what it is worth. A picture is live only while the service keeps confirming it: whatever goes wrong, the
+// The picture and what it is worth. A picture is live only while the service keeps answering: whatever goes wrong, the
 // badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing. What this
 // browser draws from memory goes on without the service, and then says that nobody confirms it.
 
@@ -37,7 +37,7 @@ export class Screen {
   clear(scene, words) {
     this.scene = scene;
     this.shown = null;
-    this.confirmedAt = 0;
+    this.confirmedAt = this.aliveAt = 0;
     this.awaitedUntil = 0;
     this.trouble = "";
     this.words = words;
@@ -74,6 +74,12 @@ export class Screen {
     this.#look();
   }
 
+  /** The service has just said that it is well and knows what is shown: a picture that takes long is no silence. */
+  keepAlive() {
+    this.aliveAt = Date.now();
+    this.#look();
+  }
+
   /** @param {number} seconds until the service shows the next picture: it lives, and serves others first */
   waitFor(seconds) {
     this.awaitedUntil = Date.now() + seconds * 1000 + STALE_AFTER_MS;
@@ -104,7 +110,7 @@ export class Screen {
     if (this.scene === null) return ["none", "", this.words];
     if (this.shown === null) return ["waiting", words("screen.nothing"), this.words];
     const isOfMemory = this.shown.way === "memory";
-    const limit = this.confirmedAt + (isOfMemory ? UNCONFIRMED_AFTER_MS : STALE_AFTER_MS);
+    const limit = isOfMemory ? this.confirmedAt + UNCONFIRMED_AFTER_MS : Math.max(this.confirmedAt, this.aliveAt) + STALE_AFTER_MS;
     if (this.trouble || Date.now() > Math.max(limit, this.awaitedUntil)) {
       if (isOfMemory) return ["unconfirmed", words("screen.unconfirmed"), ""];
       const reason = this.trouble || words("screen.silent");

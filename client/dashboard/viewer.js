@@ -118,6 +118,11 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
+  /** Whether a picture takes so long that only other answers can tell whether the service is there. */
+  get isKeptWaiting() {
+    return this.isBusy && performance.now() - this.askedAt > AGAIN_MS;
+  }
+
   refresh() {
     const now = performance.now();
     this.isMoving = this.timeline.isPlaying || now - this.wishedAt < REST_MS;

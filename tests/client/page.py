@@ -182,13 +182,14 @@ class Site:
             probe.bind(("127.0.0.1", 0))
             port: int = probe.getsockname()[1]
         settings = Settings(data_dir=data_dir, port=port, dashboard_dir=DASHBOARD, min_free_bytes=0)
-        self._settings = settings.model_copy(update=changes)
+        self._settings = settings.model_copy(update={"render_timeout_s": 5.0, **changes})
         self.url = f"http://127.0.0.1:{port}"
         self.announce()
         self.start()
 
     def start(self) -> None:
-        app = create_app(self._settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
+        renderer = ZmqRenderer(self.queue, self._settings.render_timeout_s)
+        app = create_app(self._settings, self.queue, self.store, renderer)
         self._server = Server(app, self._settings)
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()

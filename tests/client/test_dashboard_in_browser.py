@@ -28,6 +28,8 @@ from tests.client.page import (
 from tests.client.words import say
 from worker.pace import MAX_SAVED_S, SHARE
 
+SLOW_S = 7.0
+"""Longer than a silence that makes a picture stale."""
 POINTS = "return document.querySelector(`#curve polyline.${arguments[0]}`)?.points ?? []"
 ACTIONS = "return [...document.querySelectorAll(`[data-job='${arguments[0]}'] button`)].map((b) => b.dataset.action)"
 
@@ -224,6 +226,29 @@ def test_what_was_never_seen_is_hatched_or_guessed_and_the_badge_knows(site: Sit
     assert "guesses shown" in page.view
     page.click("#guess")
     page.until_state("live")
+
+
+def test_a_picture_that_takes_long_is_not_stale_while_the_service_answers_otherwise(
+    driver: webdriver.Chrome, tmp_path: Path
+) -> None:
+    with site_at(tmp_path / "data", render_timeout_s=20.0) as site:
+        page = Page(driver, site.url)
+        page.open()
+        site.queued_job()
+        claim = site.claim()
+        site.train(claim, 10, 21.0)
+        page.press(claim.job_id, "Watch")
+        page.until_state("training")
+        site.painter.pause_s = SLOW_S
+        site.finish(claim, scored=False)
+        until_s, states = time.monotonic() + SLOW_S, set()
+        while time.monotonic() < until_s:
+            states.add(page.state)
+            time.sleep(0.1)
+        assert states == {"training"}
+        assert page.shade > 0
+        page.until_state("live")
+        driver.get("about:blank")
 
 
 def test_colours_are_shown_without_highlights_and_that_is_no_guess(site: Site, page: Page) -> None:
