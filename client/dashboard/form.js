@@ -36,8 +36,9 @@ export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
-   * @param {{onJob: (id: string) => void, onShare: (share: number | null) => void, onAsked: () => void}} told of the job
-   *   that was made; of the share that is sent, null at the end; that something is asked of the user
+   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined) => void, onShare: (share: number | null) => void,
+   *   onAsked: () => void}} told of the job that was made; that a clip is being sent; of the share that is sent, null at the
+   *   end; that something is asked of the user
    */
   constructor(parts, told) {
     Object.assign(this, parts, told);
@@ -213,6 +214,7 @@ export class ClipForm {
   /** @param {Sending} sending @param {Map<string, File>} files */
   async #run(sending, files) {
     this.#show(true);
+    this.onSend(files.get("clip") ?? files.get("left"));
     try {
       this.onJob(await sending.run(files));
       this.#startAnew();
@@ -232,6 +234,7 @@ export class ClipForm {
     sending.discard();
     this.resumed = null;
     this.#showSource();
+    this.onAsked();
   }
 
   /** Take up what a reload interrupted: what has not come of its files is asked for again. */

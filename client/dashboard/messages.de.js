@@ -171,10 +171,10 @@ export const DE = {
     "masks": "sucht Instrumente",
     "poses": "verfolgt das Endoskop",
     "motion": "verfolgt das Gewebe",
-    "fusion": "sammelt Punkte",
-    "start": "beginnt das Modell",
-    "calibrate": "probiert aus",
-    "compile": "bereitet das Programm vor",
+    "fusion": "wird vorbereitet",
+    "start": "wird vorbereitet",
+    "calibrate": "wird vorbereitet",
+    "compile": "wird vorbereitet",
     "train": "trainiert",
     "finish": "schließt ab",
     "score": "misst die Qualität",
@@ -188,18 +188,24 @@ export const DE = {
   },
   "screen": {
     "rendering": "Das Bild wird gezeichnet.",
-    "not_yet": "Das erste Bild kommt, wenn das Training beginnt.",
-    "nothing": "KEIN BILD",
+    "not_yet": "Das erste Bild kommt, während der Clip vorbereitet wird.",
+    "nothing": "NOCH KEIN BILD",
     "stale": "VERALTET",
     "stale_why": "Letztes Bild {time}. {reason} Verbindung wird gesucht.",
     "silent": "Der Dienst antwortet nicht.",
     "recorded": "AUFGEZEICHNET, Gefärbtes ist maskiert",
     "first_picture": "ERSTES BILD, noch kein Modell",
-    "training": "TRAINING, Schritt {iteration}",
+    "training": "WIRD BESSER",
     "extrapolated": "EXTRAPOLIERT",
     "current": "MODELL AKTUELL",
     "unconfirmed": "AUS DEM SPEICHER",
-    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein"
+    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein",
+    "own_clip": "IHR CLIP, noch kein Modell"
+  },
+  "waiting": {
+    "preview": "Das erste Bild Ihres Clips",
+    "share": "Wie viel getan ist",
+    "sending": "Wird gesendet"
   },
   "readout": {
     "service": "Dienst {ms} ms",
@@ -207,7 +213,8 @@ export const DE = {
     "unseen": "{share} % nie gesehen",
     "stream": "Datenstrom",
     "single": "einzelne Bilder",
-    "memory": "hier gezeichnet"
+    "memory": "hier gezeichnet",
+    "iteration": "Schritt {iteration}"
   },
   "way": {
     "here": "In diesem Browser gezeichnet",

@@ -171,10 +171,10 @@ export const EN = {
     "masks": "finding instruments",
     "poses": "following the endoscope",
     "motion": "following the tissue",
-    "fusion": "collecting points",
-    "start": "starting the model",
-    "calibrate": "trying out",
-    "compile": "preparing the program",
+    "fusion": "preparing",
+    "start": "preparing",
+    "calibrate": "preparing",
+    "compile": "preparing",
     "train": "training",
     "finish": "finishing",
     "score": "measuring the quality",
@@ -188,18 +188,24 @@ export const EN = {
   },
   "screen": {
     "rendering": "The picture is being drawn.",
-    "not_yet": "Its first picture comes when training begins.",
-    "nothing": "NO PICTURE",
+    "not_yet": "The first picture comes while the clip is being prepared.",
+    "nothing": "NO PICTURE YET",
     "stale": "STALE",
     "stale_why": "Last picture {time}. {reason} Reconnecting.",
     "silent": "The service does not answer.",
     "recorded": "RECORDED, what is coloured is masked",
     "first_picture": "FIRST PICTURE, not yet a model",
-    "training": "TRAINING, iteration {iteration}",
+    "training": "IMPROVING",
     "extrapolated": "EXTRAPOLATED",
     "current": "MODEL UP TO DATE",
     "unconfirmed": "FROM MEMORY",
-    "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile"
+    "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile",
+    "own_clip": "YOUR CLIP, not yet a model"
+  },
+  "waiting": {
+    "preview": "The first frame of your clip",
+    "share": "How much is done",
+    "sending": "Sending"
   },
   "readout": {
     "service": "service {ms} ms",
@@ -207,7 +213,8 @@ export const EN = {
     "unseen": "{share} % unseen",
     "stream": "stream",
     "single": "single pictures",
-    "memory": "drawn here"
+    "memory": "drawn here",
+    "iteration": "iteration {iteration}"
   },
   "way": {
     "here": "Drawn in this browser",

@@ -67,6 +67,12 @@ export class Screen {
     else this.confirm();
   }
 
+  /** @param {boolean} isCovered the user's own clip lies over whatever picture there is */
+  cover(isCovered) {
+    this.isCovered = isCovered;
+    this.#look();
+  }
+
   /** The service has just said that what is shown is there. */
   confirm() {
     this.confirmedAt = Date.now();
@@ -97,7 +103,7 @@ export class Screen {
     const [state, badge, message] = this.#state();
     this.stage.dataset.state = this.status.dataset.state = state;
     this.status.toggleAttribute("data-recorded", this.shown?.isRecorded === true);
-    this.canvas.hidden = this.shown === null;
+    this.canvas.hidden = this.shown === null || this.isCovered === true;
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
     setText(this.statusText, this.#text(state));
@@ -107,6 +113,7 @@ export class Screen {
 
   /** @returns {[string, string, string]} state, badge, message over the picture */
   #state() {
+    if (this.isCovered) return ["waiting", words("screen.own_clip"), ""];
     if (this.scene === null) return ["none", "", this.words];
     if (this.shown === null) return ["waiting", words("screen.nothing"), this.words];
     const isOfMemory = this.shown.way === "memory";
@@ -118,7 +125,7 @@ export class Screen {
     }
     if (this.shown.isRecorded) return ["live", words("screen.recorded"), ""];
     if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", words("screen.first_picture"), ""];
-    if (this.shown.state === "running") return ["training", words("screen.training", { iteration: this.shown.iteration }), ""];
+    if (this.shown.state === "running") return ["training", words("screen.training"), ""];
     return this.shown.isExtrapolated ? ["extrapolated", words("screen.extrapolated"), ""] : ["live", words("screen.current"), ""];
   }
 

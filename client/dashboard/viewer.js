@@ -290,9 +290,10 @@ export class Viewer extends EventTarget {
     const server = Number.isFinite(picture.totalMs) ? ` (${words("readout.service", { ms: figure(picture.totalMs) })})` : "";
     const { rate } = this.pace;
     const pace = rate >= 1 && this.timeline.isPlaying ? [words("readout.rate", { rate: figure(rate) })] : [];
+    const iteration = picture.iteration === null ? [] : [words("readout.iteration", { iteration: picture.iteration })];
     const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
     const took = `${figure(tookMs)} ms${server}`;
-    this.parts.readout.textContent = [name, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
+    this.parts.readout.textContent = [name, ...iteration, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
     this.#tellWay();
     this.way.tellFigures(pace, picture.camera);
   }

@@ -51,7 +51,7 @@ def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page)
     site.train(claim, 20, 24.0)
     page.until_text("#jobs", "training · 24.0 dB · about 20 s left")
     page.until_state("training")  # it opened by itself
-    assert "iteration 40" in page.text("#badge")
+    assert "iteration 40" in page.text("#readout")
     for iteration, psnr_db, psnr_right_db in ((40, 27.5, 24.0), (60, 28.5, 26.5)):
         site.train(claim, iteration, psnr_db, psnr_right_db)
         page.until_text("#jobs", f"{psnr_db} dB")
