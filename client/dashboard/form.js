@@ -13,6 +13,8 @@ const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
 const POSES = /\.(tum|txt|csv)$|(^|[^a-z])poses?[^a-z].*json$/i;
 const PICTURE = /\.png$/i;
 const UNAUTHORISED = 401;
+/** tests/client/draw_example.py draws it. */
+const EXAMPLE = ["stereo.webm", "calibration.json", "masks.zip"];
 
 /**
  * Which part of a clip each dropped file is, by its name; the user sees the guess in the pickers.
@@ -90,6 +92,15 @@ export class ClipForm {
     this.form.elements.masks.focus({ preventScroll: true });
   }
 
+  /** Send the clip that comes with the page. @param {string} label its name */
+  async sendExample(label) {
+    this.#startAnew();
+    const files = EXAMPLE.map(async (name) => new File([await (await fetch(`example/${name}`)).blob()], name));
+    this.take(await Promise.all(files));
+    this.form.elements.label.value = label;
+    await this.#send();
+  }
+
   #startAnew() {
     this.form.reset();
     this.earlier = null;
@@ -134,16 +145,20 @@ export class ClipForm {
     return this.earlier ? ["masks"] : PARTS;
   }
 
+  /** Files dropped anywhere on the page. */
   #takeDrops() {
+    const theatre = this.form.closest("main");
     const hold = (event, isOver) => {
       event.preventDefault(); // else the browser opens the file
-      this.form.classList.toggle("over", isOver && this.form.contains(event.target));
+      theatre.classList.toggle("dropping", isOver && this.isAllowed);
     };
     document.addEventListener("dragover", (event) => hold(event, true));
     document.addEventListener("dragleave", (event) => hold(event, false));
     document.addEventListener("drop", (event) => {
       hold(event, false);
-      if (this.isAllowed && this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
+      if (!this.isAllowed || event.dataTransfer.files.length === 0) return;
+      this.onAsked();
+      this.take([...event.dataTransfer.files]);
     });
   }
 

@@ -182,12 +182,32 @@ function offerMasks() {
   get("home").hidden = isOffered; // recorded frames are the endoscope's
 }
 
+let isOpened = false;
+
+/** Once the jobs are known: open the newest scene, if nothing else is wanted; without any, say how to come by one. */
+function openFirst() {
+  if (!jobs.isKnown) {
+    isOpened = false;
+    get("empty").hidden = true;
+    return;
+  }
+  const isIdle = viewer.scene === null && awaited === null && !form.isSending && !waiting.isOn;
+  if (!isOpened && isIdle) {
+    isOpened = true; // view() comes back here
+    const newest = jobs.newest.map((id) => jobs.byId.get(id)).find(({ state }) => state === "done" || state === "running");
+    if (newest) view(newest.id);
+    else if (jobs.newest.length > 0) drawers.open("library", false);
+  }
+  isOpened = true;
+  get("empty").hidden = !isIdle || viewer.scene !== null || jobs.byId.size > 0;
+}
+
 function showJobs() {
   scopes.refresh();
   form.allow(scopes);
   sceneImport.allow(scopes);
   jobs.awaited = announcer.pending;
-  announcer.refresh(jobs.byId, jobs.gone, viewer.scene);
+  announcer.refresh(jobs.byId, jobs.gone, awaited ?? viewer.scene);
   if (jobs.gone.has(awaited)) {
     awaited = null;
     waiting.end();
@@ -200,6 +220,7 @@ function showJobs() {
   const expected = jobs.byId.get(awaited);
   if (expected && expected.state !== "queued") view(expected.id);
   showProgress();
+  openFirst();
   const viewed = jobs.byId.get(viewer.scene);
   light.keep(viewer.timeline.isPlaying || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
@@ -273,6 +294,8 @@ const form = new ClipForm(
 const sceneImport = new SceneImport({ ask: get("import"), file: get("import-file"), message: get("jobs-message") }, expect);
 awaited = announcer.awaited; // of before a reload
 if (awaited) viewer.open(null, words("page.awaited"));
+get("empty-clip").addEventListener("click", () => drawers.open("drawer"));
+get("empty-example").addEventListener("click", () => form.sendExample(words("empty.name")));
 get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
@@ -301,4 +324,4 @@ onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
-if (!address.follow()) drawers.open("library", false);
+address.follow();

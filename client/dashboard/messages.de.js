@@ -207,6 +207,13 @@ export const DE = {
     "share": "Wie viel getan ist",
     "sending": "Wird gesendet"
   },
+  "empty": {
+    "what": "Aus dem Clip eines Stereo-Endoskops wird ein Modell des bewegten Gewebes, das Sie drehen, anhalten und messen können.",
+    "clip": "Clip wählen",
+    "example": "Beispiel ausprobieren",
+    "drop": "Oder ziehen Sie einen Clip und seine Kalibrierung irgendwo auf diese Seite.",
+    "name": "Beispiel, künstliches Gewebe"
+  },
   "readout": {
     "service": "Dienst {ms} ms",
     "rate": "{rate} Bilder/s",

@@ -207,6 +207,13 @@ export const EN = {
     "share": "How much is done",
     "sending": "Sending"
   },
+  "empty": {
+    "what": "A clip of a stereo endoscope becomes a model of the moving tissue that you can turn, stop and measure.",
+    "clip": "Choose a clip",
+    "example": "Try an example",
+    "drop": "Or drop a clip and its calibration anywhere on this page.",
+    "name": "Example, synthetic tissue"
+  },
   "readout": {
     "service": "service {ms} ms",
     "rate": "{rate} pictures/s",

@@ -102,6 +102,7 @@ export class Screen {
   #look() {
     const [state, badge, message] = this.#state();
     this.stage.dataset.state = this.status.dataset.state = state;
+    this.stage.toggleAttribute("data-empty", this.scene === null);
     this.status.toggleAttribute("data-recorded", this.shown?.isRecorded === true);
     this.canvas.hidden = this.shown === null || this.isCovered === true;
     setText(this.badge, badge);
