@@ -13,6 +13,8 @@ const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
 const POSES = /\.(tum|txt|csv)$|(^|[^a-z])poses?[^a-z].*json$/i;
 const PICTURE = /\.png$/i;
 const UNAUTHORISED = 401;
+/** tests/client/draw_example.py draws it. */
+const EXAMPLE = ["stereo.webm", "calibration.json", "masks.zip"];
 
 /**
  * Which part of a clip each dropped file is, by its name; the user sees the guess in the pickers.
@@ -36,8 +38,9 @@ export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
-   * @param {{onJob: (id: string) => void, onShare: (share: number | null) => void, onAsked: () => void}} told of the job
-   *   that was made; of the share that is sent, null at the end; that something is asked of the user
+   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined) => void, onShare: (share: number | null) => void,
+   *   onAsked: () => void}} told of the job that was made; that a clip is being sent; of the share that is sent, null at the
+   *   end; that something is asked of the user
    */
   constructor(parts, told) {
     Object.assign(this, parts, told);
@@ -89,6 +92,15 @@ export class ClipForm {
     this.form.elements.masks.focus({ preventScroll: true });
   }
 
+  /** Send the clip that comes with the page. @param {string} label its name */
+  async sendExample(label) {
+    this.#startAnew();
+    const files = EXAMPLE.map(async (name) => new File([await (await fetch(`example/${name}`)).blob()], name));
+    this.take(await Promise.all(files));
+    this.form.elements.label.value = label;
+    await this.#send();
+  }
+
   #startAnew() {
     this.form.reset();
     this.earlier = null;
@@ -133,16 +145,20 @@ export class ClipForm {
     return this.earlier ? ["masks"] : PARTS;
   }
 
+  /** Files dropped anywhere on the page. */
   #takeDrops() {
+    const theatre = this.form.closest("main");
     const hold = (event, isOver) => {
       event.preventDefault(); // else the browser opens the file
-      this.form.classList.toggle("over", isOver && this.form.contains(event.target));
+      theatre.classList.toggle("dropping", isOver && this.isAllowed);
     };
     document.addEventListener("dragover", (event) => hold(event, true));
     document.addEventListener("dragleave", (event) => hold(event, false));
     document.addEventListener("drop", (event) => {
       hold(event, false);
-      if (this.isAllowed && this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
+      if (!this.isAllowed || event.dataTransfer.files.length === 0) return;
+      this.onAsked();
+      this.take([...event.dataTransfer.files]);
     });
   }
 
@@ -213,6 +229,7 @@ export class ClipForm {
   /** @param {Sending} sending @param {Map<string, File>} files */
   async #run(sending, files) {
     this.#show(true);
+    this.onSend(files.get("clip") ?? files.get("left"));
     try {
       this.onJob(await sending.run(files));
       this.#startAnew();
@@ -232,6 +249,7 @@ export class ClipForm {
     sending.discard();
     this.resumed = null;
     this.#showSource();
+    this.onAsked();
   }
 
   /** Take up what a reload interrupted: what has not come of its files is asked for again. */

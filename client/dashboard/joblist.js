@@ -7,7 +7,7 @@ import { TimesLeft } from "./left.js";
 import { words } from "./messages.js";
 import { hush } from "./news.js";
 import { details, showProblem } from "./problem.js";
-import { progressOf } from "./progress.js";
+import { progressOf, shareOf } from "./progress.js";
 import { Thumbnails } from "./thumbnails.js";
 
 /** @typedef {import("./api.js").Job} Job */
@@ -87,7 +87,7 @@ export class JobList {
       this.rows.set(job.id, row);
     }
     row.words.textContent = progressOf(job, this.times);
-    row.bar.value = job.fraction ?? 0;
+    row.bar.value = shareOf(job);
     row.item.classList.toggle("chosen", job.id === chosen);
     if (job.id === chosen) row.item.setAttribute("aria-current", "true");
     else row.item.removeAttribute("aria-current");

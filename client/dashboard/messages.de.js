@@ -93,9 +93,10 @@ export const DE = {
     "time_too_short": "Die Zeit zum Trainieren war für diesen Clip zu kurz.",
     "training_score_low": "Das Modell sieht selbst in den gelernten Bildern deutlich anders aus.",
     "coarse": "Grob gezeichnet, um Zeit zu sparen.",
+    "enlarged": "So nah hat das Bild keine feineren Einzelheiten als der Clip.",
     "hardly_seen": "Das Endoskop hat diesen Teil kaum gesehen.",
     "highlights_unknown": "Glanzlichter lassen sich nicht ausblenden: Diese Szene wurde nur aus einem Auge gelernt.",
-    "pose_far": "Diese Ansicht liegt weit vom Endoskop entfernt: Das meiste ist geraten.",
+    "pose_far": "Diese Ansicht blickt weit neben dem Endoskop herein: Das meiste ist geraten.",
     "time_outside_clip": "Dieser Moment liegt außerhalb des Clips; der nächste wird gezeigt.",
     "first_picture": "Ein Moment des Clips, noch kein Modell.",
     "training_goes_on": "Das Training läuft noch; das Bild ändert sich weiter.",
@@ -171,10 +172,10 @@ export const DE = {
     "masks": "sucht Instrumente",
     "poses": "verfolgt das Endoskop",
     "motion": "verfolgt das Gewebe",
-    "fusion": "sammelt Punkte",
-    "start": "beginnt das Modell",
-    "calibrate": "probiert aus",
-    "compile": "bereitet das Programm vor",
+    "fusion": "wird vorbereitet",
+    "start": "wird vorbereitet",
+    "calibrate": "wird vorbereitet",
+    "compile": "wird vorbereitet",
     "train": "trainiert",
     "finish": "schließt ab",
     "score": "misst die Qualität",
@@ -188,18 +189,31 @@ export const DE = {
   },
   "screen": {
     "rendering": "Das Bild wird gezeichnet.",
-    "not_yet": "Das erste Bild kommt, wenn das Training beginnt.",
-    "nothing": "KEIN BILD",
+    "not_yet": "Das erste Bild kommt, während der Clip vorbereitet wird.",
+    "nothing": "NOCH KEIN BILD",
     "stale": "VERALTET",
     "stale_why": "Letztes Bild {time}. {reason} Verbindung wird gesucht.",
     "silent": "Der Dienst antwortet nicht.",
     "recorded": "AUFGEZEICHNET, Gefärbtes ist maskiert",
     "first_picture": "ERSTES BILD, noch kein Modell",
-    "training": "TRAINING, Schritt {iteration}",
+    "training": "WIRD BESSER",
     "extrapolated": "EXTRAPOLIERT",
-    "current": "AKTUELL",
+    "current": "MODELL AKTUELL",
     "unconfirmed": "AUS DEM SPEICHER",
-    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein"
+    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein",
+    "own_clip": "IHR CLIP, noch kein Modell"
+  },
+  "waiting": {
+    "preview": "Das erste Bild Ihres Clips",
+    "share": "Wie viel getan ist",
+    "sending": "Wird gesendet"
+  },
+  "empty": {
+    "what": "Aus dem Clip eines Stereo-Endoskops wird ein Modell des bewegten Gewebes, das Sie drehen, anhalten und messen können.",
+    "clip": "Clip wählen",
+    "example": "Beispiel ausprobieren",
+    "drop": "Oder ziehen Sie einen Clip und seine Kalibrierung irgendwo auf diese Seite.",
+    "name": "Beispiel, künstliches Gewebe"
   },
   "readout": {
     "service": "Dienst {ms} ms",
@@ -207,7 +221,8 @@ export const DE = {
     "unseen": "{share} % nie gesehen",
     "stream": "Datenstrom",
     "single": "einzelne Bilder",
-    "memory": "hier gezeichnet"
+    "memory": "hier gezeichnet",
+    "iteration": "Schritt {iteration}"
   },
   "way": {
     "here": "In diesem Browser gezeichnet",
@@ -238,6 +253,7 @@ export const DE = {
     "figures": "{width} × {height}; Millisekunden: Entpacken {decode}, Bewegung {deform}, Sortieren {sort}, Zeichnen {draw}. {gpu}"
   },
   "light": {
+    "why": "Warum: Bericht öffnen",
     "good": "Gut",
     "care": "Mit Vorsicht",
     "bad": "Nicht verlässlich",

@@ -182,13 +182,14 @@ class Site:
             probe.bind(("127.0.0.1", 0))
             port: int = probe.getsockname()[1]
         settings = Settings(data_dir=data_dir, port=port, dashboard_dir=DASHBOARD, min_free_bytes=0)
-        self._settings = settings.model_copy(update=changes)
+        self._settings = settings.model_copy(update={"render_timeout_s": 5.0, **changes})
         self.url = f"http://127.0.0.1:{port}"
         self.announce()
         self.start()
 
     def start(self) -> None:
-        app = create_app(self._settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
+        renderer = ZmqRenderer(self.queue, self._settings.render_timeout_s)
+        app = create_app(self._settings, self.queue, self.store, renderer)
         self._server = Server(app, self._settings)
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
@@ -238,6 +239,7 @@ class Site:
         scored: bool = True,
         model: TrainedScene | None = None,
         beside: Mapping[str, bytes] | None = None,
+        report: Report = REPORT_OF_THE_PAGE,
     ) -> str:
         """The job's scene; model and the files beside it: as they are stored, for those who read them."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
@@ -245,8 +247,7 @@ class Site:
             (folder / MANIFEST).write_text('{"files": {}}')
         else:
             save_scene(folder, model, beside)
-        report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
-        (folder / REPORT).write_text(report.model_dump_json())
+        (folder / REPORT).write_text((report if scored else first_report_of_the_page()).model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)

@@ -41,7 +41,7 @@ def test_recorded_frames_show_the_masks_while_a_job_trains_and_afterwards(site: 
         page.until(lambda: page.text("#badge").startswith("RECORDED") and page.shade == RECORDED_SHADE)
         assert page.view == "recorded, masks marked, 0.00 s"
     Select(page.find("#layer")).select_by_value("rgb")
-    page.until(lambda: page.text("#badge") == "CURRENT" and page.shade > RECORDED_SHADE)
+    page.until(lambda: page.text("#badge") == say("screen.current") and page.shade > RECORDED_SHADE)
 
 
 def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path: Path) -> None:

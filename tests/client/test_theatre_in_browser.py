@@ -195,7 +195,7 @@ def test_the_warning_of_this_view_is_read_before_those_of_its_scene_and_all_are_
             "orbit:30,0,1",
         )
         page.until_text("#picture-warning", say("notice.pose_far"))
-        whole = " ".join(say(f"notice.{code}") for code in (NoticeCode.POSE_FAR, *of_scene))
+        whole = " ".join(say(f"notice.{code}") for code in (NoticeCode.POSE_FAR, *of_scene, NoticeCode.UNCLASSIFIED))
         assert page.script("return document.querySelector('#picture-warning').textContent") == whole
         assert page.find("#picture-warning").get_attribute("title") == whole
         hidden = "const { scrollHeight, clientHeight } = document.querySelector('#picture-warning'); "

@@ -19,6 +19,7 @@ from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
 from tests.client.page import Page, Site, site_at
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of
+from tests.client.test_waiting_in_browser import BAR
 from tests.client.words import say
 from tests.service.test_check import RECTIFIED
 
@@ -172,6 +173,7 @@ def test_row_10_an_upload_goes_on_after_a_reload_at_half(site: Site, page: Page,
     names = [name for name, _ in entries]
     assert "/uploads" not in names  # it went on with the upload that there was
     assert not any("patient" in name for name in names)
+    page.show("drawer")
     page.until(lambda: page.find("#upload [type=submit]").is_displayed())
 
 
@@ -232,7 +234,7 @@ def test_a_job_that_was_watched_is_found_again_after_a_reload(site: Site, page: 
     claim = site.claim()
     site.train(claim, 20, 24.0)
     page.until_state("training")  # it opened by itself
-    page.until(lambda: page.script("return document.title") == "20 % · intrasplat")
+    page.until(lambda: page.script("return document.title") == f"{round(100 * page.script(BAR))} % · intrasplat")
     site.finish(claim)
     page.until_state("live")
     page.until(lambda: page.script("return document.title") == "intrasplat")
