@@ -14,6 +14,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from client.backup import add_backup
+from client.feeds import add_feeds
 from client.keys import add_keys
 from client.remote import add_remote
 from client.slicer.command import add_slicer
@@ -81,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     worker = "claim jobs from the queue of REDIS_URL and serve renders, until a signal ends it"
     commands.add_parser("worker", help=worker, add_help=False)
     add_remote(commands)
+    add_feeds(commands)
     add_slicer(commands)
     add_keys(commands)
     add_backup(commands)

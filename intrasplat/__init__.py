@@ -8,6 +8,8 @@
     scene.save("scene")
     scene = isp.load("scene")
     scene.export("scene.ply", t=0.4)
+    with isp.follow("rtsp://camera/stereo", calibration="calibration.json") as live:  # docs/live.md
+        view = live.view("-2.5", pose=isp.orbit(10, 0))  # of 2.5 s ago
 
 Units are mm, camera axes OpenCV's (x right, y down, z forward); model time t runs from 0 to 1 over the clip. A
 module is imported when its name is first used: torch is not loaded before. Research use only, not a medical device.
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
         TrainingDiverged,
         UnavailableError,
     )
+    from intrasplat.live.followed import LiveScene, follow
     from intrasplat.machine.hooks import Progress
     from intrasplat.notices import Notice
     from intrasplat.pose import orbit, parse_pose
@@ -48,6 +51,8 @@ _MODULES = {
     "reconstruct": "reconstruction",
     "load": "reconstruction",
     "Scene": "reconstruction",
+    "follow": "live.followed",
+    "LiveScene": "live.followed",
     "View": "view.frame",
     "rasterize": "splat.rasterize",
     "Rasterized": "splat.rasterize",
@@ -75,6 +80,7 @@ __all__ = [  # in the order in which they are used
     "IntrasplatError",
     "Intrinsics",
     "LimitError",
+    "LiveScene",
     "Notice",
     "Progress",
     "Rasterized",
@@ -85,6 +91,7 @@ __all__ = [  # in the order in which they are used
     "UnavailableError",
     "View",
     "__version__",
+    "follow",
     "load",
     "orbit",
     "parse_pose",

@@ -1,7 +1,7 @@
 """The `intrasplat` command.
 
-reconstruct, render, export, measure, evaluate, poses and doctor work on this machine without a service. The server (the
-distribution intrasplat-server) registers the other commands (intrasplat/server_parts.py).
+reconstruct, render, export, measure, live, evaluate, poses and doctor work on this machine without a service. The
+server (the distribution intrasplat-server) registers the other commands (intrasplat/server_parts.py).
 """
 
 from __future__ import annotations

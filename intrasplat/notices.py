@@ -127,6 +127,7 @@ class NoticeCode(StrEnum):
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
+    TIME_IN_GAP = "time_in_gap"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
     FIRST_PICTURE = "first_picture"
     TRAINING_GOES_ON = "training_goes_on"

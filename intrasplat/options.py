@@ -137,7 +137,7 @@ class JobOptions(ReconstructionOptions):
     )
 
 
-Options = TypeVar("Options", bound=ClipOptions)
+Options = TypeVar("Options", bound=BaseModel)
 
 
 def parse_options(model: type[Options], given: str | Mapping[str, object]) -> Options:

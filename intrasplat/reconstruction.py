@@ -13,7 +13,7 @@ import weakref
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,9 @@ from intrasplat.train.request import ReconstructionRequest
 from intrasplat.view.camera import camera_of, pose_of
 from intrasplat.view.frame import View
 from intrasplat.view.render import render_frame
+
+AnyPose: TypeAlias = MatrixPose | OrbitPose | NDArray[np.floating[Any]] | str | None
+"""What a caller may give as a pose."""
 
 
 class Scene:
@@ -96,7 +99,7 @@ class Scene:
     def render(
         self,
         t: float,
-        pose: MatrixPose | OrbitPose | NDArray[np.floating[Any]] | str | None = None,
+        pose: AnyPose = None,
         *,
         width: int | None = None,
         height: int | None = None,
@@ -136,27 +139,11 @@ class Scene:
         """
         if not np.isfinite(t):
             raise InputError("t", f"it is {t}.", "Give a number: 0 is the first frame, 1 the end of the clip.")
-        camera = intrinsics
-        if camera is None:
-            try:
-                wanted = IntrinsicsOverride(width=width, height=height)
-            except ValidationError as error:
-                first = error.errors()[0]
-                field, problem = str(first["loc"][0]), f"{first['input']} is not accepted: {first['msg']}."
-                raise InputError(field, problem, "Give 8 to 8192 pixels.") from error
-            camera = camera_of(self.intrinsics, wanted, MAX_RENDER_PIXELS)
-        world_from_camera = self._world_from_camera(pose)
+        camera = intrinsics or lens_of(self.trained, width, height)
         return render_frame(
-            self.trained, t, world_from_camera, camera, choose_device(self._device),
+            self.trained, t, world_from_camera_of(self.trained, pose), camera, choose_device(self._device),
             highlights=highlights, light=light, smoke=smoke, detail=detail,
         )  # fmt: skip
-
-    def _world_from_camera(self, pose: Any) -> NDArray[np.float64] | None:
-        if isinstance(pose, np.ndarray):
-            if pose.shape not in ((4, 4), (3, 4)):
-                raise InputError("pose", f"it is {list(pose.shape)}.", "Give [4, 4] world_from_camera in mm.")
-            pose = " ".join(repr(float(each)) for each in pose.ravel())
-        return pose_of(self.trained, parse_pose(pose) if isinstance(pose, str) else pose)
 
     def save(self, folder: FilePath) -> None:
         """Write the scene's files into a new or empty folder; `load` and the command line read them.
@@ -231,6 +218,26 @@ class Scene:
         finally:
             unfinished.unlink(missing_ok=True)
         return target
+
+
+def lens_of(scene: TrainedScene, width: int | None, height: int | None) -> Intrinsics:
+    """The scene's camera with these pixels; raises as Scene.render."""
+    try:
+        wanted = IntrinsicsOverride(width=width, height=height)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field, problem = str(first["loc"][0]), f"{first['input']} is not accepted: {first['msg']}."
+        raise InputError(field, problem, "Give 8 to 8192 pixels.") from error
+    return camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
+
+
+def world_from_camera_of(scene: TrainedScene, pose: AnyPose) -> NDArray[np.float64] | None:
+    """[4, 4] mm of a pose of Scene.render; None: the endoscope's."""
+    if isinstance(pose, np.ndarray):
+        if pose.shape not in ((4, 4), (3, 4)):
+            raise InputError("pose", f"it is {list(pose.shape)}.", "Give [4, 4] world_from_camera in mm.")
+        pose = " ".join(repr(float(each)) for each in pose.ravel())
+    return pose_of(scene, parse_pose(pose) if isinstance(pose, str) else pose)
 
 
 def reconstruct(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from contract.access.keys import ApiKey, KeyFile, KeyScope, needs_keys
 from contract.runtime.settings import Settings
+from contract.wire.feeds import FeedRecord
 from contract.wire.job import LOCAL_TENANT, JobRecord
 from intrasplat.errors import ErrorCode
 from service.limits import Limiter
@@ -55,8 +56,8 @@ class Caller:
             detail = f"This key lacks the scope {scope.value!r}."
             raise AccessRefusal(403, detail, remedy, address=self.address, caller=self)
 
-    def owns(self, record: JobRecord) -> bool:
-        """Whether the job belongs to the caller's tenant. If not, the caller gets the answer for a missing job."""
+    def owns(self, record: JobRecord | FeedRecord) -> bool:
+        """Whether the job or feed belongs to the caller's tenant. If not, it is answered as missing."""
         return record.tenant == self.tenant
 
 

@@ -17,6 +17,9 @@ from intrasplat.version import version
 from service import (
     check,
     exports,
+    feed_cut,
+    feed_push,
+    feeds,
     imports,
     jobs,
     measure,
@@ -59,7 +62,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
         background = (deps.sweep.run, deps.retention.run, deps.webhooks.run, renderer.run)
         tasks = [asyncio.create_task(_restart_on_error(run)) for run in background]
         yield
-        deps.feeds.end()
+        deps.end_channels()
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
@@ -83,7 +86,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     install_handlers(app)
     install_refusal_handler(app, deps.audit)
     scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
-    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, system):
+    for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, feed_cut, feed_push, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:
         app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")

@@ -1,4 +1,4 @@
-"""The bodies of POST /reconstruct and POST /scenes as /openapi.json describes them: schemas with names."""
+"""The bodies of POST /reconstruct, POST /scenes and /feeds as /openapi.json describes them: schemas with names."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from contract.wire.checks import DescribedClip
+from contract.wire.feeds import GivenCut
 from contract.wire.labels import Labels
 from contract.wire.webhooks import CALLBACK_ABOUT, CALLBACK_PART, MAX_CALLBACK_CHARACTERS
 from intrasplat.names import JOB_ID_PATTERN
@@ -74,13 +75,25 @@ SCENE_FORM["properties"] = {
     **{name: each for name, each in SCENE_FORM["properties"].items() if name != CLIP_OF},
 }
 
+FEED_FORM: dict[str, Any] = {
+    "title": "FeedForm",
+    "description": "A live feed to be opened.",
+    "type": "object",
+    "properties": {"calibration": _of_file("calibration"), "options": {"$ref": "#/components/schemas/FeedOptions"}},
+    "required": ["calibration"],
+    "additionalProperties": False,
+}
+
 BODIES: dict[str, dict[str, Any]] = {
     "ClipForm": _body("ClipForm", "A clip in one request", {part: _of_file(part) for part in PARTS}),
     "ClipOfUploads": _body(
         "ClipOfUploads", "A clip of finished uploads (POST /uploads)", {part: _of_upload(part) for part in PARTS}
     ),
-    **models_json_schema([(DescribedClip, "validation")], ref_template="#/components/schemas/{model}")[1]["$defs"],
+    **models_json_schema(
+        [(DescribedClip, "validation"), (GivenCut, "validation")], ref_template="#/components/schemas/{model}"
+    )[1]["$defs"],
     "SceneForm": SCENE_FORM,
+    "FeedForm": FEED_FORM,
 }
 """Schemas by name. They do not say which parts go together, because generators do not read conditions."""
 
@@ -92,6 +105,36 @@ SCENE_BODY: dict[str, Any] = {
         "content": {
             "multipart/form-data": {"schema": {"$ref": "#/components/schemas/SceneForm"}, "encoding": JSON_PARTS}
         },
+    }
+}
+FEED_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "the calibration, and where the video is; without options.source it is pushed",
+        "content": {
+            "multipart/form-data": {
+                "schema": {"$ref": "#/components/schemas/FeedForm"},
+                "encoding": {"options": {"contentType": "application/json"}},
+            }
+        },
+    }
+}
+CUT_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {"$ref": "#/components/schemas/GivenCut"},
+                "example": {"from": -30, "to": "live", "options": {"budget_s": 60}},
+            }
+        },
+    }
+}
+VIDEO_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "fragmented mp4, MPEG-TS or Matroska, for as long as it goes on",
+        "content": {"application/octet-stream": BINARY},
     }
 }
 REQUEST_BODY: dict[str, Any] = {

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeAlias
 
 import zmq
 import zmq.asyncio
@@ -17,7 +18,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from contract.access.render_keys import service_keys, worker_keys
 from contract.runtime import traces
-from contract.wire.rendering import CancelRequest, SceneRequest, WorkerReply, WorkerRequest
+from contract.wire.rendering import CancelRequest, FeedRequest, SceneRequest, WorkerReply, WorkerRequest
 from intrasplat.errors import UnavailableError
 
 CONNECT_TIMEOUT_S = 2.0
@@ -31,6 +32,8 @@ HEARTBEAT_MS, SILENCE_MS = 2000, 6000
 UP = zmq.Event.HANDSHAKE_SUCCEEDED
 DOWN = zmq.Event.DISCONNECTED | zmq.Event.CONNECT_RETRIED
 REFUSED = zmq.Event.HANDSHAKE_FAILED_AUTH | zmq.Event.HANDSHAKE_FAILED_PROTOCOL | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+
+AnyRequest: TypeAlias = SceneRequest | FeedRequest
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -84,8 +87,9 @@ class Connection:
         self._socket.connect(endpoint)
         self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._watch())]
 
-    async def ask(self, request: SceneRequest, *, patiently: bool = True) -> Answer:
-        """The worker's answer. patiently: wait a moment for a worker that is down, because there is no other.
+    async def ask(self, request: AnyRequest, body: bytes | None = None, *, patiently: bool = True) -> Answer:
+        """The worker's answer. body: of a PushRequest. patiently: wait a moment for a worker that is down, because
+        there is no other.
 
         The worker gets all requests at once and chooses their order. Cancelling this call cancels the request.
 
@@ -99,7 +103,7 @@ class Connection:
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[request_id] = future
         try:
-            await self._socket.send_multipart([request_id, document])
+            await self._socket.send_multipart([request_id, document, *([] if body is None else [body])])
             return await future
         except asyncio.CancelledError:
             task = asyncio.create_task(self._cancel(request_id))

@@ -17,13 +17,18 @@ from starlette.requests import HTTPConnection
 from contract.access.audit import AuditLog
 from contract.queue.interface import Queue
 from contract.runtime.settings import Settings
+from contract.store.feed_files import FeedFiles
 from contract.store.shelf import is_job_id
 from contract.store.store import Store
+from contract.wire.feeds import FeedRecord
 from contract.wire.job import JobRecord
 from service.access import Access, AccessRefusal, Caller, key_missing
 from service.audit import Audit
 from service.done import DoneJobs
-from service.events import Feeds
+from service.events import JobChannels
+from service.feed_events import FeedChannels
+from service.feed_records import FeedRecords
+from service.followed import FollowedFeeds
 from service.intake import Intake
 from service.limits import Limiter
 from service.metrics import Metrics
@@ -58,12 +63,22 @@ class Deps:
         # uploads, events and webhooks of jobs, removal
         self.intake = Intake(settings, store)
         self.sweep = Sweep(queue, store)
-        self.feeds = Feeds(queue)
+        self.job_channels = JobChannels(queue)
         self.webhooks = Webhooks(settings, queue)
         self.questions = Questions()
         self.done = DoneJobs(queue, store, self.questions)
         self.purger = Purger(queue, store, self.audit, self.done)
+        # live feeds
+        self.feed_channels = FeedChannels(queue)
+        self.feed_files = FeedFiles(settings.data_dir)
+        self.feeds = FeedRecords(queue, self.questions)
+        self.followed = FollowedFeeds()
         self.retention = Retention(settings, queue, store, self.purger)
+
+    def end_channels(self) -> None:
+        """End all streams of events. May be called from a signal handler."""
+        self.job_channels.end()
+        self.feed_channels.end()
 
 
 def _deps_of(connection: HTTPConnection) -> Deps:
@@ -123,13 +138,22 @@ def owned_scene(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
     raise no_such_scene(scene_id, caller, record)
 
 
-def no_such_scene(scene_id: str, caller: Caller, record: JobRecord | None) -> Problem:
+def owned_feed(services: Deps, caller: Caller, feed_id: str) -> FeedRecord:
+    """As owned_job(), for a live feed, as the queue has it now."""
+    record = services.queue.feed(feed_id) if is_job_id(feed_id) else None
+    if record is not None and caller.owns(record):
+        return record
+    raise not_found(f"There is no feed {feed_id[:40]!r}.", "feed_id", "GET /feeds lists what there is.", caller, record)
+
+
+def no_such_scene(scene_id: str, caller: Caller, record: JobRecord | FeedRecord | None) -> Problem:
     """not_found() of a scene."""
     return not_found(f"There is no scene {scene_id[:40]!r}.", "scene", SCENES_REMEDY, caller, record)
 
 
-def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobRecord | None) -> Problem:
+def not_found(detail: str, field: str, remedy: str, caller: Caller, record: JobRecord | FeedRecord | None) -> Problem:
     """The same 404 for what does not exist and for what is another tenant's; the audit log records only the latter."""
     if record is None:
         return Problem(404, detail, field=field, remedy=remedy)
-    return AccessRefusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=record.job_id)
+    owned_id = record.feed_id if isinstance(record, FeedRecord) else record.job_id
+    return AccessRefusal(404, detail, remedy, field=field, address=caller.address, caller=caller, job_id=owned_id)

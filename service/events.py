@@ -1,7 +1,7 @@
-"""Server-sent events for each change of a job, from the queue's own stream of changes.
+"""Server-sent events for each change of a job or a live feed.
 
-One poller per watched job reads the queue, however many callers listen. All callers read the same list of the last
-MAX_EVENTS changes, each at its own pace, so a slow caller costs no memory and delays nobody.
+One poller for each of them that is watched reads the queue, however many callers listen. All callers read the same list
+of the last MAX_EVENTS changes, each at its own pace, so a slow caller costs no memory and delays nobody.
 """
 
 from __future__ import annotations
@@ -9,15 +9,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fastapi.sse import format_sse_event
 from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import MAX_EVENTS, Queue, event_order
-from contract.wire.job import TERMINAL_STATES, Forecast, JobRecord, JobState, JobView
+from contract.wire.job import TERMINAL_STATES, Forecast, JobRecord, JobView
 from intrasplat.errors import UnavailableError
 
 POLL_PERIOD_S = 0.4
@@ -39,34 +41,34 @@ class Entry:
     """One message to the listeners. number None: it is not an event of the queue, such as a new forecast."""
 
     number: str | None
-    state: JobState
     data: str
+    is_last: bool = False
 
 
-class Feed:
-    """The last changes of one job. count: how many there have been in total; changed: set at the next one."""
+class Channel:
+    """The last changes of one job or feed. count: how many there have been in total; changed: set at the next one."""
 
-    def __init__(self, job_id: str) -> None:
-        self.job_id = job_id
+    def __init__(self, watched_id: str, most_entries: int = MAX_EVENTS) -> None:
+        self.watched_id = watched_id
         self.listeners = 0
         self.count = 0
         self.is_over = False
         self.changed = asyncio.Event()
-        self._entries: deque[Entry] = deque(maxlen=MAX_EVENTS)
+        self._entries: deque[Entry] = deque(maxlen=most_entries)
 
     @property
     def newest(self) -> Entry | None:
         """The last entry."""
         return self._entries[-1] if self._entries else None
 
-    def add(self, record: JobRecord, number: str | None = None, forecast: Forecast | None = None) -> None:
-        """Send the job's present state to the listeners."""
-        self._entries.append(Entry(number, record.state, JobView.of(record, forecast).model_dump_json()))
+    def add(self, entry: Entry) -> None:
+        """Send an entry to the listeners."""
+        self._entries.append(entry)
         self.count += 1
         self.wake()
 
     def end(self) -> None:
-        """Mark the feed as ended."""
+        """Mark the channel as ended."""
         self.is_over = True
         self.wake()
 
@@ -88,12 +90,17 @@ class Feed:
         return self.count - len(self._entries)
 
 
-class Feeds:
-    """The feeds that have listeners, with their pollers."""
+class Channels(ABC):
+    """The channels that have listeners, with their pollers."""
+
+    event: ClassVar[str]
+    """The type of their events."""
+    most_entries: ClassVar[int] = MAX_EVENTS
+    """Entries that a channel stores for listeners that read slowly or come late."""
 
     def __init__(self, queue: Queue) -> None:
         self._queue = queue
-        self._feeds: dict[str, Feed] = {}
+        self._channels: dict[str, Channel] = {}
         self._pollers: dict[str, asyncio.Task[None]] = {}
         self._is_ending = False
 
@@ -101,22 +108,22 @@ class Feeds:
         """End all streams within a poll's period. May be called from a signal handler."""
         self._is_ending = True
 
-    async def stream(self, job_id: str, after: EventOrder) -> AsyncIterator[bytes]:
-        """The events after `after` and all later ones until the job's end, encoded for text/event-stream."""
+    async def stream(self, watched_id: str, after: EventOrder = NOTHING_SEEN) -> AsyncIterator[bytes]:
+        """The events after `after` and all later ones until the end, encoded for text/event-stream."""
         ends_at_s = time.monotonic() + STREAM_S
-        with self._listening(job_id) as feed:
+        with self._listening(watched_id) as channel:
             yield format_sse_event(retry=RETRY_MS)
-            while not (feed.count or feed.is_over):
-                await feed.changed.wait()
-            seen = feed.seen_at(after)
+            while not (channel.count or channel.is_over):
+                await channel.changed.wait()
+            seen = channel.seen_at(after)
             while True:
-                changed = feed.changed
-                for entry in feed.since(seen):
-                    yield format_sse_event(event="job", id=entry.number, data_str=entry.data)
-                seen = feed.count
-                newest = feed.newest
-                has_ended = newest is not None and newest.state in TERMINAL_STATES
-                if feed.is_over or has_ended or time.monotonic() > ends_at_s:
+                changed = channel.changed
+                for entry in channel.since(seen):
+                    yield format_sse_event(event=self.event, id=entry.number, data_str=entry.data)
+                seen = channel.count
+                newest = channel.newest
+                has_ended = newest is not None and newest.is_last
+                if channel.is_over or has_ended or time.monotonic() > ends_at_s:
                     return
                 try:
                     async with asyncio.timeout(HEARTBEAT_S):
@@ -125,44 +132,68 @@ class Feeds:
                     yield format_sse_event(comment="still here")
 
     @contextlib.contextmanager
-    def _listening(self, job_id: str) -> Iterator[Feed]:
-        feed = self._feeds.get(job_id)
-        if feed is None:
-            feed = self._feeds[job_id] = Feed(job_id)
-            self._pollers[job_id] = asyncio.create_task(self._poll(feed))
-        feed.listeners += 1
+    def _listening(self, watched_id: str) -> Iterator[Channel]:
+        channel = self._channels.get(watched_id)
+        if channel is None:
+            channel = self._channels[watched_id] = Channel(watched_id, self.most_entries)
+            self._pollers[watched_id] = asyncio.create_task(self._poll_until_over(channel))
+        channel.listeners += 1
         try:
-            yield feed
+            yield channel
         finally:
-            feed.listeners -= 1
-            if feed.listeners == 0:
-                self._pollers.pop(job_id).cancel()
-                del self._feeds[job_id]
+            channel.listeners -= 1
+            if channel.listeners == 0:
+                self._pollers.pop(watched_id).cancel()
+                del self._channels[watched_id]
 
-    async def _poll(self, feed: Feed) -> None:
-        after, looked_at_s, forecast = "0", 0.0, None
-        while not (feed.is_over or self._is_ending):
+    async def _poll_until_over(self, channel: Channel) -> None:
+        poll = self._poller(channel)
+        while not (channel.is_over or self._is_ending):
             with contextlib.suppress(UnavailableError):  # the listeners get the changes when the queue is back
-                for event in await run_in_threadpool(self._queue.events, feed.job_id, after):
-                    feed.add(event.record, event.number)
-                    after, forecast = event.number, None
-                if time.monotonic() >= looked_at_s + LOOK_PERIOD_S:
-                    forecast = await self._look(feed, forecast)
-                    looked_at_s = time.monotonic()
+                await poll()
             await asyncio.sleep(POLL_PERIOD_S)
-        feed.end()
+        channel.end()
 
-    async def _look(self, feed: Feed, sent: Forecast | None) -> Forecast | None:
+    @abstractmethod
+    def _poller(self, channel: Channel) -> Callable[[], Awaitable[None]]:
+        """A function that adds the news to the channel, called every POLL_PERIOD_S; it may raise UnavailableError."""
+
+
+class JobChannels(Channels):
+    """The changes of jobs, from the queue's own stream of them."""
+
+    event = "job"
+
+    def _poller(self, channel: Channel) -> Callable[[], Awaitable[None]]:
+        after, looked_at_s, forecast = "0", 0.0, None
+
+        async def poll() -> None:
+            nonlocal after, looked_at_s, forecast
+            for event in await run_in_threadpool(self._queue.events, channel.watched_id, after):
+                channel.add(_entry_of(event.record, event.number))
+                after, forecast = event.number, None
+            if time.monotonic() >= looked_at_s + LOOK_PERIOD_S:
+                forecast = await self._look(channel, forecast)
+                looked_at_s = time.monotonic()
+
+        return poll
+
+    async def _look(self, channel: Channel, sent: Forecast | None) -> Forecast | None:
         """Send a changed position in the queue, and a job without events. Returns the forecast that was sent last."""
-        record = await run_in_threadpool(self._queue.get, feed.job_id)
+        record = await run_in_threadpool(self._queue.get, channel.watched_id)
         if record is None:
-            feed.end()
+            channel.end()
             return None
         if record.state in TERMINAL_STATES:
-            if feed.newest is None:  # the job was restored after the queue had lost it
-                feed.add(record)
+            if channel.newest is None:  # the job was restored after the queue had lost it
+                channel.add(_entry_of(record))
             return None
-        forecast = await run_in_threadpool(self._queue.forecast, feed.job_id)
+        forecast = await run_in_threadpool(self._queue.forecast, channel.watched_id)
         if sent is None or forecast.position != sent.position:
-            feed.add(record, forecast=forecast)
+            channel.add(_entry_of(record, forecast=forecast))
         return forecast
+
+
+def _entry_of(record: JobRecord, number: str | None = None, forecast: Forecast | None = None) -> Entry:
+    data = JobView.of(record, forecast).model_dump_json()
+    return Entry(number, data, is_last=record.state in TERMINAL_STATES)

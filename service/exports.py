@@ -16,7 +16,7 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
-from contract.wire.rendering import ExportRequest
+from contract.wire.rendering import CutRequest, ExportRequest
 from intrasplat.errors import UnavailableError
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
 from intrasplat.scene.stored_exports import stored_parts
@@ -24,8 +24,10 @@ from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
+from service.moments import AskedTime, moment_of, scene_time
 from service.renders import image_response, problem_of_reply
-from service.scenes import finished_job
+from service.scenes import find_finished, finished_job
+from service.shown import Shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -43,6 +45,7 @@ class ExportQuery(ExportOptions):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    t: AskedTime = None  # type: ignore[assignment]
     format: str = Field(
         default="ply",
         max_length=32,
@@ -67,31 +70,44 @@ async def export_scene(
 ) -> Response:
     """The scene as a file in one of many formats (docs/export.md). Long ones are sent while they are made.
 
+    Of a live feed it is the part of its past that shows the moment t.
+
     An export that fails after its first bytes is cut off, so that its transfer is not complete.
     """
-    options = check_export(query.format, query.model_dump(exclude={"format"}))
-    if EXPORT_FORMATS[query.format].is_stored:
+    if query.format in EXPORT_FORMATS and EXPORT_FORMATS[query.format].is_stored:
+        check_export(query.format, query.model_dump(exclude={"format"}))
         return await _stored(scene_id, query.format, services, caller)
-    caller.require(KeyScope.VIEW)
-    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    shown = await find_finished(services, caller, scene_id)
+    request = _request_of(shown, query)
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
-    request = ExportRequest(
-        scene_id=scene_id,
-        attempt=record.attempt,
-        format=query.format,
-        options=options,
-        export_id=uuid.uuid4().hex,
-    )
     first, part, until_s = await services.renderer.ask(request), 0, time.monotonic() + FIRST_BYTES_S
     while first.head.error is None and first.head.more and not first.body and time.monotonic() < until_s:
         part += 1
-        first = await _part(services, request.model_copy(update={"part": part}), first.worker)
+        first = await next_part(services, request.model_copy(update={"part": part}), first.worker)
     response = image_response(scene_id, first)
     if first.head.more:
         head = {name: value for name, value in response.headers.items() if name != "content-length"}
         response = StreamingResponse(_parts(services, request, first, part), headers=head)
     response.headers["Content-Disposition"] = _disposition(scene_id, query.format)
     return response
+
+
+def _request_of(shown: Shown, query: ExportQuery) -> ExportRequest:
+    """The request to the worker.
+
+    Raises:
+        InputError: there is no such format, or an option does not fit it.
+    """
+    given = query.model_dump(exclude={"format", "t"})
+    asked = None if query.t is None or shown.is_feed else scene_time(query.t)
+    return ExportRequest(
+        scene_id=shown.scene_id,
+        attempt=shown.attempt or 0,
+        moment=moment_of(query.t) if shown.is_feed else None,
+        format=query.format,
+        options=check_export(query.format, given | {"t": asked}),
+        export_id=uuid.uuid4().hex,
+    )
 
 
 async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> Response:
@@ -121,14 +137,14 @@ async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: i
         if time.monotonic() > until_s:
             raise UnavailableError(f"The export took more than {MAX_EXPORT_S:g} s.", "Ask for fewer frames.")
         part += 1
-        answer = await _part(services, request.model_copy(update={"part": part}), answer.worker)
+        answer = await next_part(services, request.model_copy(update={"part": part}), answer.worker)
         if answer.head.error is not None:
             logger.warning("an export was cut off: %s", answer.head.error.kind)
             raise problem_of_reply(answer.head.error)
         yield answer.body
 
 
-async def _part(services: Deps, request: ExportRequest, worker: str | None) -> Answer:
+async def next_part(services: Deps, request: ExportRequest | CutRequest, worker: str | None) -> Answer:
     """The answer of the worker, waiting while it is busy.
 
     Raises:

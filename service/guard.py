@@ -38,14 +38,14 @@ EXPOSED_HEADERS = (
         f"X-Intrasplat-{name}"
         for name in (
             *("Scene", "State", "Next", "T", "Iteration", "Unseen", "Detail", "Camera"),
-            *("Depth-Unit", "Depth-Range-Mm", "Warning", "Warning-Codes"),
+            *("Depth-Unit", "Depth-Range-Mm", "Warning", "Warning-Codes", "Captured-At", "Age-S", "Source-S"),
         )
     ),
 )
 """The response headers that a page of another origin may read."""
 FOREIGN_SITES = frozenset({"cross-site", "same-site"})
 """Values of Sec-Fetch-Site for a request of another page; browsers send no Origin for images. Links are allowed."""
-CORS_METHODS = ("GET", "HEAD", "POST", "PATCH", "DELETE")
+CORS_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 
 
 class Guard:

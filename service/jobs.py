@@ -162,7 +162,7 @@ async def watch_job(
         missed = await run_in_threadpool(services.queue.events, job_id, last_event_id)
         if not missed:
             return Response(status_code=204)  # a browser does not reconnect after 204
-    return EventSourceResponse(services.feeds.stream(job_id, after), headers=STREAM_HEADERS)
+    return EventSourceResponse(services.job_channels.stream(job_id, after), headers=STREAM_HEADERS)
 
 
 def _view(services: Deps, record: JobRecord, response: Response) -> JobView:

@@ -6,14 +6,12 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from pydantic import ConfigDict, Field
-from starlette.concurrency import run_in_threadpool
 
-from contract.access.keys import KeyScope
 from contract.wire.rendering import MeasureRequest
 from intrasplat.measuring import MAX_POINTS, Measurement, parse_points
 from service.deps import AnyCaller, Services
 from service.renders import ViewQuery, image_response
-from service.scenes import finished_job
+from service.scenes import find_finished
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -39,13 +37,12 @@ async def measure(
     tissue carries along, at every frame. Where the confidence is low or no frame saw the tissue, nothing is measured,
     and `refusal` says why. Research use only.
     """
-    caller.require(KeyScope.VIEW)
-    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    shown = await find_finished(services, caller, scene_id)
     await services.audit.viewed(caller, scene_id)
     request = MeasureRequest(
         scene_id=scene_id,
-        attempt=record.attempt,
-        t=query.t,
+        attempt=shown.attempt or 0,
+        **shown.time_fields(query.t),
         pose=query.asked_pose,
         camera=query.camera,
         points=parse_points(query.points),

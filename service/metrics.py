@@ -1,4 +1,5 @@
-"""GET /metrics for Prometheus. Labels are routes, states and devices: never a tenant, an id or a name."""
+"""GET /metrics for Prometheus. Labels are routes, states and devices: never a tenant, a name, or an id, but the first
+characters of a live feed's."""
 
 from __future__ import annotations
 
@@ -21,10 +22,11 @@ from contract.store.store import Store
 from contract.wire.webhooks import DeliveryStatus
 from intrasplat.errors import UnavailableError
 from intrasplat.version import version
+from service.feed_metrics import of_feeds
 
 NO_ROUTE = "none"
 """The label of the page's files and of unknown paths. Callers choose paths, so a path is never a label."""
-METHODS = frozenset({"GET", "HEAD", "POST", "PATCH", "DELETE", "OPTIONS"})
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 DURATIONS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, 60.0, 600.0)
 RENDER_DURATIONS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 5.0)
 REASONS = {
@@ -75,6 +77,7 @@ class Metrics:
             registry=registry,
         )
         self.streams = Gauge("intrasplat_streams", "Open WebSockets on /stream.", registry=registry)
+        self.pushes = Gauge("intrasplat_feed_pushes", "Open connections that push a feed's video.", registry=registry)
 
     def exposition(self) -> bytes:
         """All figures in Prometheus' text format. Reads queue and disk."""
@@ -153,6 +156,7 @@ class _QueueCollector(Collector):
         """The figures; for an unreachable queue or disk, only that it is unreachable."""
         try:
             yield from self._of_queue()
+            yield from of_feeds(self._queue.feeds(), time.time())
             yield GaugeMetricFamily("intrasplat_queue_up", "Whether the queue answers.", 1)
         except UnavailableError:
             yield GaugeMetricFamily("intrasplat_queue_up", "Whether the queue answers.", 0)
@@ -170,7 +174,9 @@ class _QueueCollector(Collector):
         for state, count in figures.ended.items():
             ended.add_metric((state.value,), count)
         live = GaugeMetricFamily("intrasplat_workers", "Live workers.", labels=("device", "trains"))
-        kinds = collections.Counter((worker.device, "no" if worker.renders_only else "yes") for worker in workers)
+        kinds = collections.Counter(
+            (worker.device, "no" if worker.renders_only else "yes") for worker in workers if worker.feed_id is None
+        )
         for kind, count in sorted(kinds.items()):
             live.add_metric(kind, count)
         webhooks = CounterMetricFamily("intrasplat_webhooks", "Webhooks delivered and given up.", labels=("status",))

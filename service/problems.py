@@ -12,6 +12,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocketState
 
+from contract.queue.feeds import FeedsFullError
 from contract.queue.interface import QueueFullError
 from intrasplat.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
 from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
@@ -126,6 +127,8 @@ def problem_of(error: Exception) -> Problem | None:
             return Problem(404, str(error), field="scene", remedy=SCENES_REMEDY)
         case QueueFullError():
             return Problem(429 if error.tenant else 503, error.problem, field="queue", remedy=error.remedy)
+        case FeedsFullError():
+            return Problem(429 if error.tenant else 503, error.problem, field="feeds", remedy=error.remedy)
         case StoreFullError():
             return disk_full(error.problem, error.remedy)
         case UnavailableError():

@@ -59,8 +59,9 @@ IdempotencyKey = Annotated[
 ]
 
 
-Accept: TypeAlias = Callable[[Deps, Caller, str, Received, str | None], JobRecord]
-"""Creates a job: (services, caller, job id, received parts, hash of the idempotency key) -> record."""
+Record = TypeVar("Record")
+Accept: TypeAlias = Callable[[Deps, Caller, str, Received, str | None], Record]
+"""Creates a job or feed: (services, caller, id, received parts, hash of the idempotency key) -> record."""
 
 
 class Submission(BaseModel):
@@ -97,7 +98,7 @@ async def reconstruct(
         submission = await read_json(request, services, Submission, MAX_SUBMISSION_BYTES, JSON_REMEDY)
         record = await run_in_threadpool(_accept_uploads, services, caller, submission, key)
     else:
-        record = await receive_form(request, services, caller, key, _accept)
+        record = await receive_form(request, services, caller, key, accept_clip)
     response.headers["Location"] = f"/jobs/{record.job_id}"
     response.headers["Retry-After"] = str(RETRY_AFTER_S)
     return JobView.of(record, await run_in_threadpool(forecast_of, services, record))
@@ -117,9 +118,9 @@ def forecast_of(services: Deps, record: JobRecord) -> Forecast | None:
 
 
 async def receive_form(
-    request: Request, services: Deps, caller: Caller, key: str | None, accept: Accept, form: Form = CLIP_FORM
-) -> JobRecord:
-    """Receive a multipart request and return the job that `accept` creates from it."""
+    request: Request, services: Deps, caller: Caller, key: str | None, accept: Accept[Record], form: Form = CLIP_FORM
+) -> Record:
+    """Receive a multipart request and return what `accept` creates from it."""
     store, settings = services.store, services.settings
     with services.intake.slot(caller.tenant, declared_length(request), form.main_part) as slot:
         job_id = new_job_id()
@@ -200,7 +201,7 @@ def _make_job_of(
         if received.total_bytes > services.settings.max_upload_bytes:
             problem = f"all files together have {received.total_bytes} bytes, more than an upload may have."
             raise LimitError("clip", problem, LIMIT_REMEDY)
-        record = _accept(services, caller, job_id, received, key)
+        record = accept_clip(services, caller, job_id, received, key)
     except Problem as problem:
         if "job_id" in problem.extensions:  # the clip is in the spool despite the error
             _assign(partials, job_id)
@@ -259,7 +260,7 @@ def _assign(partials: Mapping[str, Partial], job_id: str) -> None:
         partial.assign_to(job_id)
 
 
-def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
+def accept_clip(services: Deps, caller: Caller, job_id: str, received: Received, key: str | None) -> JobRecord:
     """Spool first, then enqueue: a job exists only for a clip that is on disk."""
     options = parse_options(JobOptions, received.options)
     check_retention(options, services.settings)

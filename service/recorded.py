@@ -14,7 +14,9 @@ from intrasplat.scene.recorded_file import MASK, PICTURE, read_frame
 from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
-from service.renders import ModelTime, find_shown, image_response
+from service.moments import AskedTime
+from service.renders import FEED_HEADERS, image_response
+from service.shown import find_shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -31,22 +33,28 @@ Masks = Annotated[
     "/{scene_id}/recorded",
     operation_id="get_recorded",
     response_class=Response,
-    responses={200: {"description": "the frame", "content": {"image/jpeg": BINARY, "image/png": BINARY}}},
+    responses={
+        200: {
+            "description": "the frame",
+            "content": {"image/jpeg": BINARY, "image/png": BINARY},
+            "headers": FEED_HEADERS,
+        }
+    },
 )
 async def get_recorded(
     scene_id: str,
     services: Services,
     caller: AnyCaller,
-    t: ModelTime = 0.0,
+    t: Annotated[AskedTime, Query()] = None,
     eye: OfEye = "left",
     masks: Masks = RecordedMasks.MARKED,
 ) -> Response:
-    """The recorded frame nearest to t as the model's camera sees it; also while the job trains.
+    """The recorded frame nearest to t as the model's camera sees it; also while the job trains, and of a live feed.
 
     X-Intrasplat-T is the frame's time. `recorded` of GET /scenes/{id} lists the frames that a finished scene keeps.
     """
-    shown = await find_shown(services, caller, scene_id)
-    request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, t=t, eye=eye, masks=masks)
+    shown = await find_shown(services, caller, scene_id, with_feeds=True)
+    request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, **shown.time_fields(t), eye=eye, masks=masks)
     if request.attempt is None or request.masks is RecordedMasks.MARKED:
         answer = await services.renderer.ask(request)
     else:

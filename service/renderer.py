@@ -20,10 +20,11 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.queue.interface import WORKER_TTL_S, Queue
 from contract.runtime import traces
-from contract.wire.rendering import ReplyError, SceneRequest, WorkerAddress, WorkerReply
+from contract.wire.cameras import CamerasRequest
+from contract.wire.rendering import CutRequest, PushRequest, ReplyError, WorkerAddress, WorkerReply
 from intrasplat.errors import UnavailableError
 from intrasplat.files.durable import replace_file
-from service.connection import Answer, Connection, Reached, WorkerGoneError
+from service.connection import Answer, AnyRequest, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `intrasplat worker`."
 ADDRESSES_VALID_S = 1.0
@@ -41,8 +42,8 @@ logger = logging.getLogger("intrasplat.service")
 class Renderer(Protocol):
     """Answers render and export requests."""
 
-    async def ask(self, request: SceneRequest, worker: str | None = None) -> Answer:
-        """The answer, from the worker at endpoint `worker` if given.
+    async def ask(self, request: AnyRequest, worker: str | None = None, body: bytes | None = None) -> Answer:
+        """The answer, from the worker at endpoint `worker` if given. body: of a PushRequest.
 
         Raises:
             UnavailableError: no answer comes in time.
@@ -65,8 +66,9 @@ class Renderer(Protocol):
 class ZmqRenderer:
     """Asks the live workers that the queue lists.
 
-    The worker that runs a job renders it. Any worker can render a finished scene: an idle one that has it in memory is
-    preferred, else always the same one, which then loads it. If that worker is gone, silent or busy, another is tried.
+    The worker that runs a job renders it, and the process that follows a live feed answers for that alone. Any other
+    worker can render a finished scene: an idle one that has it in memory is preferred, else always the same one, which
+    then loads it. If that worker is gone, silent or busy, another is tried.
 
     known: a file with the workers' addresses, for a service that starts while the queue is unreachable.
     """
@@ -84,14 +86,15 @@ class ZmqRenderer:
         self._read_s = self._heard_s = -math.inf
         self._reading: asyncio.Task[None] | None = None
 
-    async def ask(self, request: SceneRequest, worker: str | None = None) -> Answer:
+    async def ask(self, request: AnyRequest, worker: str | None = None, body: bytes | None = None) -> Answer:
         workers = await self._workers_for(request)
         if worker is not None:
             workers = [each for each in workers if each.endpoint == worker]
             if not workers:
                 raise UnavailableError("The worker of this export has ended.", "Ask for the export again.")
         if not workers:
-            problem = f"No worker runs job {request.scene_id} yet."
+            doing = "follows the feed" if _is_of_feed(request) else "runs job"
+            problem = f"No worker {doing} {request.scene_id} yet."
             not_yet = ReplyError(kind="not-yet", problem=problem, field="scene", remedy="Ask again in a second.")
             return Answer(WorkerReply(error=not_yet), b"")
         until_s = time.monotonic() + self._timeout_s
@@ -99,23 +102,25 @@ class ZmqRenderer:
         if others:
             with contextlib.suppress(WorkerGoneError, TimeoutError):
                 async with asyncio.timeout(self._timeout_s / 2):
-                    answer = await self._ask(first, request, patiently=False)
+                    answer = await self._ask(first, request, body, patiently=False)
                 if answer.head.error is None or answer.head.error.kind != "busy":
                     return answer
             first = others[0]
         try:
             async with asyncio.timeout(until_s - time.monotonic()):
-                return await self._ask(first, request)
+                return await self._ask(first, request, body)
         except TimeoutError:
             problem = f"The worker did not answer within {self._timeout_s:g} s."
             raise UnavailableError(problem, _remedy(first)) from None
         except WorkerGoneError:
             raise UnavailableError("The worker ended before it answered.", _remedy(first)) from None
 
-    async def _ask(self, address: WorkerAddress, request: SceneRequest, *, patiently: bool = True) -> Answer:
+    async def _ask(
+        self, address: WorkerAddress, request: AnyRequest, body: bytes | None, *, patiently: bool = True
+    ) -> Answer:
         connection = await self._connection(address)
         with traces.span("ask worker", kind=SpanKind.CLIENT, worker=address.name):
-            answer = await connection.ask(request, patiently=patiently)
+            answer = await connection.ask(request, body, patiently=patiently)
         return dataclasses.replace(answer, worker=address.endpoint)
 
     async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:
@@ -145,17 +150,20 @@ class ZmqRenderer:
             self._context.term()
             self._context = None
 
-    async def _workers_for(self, request: SceneRequest) -> list[WorkerAddress]:
-        """The workers that can answer, best first; empty for a job that no worker runs.
+    async def _workers_for(self, request: AnyRequest) -> list[WorkerAddress]:
+        """The workers that can answer, best first; empty for a job that no worker runs, or a feed that none follows.
 
         Raises:
             UnavailableError: there is no worker at all.
         """
         addresses = await self._live()
-        if request.attempt is not None:
-            return sorted(addresses, key=lambda address: self._preference(address, request.scene_id), reverse=True)
-        running = [address for address in addresses if address.job_id == request.scene_id]
-        return running or [each for each in await self._live(reread=True) if each.job_id == request.scene_id]
+        if request.attempt is not None and not _is_of_feed(request):
+            others = [each for each in addresses if each.feed_id is None]
+            if not others:
+                raise UnavailableError("No worker is ready.", WORKER_REMEDY)
+            return sorted(others, key=lambda address: self._preference(address, request.scene_id), reverse=True)
+        there = [each for each in addresses if _has(each, request)]
+        return there or [each for each in await self._live(reread=True) if _has(each, request)]
 
     def _preference(self, address: WorkerAddress, scene_id: str) -> tuple[bool, bool, bool, bool, bytes]:
         """Sort key: prefers workers that answer, are idle and have the scene; then rendezvous hashing."""
@@ -216,6 +224,17 @@ class ZmqRenderer:
         content = ADDRESSES.dump_json(_places(addresses))
         with contextlib.suppress(OSError):  # on a full disk they are known only until this service ends
             await run_in_threadpool(replace_file, self._known, content)
+
+
+def _is_of_feed(request: AnyRequest) -> bool:
+    if isinstance(request, CutRequest | PushRequest):
+        return True
+    return not isinstance(request, CamerasRequest) and request.moment is not None
+
+
+def _has(address: WorkerAddress, request: AnyRequest) -> bool:
+    """Whether the worker follows the feed, or runs the job."""
+    return request.scene_id == (address.feed_id if _is_of_feed(request) else address.job_id)
 
 
 def _places(addresses: list[WorkerAddress]) -> list[WorkerAddress]:

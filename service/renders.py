@@ -6,16 +6,11 @@ import asyncio
 import hashlib
 import time
 from collections.abc import Coroutine
-from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Header, Query, Request, Response
-from opentelemetry.trace import get_current_span
 from pydantic import BaseModel, ConfigDict, Field
-from starlette.concurrency import run_in_threadpool
 
-from contract.access.keys import KeyScope
-from contract.runtime import traces
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
@@ -27,13 +22,28 @@ from intrasplat.version import version
 from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer
-from service.deps import AnyCaller, Deps, Services, owned_scene
-from service.listing import SceneSearch
+from service.deps import AnyCaller, Deps, Services
+from service.moments import AskedTime, moment_text
 from service.problems import Problem
 from service.request_log import GONE
+from service.shown import Shown, find_shown
 
 router = APIRouter(tags=["renders"])
 
+FEED_HEADERS: dict[str, object] = {
+    "X-Intrasplat-Captured-At": {
+        "description": "of a live feed: when the pair of the moment that is shown arrived (RFC 3339)",
+        "schema": {"type": "string", "format": "date-time"},
+    },
+    "X-Intrasplat-Age-S": {
+        "description": "of a live feed: seconds from then until the answer",
+        "schema": {"type": "number"},
+    },
+    "X-Intrasplat-Source-S": {
+        "description": "of a live feed: the moment in seconds of the source",
+        "schema": {"type": "number"},
+    },
+}
 IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
     200: {
         "description": "the image",
@@ -62,6 +72,7 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "description": "of layer=depth in false colours: depths of the brightest and of the darkest colour",
                 "schema": {"type": "string", "pattern": "^-?[0-9]+ -?[0-9]+$"},
             },
+            **FEED_HEADERS,
         },
     },
     304: {"description": "it is the one that the caller has"},
@@ -73,9 +84,6 @@ NOT_YET_RETRY_S = "1"
 
 Result = TypeVar("Result")
 
-ModelTime = Annotated[
-    float, Field(ge=0, le=1e6, allow_inf_nan=False, description="0 is the first frame, 1 the end of the clip")
-]
 Pixels = Annotated[int | None, Field(ge=8, le=8192, description="size of the image in pixels; default: the clip's")]
 FocalLength = Annotated[
     float | None,
@@ -106,7 +114,7 @@ class ViewQuery(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    t: ModelTime = 0.0
+    t: AskedTime = None
     pose: PoseText = None
     width: Pixels = None
     height: Pixels = None
@@ -168,18 +176,6 @@ class RenderQuery(ViewQuery):
     )
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What a caller sees: the scene that `attempt` finished; None: the running job's newest snapshot."""
-
-    scene_id: str
-    attempt: int | None
-
-    @property
-    def state(self) -> JobState:
-        return JobState.RUNNING if self.attempt is None else JobState.DONE
-
-
 @router.get("/render", operation_id="render", response_class=Response, responses=IMAGE_RESPONSES)
 async def render(
     services: Services,
@@ -188,9 +184,12 @@ async def render(
     http_request: Request,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot."""
+    """An image at time t from a pose, without the instruments; while the job runs, from its newest snapshot.
+
+    `scene` may be a live feed's id.
+    """
     start = time.perf_counter()
-    shown = await find_shown(services, caller, query.scene)
+    shown = await find_shown(services, caller, query.scene, with_feeds=True)
     request = request_of(query, shown, services.settings)
     tag = tag_of(request)
     if shown.attempt is not None and matches(if_none_match, tag):
@@ -215,50 +214,6 @@ async def render(
     total_ms = (time.perf_counter() - start) * 1e3
     response.headers["Server-Timing"] = f"render;dur={answer.head.render_ms:.1f}, total;dur={total_ms:.1f}"
     return response
-
-
-async def find_shown(services: Deps, caller: Caller, scene: str | None) -> Shown:
-    """Find the named scene, or the tenant's only one, and record in the audit log that the caller views it.
-
-    Raises:
-        Problem: 400: no scene is named and the tenant has not exactly one (never show another patient by accident).
-            403: the key lacks the scope. 404: the tenant has no such scene. 409: the job has nothing to show.
-            503: it had a snapshot, and waits for another worker.
-    """
-    caller.require(KeyScope.VIEW)
-    with traces.span("find"):
-        shown = await run_in_threadpool(_find, services, caller, scene)
-    traces.describe(get_current_span(), job_id=shown.scene_id)
-    await services.audit.viewed(caller, shown.scene_id)
-    return shown
-
-
-def _find(services: Deps, caller: Caller, scene: str | None) -> Shown:
-    if scene is None:
-        return _only(services, caller)
-    record = owned_scene(services, caller, scene)
-    if record.state is JobState.DONE:
-        return Shown(scene, record.attempt)
-    if record.state is JobState.RUNNING:
-        return Shown(scene, None)
-    if record.state is JobState.QUEUED and record.attempt > 0:
-        remedy = "Ask again in some seconds, when another worker has claimed it."
-        raise Problem(503, "The job's worker has ended, and the job is queued again.", field="scene", remedy=remedy)
-    detail = f"The job is {record.state}; there is nothing to show."
-    waits = record.state is JobState.QUEUED
-    remedy = f"Wait for its first view: GET /jobs/{scene}/events." if waits else f"GET /jobs/{scene} says why."
-    raise Problem(409, detail, field="scene", remedy=remedy)
-
-
-def _only(services: Deps, caller: Caller) -> Shown:
-    page, _ = services.done.page_of(caller.tenant, SceneSearch())
-    there = [record for record in page.records if services.store.has_scene(record.job_id, record.attempt)]
-    if len(there) != 1 or page.end is not None:
-        if not there and page.end is None:
-            raise Problem(400, "There is no finished scene.", field="scene", remedy="Send a clip: POST /reconstruct.")
-        detail = f"There are {len(there)}{' or more' if page.end else ''} scenes, and the request names none."
-        raise Problem(400, detail, field="scene", remedy="Add scene=ID; GET /scenes lists them.")
-    return Shown(there[0].job_id, there[0].attempt)
 
 
 async def unless_gone(http_request: Request, work: Coroutine[Any, Any, Result]) -> Result | None:
@@ -287,13 +242,13 @@ async def answer_to(services: Deps, caller: Caller, request: RenderRequest, show
     """
     with services.render_limits.admitted(caller, request):
         answer = await services.renderer.ask(request)
-        if answer.head.error is not None and answer.head.error.kind == "not-yet":
+        if not shown.is_feed and answer.head.error is not None and answer.head.error.kind == "not-yet":
             shown = await find_shown(services, caller, shown.scene_id)
             if shown.attempt is not None:
                 answer = await services.renderer.ask(request.model_copy(update={"attempt": shown.attempt}))
     services.render_limits.learn(shown.scene_id, answer.head)
-    if answer.head.error is None:
-        services.metrics.rendered(shown.state.value, answer.head.render_ms)
+    if answer.head.error is None and answer.body:
+        services.metrics.rendered("feed" if shown.is_feed else shown.state.value, answer.head.render_ms)
     return shown, answer
 
 
@@ -301,12 +256,12 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
     """The request to the worker.
 
     Raises:
-        InputError: the pose is not valid.
+        InputError: time or pose is not valid.
     """
     return RenderRequest(
         scene_id=shown.scene_id,
         attempt=shown.attempt,
-        t=query.t,
+        **shown.time_fields(query.t),
         pose=query.asked_pose,
         eye=query.eye,
         camera=query.camera,
@@ -329,6 +284,13 @@ def image_response(scene_id: str, answer: Answer) -> Response:
         raise problem_of_reply(head.error)
     state = JobState.DONE if head.iteration is None else JobState.RUNNING
     headers = {"X-Intrasplat-Scene": scene_id, "X-Intrasplat-State": state.value, "X-Intrasplat-T": f"{head.t:.6g}"}
+    if (feed := head.feed) is not None:
+        headers |= {
+            "X-Intrasplat-State": feed.state.value,
+            "X-Intrasplat-Captured-At": moment_text(feed.captured_at_s),
+            "X-Intrasplat-Age-S": f"{feed.age_s:.3f}",
+            "X-Intrasplat-Source-S": f"{feed.source_s:.3f}",
+        }
     if head.iteration is not None:
         headers["X-Intrasplat-Iteration"] = str(head.iteration)
     if head.warnings:

@@ -116,7 +116,7 @@ def _marking(scope: Scope, send: Send, request_id: str, answered: _Answered) -> 
     async def marked(message: Message) -> None:
         kind = message["type"]
         if kind == "websocket.close" and answered.status is None:
-            problem = Problem(404, "There is no such WebSocket.", remedy="The one there is: /stream.")
+            problem = Problem(404, "There is no such WebSocket.", remedy="There are /stream and /feeds/{id}/pictures.")
             await _refuse(problem, scope, _nothing, marked)
             return
         if kind == "websocket.accept":

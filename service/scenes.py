@@ -22,8 +22,9 @@ from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
 from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
 from service.purge import Receipt
-from service.renders import find_shown, image_response
+from service.renders import image_response
 from service.reuse import others_with_clip
+from service.shown import Shown, find_shown, scene_or_feed
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -145,6 +146,16 @@ def finished_job(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
         detail = f"The job is {record.state}; there is no finished scene."
         raise Problem(409, detail, field="scene", remedy=f"See GET /jobs/{scene_id}.")
     return record
+
+
+async def find_finished(services: Deps, caller: Caller, scene_id: str) -> Shown:
+    """The finished scene or the live feed of that id; raises as finished_job(), and Problem 403 without the scope."""
+    caller.require(KeyScope.VIEW)
+    return await run_in_threadpool(scene_or_feed, services, caller, scene_id, _finished)
+
+
+def _finished(services: Deps, caller: Caller, scene_id: str) -> Shown:
+    return Shown(scene_id, finished_job(services, caller, scene_id).attempt)
 
 
 def _known(services: Deps, scene_id: str) -> JobRecord | None:

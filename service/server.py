@@ -111,10 +111,10 @@ class Server(uvicorn.Server):
         super().__init__(config)
         deps = app.state.deps
         assert isinstance(deps, Deps)
-        self._feeds = deps.feeds
+        self._end_channels = deps.end_channels
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        self._feeds.end()
+        self._end_channels()
         super().handle_exit(sig, frame)
 
 

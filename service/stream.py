@@ -6,6 +6,9 @@ is a JSON text: the problem document of HTTP with the `id`. The connection then 
 allowed (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
 headers, is {"authorize": KEY}.
 
+Of a live feed, a request with `follow` is answered once, and then with a new view whenever the feed has a newer moment,
+until the next request comes. While the feed's worker is away, each second brings the problem.
+
 While a view is rendered and sent, only the newest incoming message is kept. So a viewer that sends requests faster than
 they are answered skips views, and a viewer that does not read gets one view and then none.
 """
@@ -16,43 +19,36 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import time
-from collections.abc import Callable
 from typing import Any
 
-from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, WebSocket
 from opentelemetry.trace import SpanKind
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import from_json
-from starlette.types import Message
 
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.wire.job import JobState
 from contract.wire.rendering import PictureCamera
+from intrasplat.live.state import FeedState
 from intrasplat.notices import Notice
-from service.access import AccessRefusal, Caller, key_missing
+from service.access import AccessRefusal
 from service.connection import Answer
-from service.deps import Deps, EarlyCaller, Services, address_of
+from service.deps import Deps, EarlyCaller, Services
+from service.moments import moment_text
 from service.problems import API_REMEDY, Problem, fault, problem_of
-from service.renders import RenderQuery, Shown, answer_to, find_shown, problem_of_reply, request_of
+from service.renders import RenderQuery, answer_to, problem_of_reply, request_of
+from service.shown import Shown, find_shown
+from service.sockets import GONE, NOT_ALLOWED, NOT_TEXT, TOO_LARGE, Entrance, HangUpError, document_of
 
 router = APIRouter()
 
 LENGTH_BYTES = 4
 MAX_MESSAGE = 16 * 1024
 """Maximum characters of a message; a request has some hundred."""
-AUTHORIZE_TIMEOUT_S = 5.0
-"""A client that connects without a key must send it within this time."""
-SEND_TIMEOUT_S = 30.0
-"""A viewer that takes this long to receive one view counts as gone."""
-
-NOT_TEXT, NOT_ALLOWED, TOO_LARGE = 1003, 1008, 1009
-"""Close codes of RFC 6455, 7.4.1."""
-
-AUTHORIZE = "authorize"
-GONE = (WebSocketDisconnect, TimeoutError)
-"""Raised when the viewer has disconnected, or does not read any more."""
+AWAY_RETRY_S = 1.0
+"""When a feed that is followed is asked again after an error."""
 
 logger = logging.getLogger("intrasplat.service")
 
@@ -63,6 +59,7 @@ class StreamMessage(RenderQuery):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: str | int | None = Field(default=None, description="comes back with the answer")
+    follow: bool = Field(default=False, description="of t=live of a feed: send every newer moment, too")
 
 
 class StreamHead(BaseModel):
@@ -70,7 +67,7 @@ class StreamHead(BaseModel):
 
     id: str | int | None
     scene: str
-    state: JobState
+    state: JobState | FeedState
     t: float
     iteration: int | None
     unseen: float
@@ -81,15 +78,10 @@ class StreamHead(BaseModel):
     render_ms: float
     total_ms: float
     camera: PictureCamera | None = None
-
-
-class _HangUp(Exception):
-    """Close the connection with this code, after a last message."""
-
-    def __init__(self, code: int, problem: Problem) -> None:
-        super().__init__(problem.detail)
-        self.code = code
-        self.problem = problem
+    captured_at: str | None = Field(default=None, exclude_if=lambda text: text is None)
+    """Of a live feed, as the next two: when the pair of the moment arrived, RFC 3339."""
+    age_s: float | None = Field(default=None, exclude_if=lambda seconds: seconds is None)
+    source_s: float | None = Field(default=None, exclude_if=lambda seconds: seconds is None)
 
 
 @router.websocket("/stream")
@@ -102,21 +94,16 @@ async def stream(websocket: WebSocket, services: Services, caller: EarlyCaller) 
             lobby.enter_context(services.access.stranger())
         await websocket.accept()
         with services.metrics.streams.track_inprogress():
-            await _Viewer(websocket, services, lobby, may_come_in=caller is not None).serve()
+            entrance = Entrance(websocket, services, lobby, KeyScope.VIEW, may_come_in=caller is not None)
+            await _Viewer(entrance, services).serve()
 
 
 class _Viewer:
-    """One connection: one task reads and keeps the newest request, another answers.
+    """One connection: one task reads and keeps the newest request, another answers."""
 
-    lobby: counts it as a connection without a key until the key has come.
-    """
-
-    def __init__(self, websocket: WebSocket, services: Deps, lobby: contextlib.ExitStack, *, may_come_in: bool) -> None:
-        self._websocket = websocket
+    def __init__(self, entrance: Entrance, services: Deps) -> None:
+        self._entrance = entrance
         self._services = services
-        self._lobby = lobby
-        self._address = address_of(websocket)
-        self._caller: Callable[[], Caller] | None = self._caller_of_headers if may_come_in else None
         self._newest: dict[str, Any] | Problem | None = None
         self._arrived = asyncio.Event()
 
@@ -130,37 +117,28 @@ class _Viewer:
                 task.cancel()
             results = await asyncio.gather(*tasks, return_exceptions=True)
         for result in results:
-            if isinstance(result, _HangUp):
-                await self._hang_up(result)
+            if isinstance(result, HangUpError):
+                await self._entrance.hang_up(result)
             elif isinstance(result, Exception) and not isinstance(result, GONE):
                 raise result
 
     async def _read(self) -> None:
         while True:
-            message = await self._receive()
+            message = await self._entrance.receive()
             if message["type"] == "websocket.disconnect":
                 return
             text = message.get("text")
             if text is None:
-                raise _HangUp(NOT_TEXT, Problem(422, "A binary message is not a request.", remedy=API_REMEDY))
+                raise HangUpError(NOT_TEXT, Problem(422, "A binary message is not a request.", remedy=API_REMEDY))
             if len(text) > MAX_MESSAGE:
                 detail = f"The message has {len(text)} characters, more than {MAX_MESSAGE}."
-                raise _HangUp(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
+                raise HangUpError(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
             document = document_of(text)
-            if self._caller is None or (isinstance(document, dict) and AUTHORIZE in document):
-                self._caller = self._authorized(document)
-                self._lobby.close()
+            if self._entrance.is_key(document):
+                self._entrance.authorize(document)
             else:
                 self._newest = document
                 self._arrived.set()
-
-    async def _receive(self) -> Message:
-        """The viewer's next message. The key must come within AUTHORIZE_TIMEOUT_S."""
-        try:
-            async with asyncio.timeout(AUTHORIZE_TIMEOUT_S if self._caller is None else None):
-                return await self._websocket.receive()
-        except TimeoutError:
-            raise _HangUp(NOT_ALLOWED, key_missing(self._address)) from None
 
     async def _answer_all(self) -> None:
         while True:
@@ -168,91 +146,93 @@ class _Viewer:
             self._arrived.clear()
             document, start = self._newest, time.perf_counter()
             assert document is not None
-            try:
-                answer = await self._answer(document, start)
-            except Exception as error:
-                await self._send_problem(error, document.get("id") if isinstance(document, dict) else None)
-            else:
-                async with asyncio.timeout(SEND_TIMEOUT_S):
-                    await self._websocket.send_bytes(answer)
+            shown = await self._answer(document, start)
+            if shown is not None:
+                await self._follow(*shown)
 
-    async def _answer(self, document: dict[str, Any] | Problem, start: float) -> bytes:
-        """The message with the view."""
-        if isinstance(document, Problem):
-            raise document
-        message = message_of(document)
-        caller = self._known_caller()
+    async def _answer(self, document: dict[str, Any] | Problem, start: float) -> tuple[StreamMessage, float] | None:
+        """Send the view that is asked for. Returns the request and its second if newer moments are to follow."""
+        try:
+            if isinstance(document, Problem):
+                raise document
+            message = message_of(document)
+            shown, answer = await self._view(message)
+        except Exception as error:
+            message_id = document.get("id") if isinstance(document, dict) else None
+            problem = await self._send_problem(error, message_id)
+            does_follow = isinstance(document, dict) and document.get("follow") is True and problem.status in (429, 503)
+            return (message_of(document), -math.inf) if does_follow and isinstance(document, dict) else None
+        await self._entrance.send(packed(message, shown, answer, (time.perf_counter() - start) * 1e3))
+        return (message, answer.head.feed.source_s) if message.follow and answer.head.feed is not None else None
+
+    async def _view(self, message: StreamMessage, newer_than_s: float | None = None) -> tuple[Shown, Answer]:
+        """The worker's answer.
+
+        Raises:
+            Problem: it is an error, or the caller may not have it.
+        """
+        caller = self._entrance.caller()
         self._services.limiter.admit(caller.key_id or caller.address)
         with traces.span("view of /stream", traces.NEW, kind=SpanKind.SERVER):
-            shown = await find_shown(self._services, caller, message.scene)
+            shown = await find_shown(self._services, caller, message.scene, with_feeds=True)
             request = request_of(message, shown, self._services.settings)
+            if message.follow and not (request.moment is not None and request.moment.is_live):
+                raise Problem(422, "Only t=live of a feed can be followed.", field="follow", remedy="Leave it out.")
+            if newer_than_s is not None:
+                request = request.model_copy(update={"newer_than_s": newer_than_s})
             shown, answer = await answer_to(self._services, caller, request, shown)
             if answer.head.error is not None:
                 raise problem_of_reply(answer.head.error)
-        return packed(message, shown, answer, (time.perf_counter() - start) * 1e3)
+        return shown, answer
 
-    async def _send_problem(self, error: Exception, message_id: object) -> None:
+    async def _follow(self, message: StreamMessage, source_s: float) -> None:
+        """Send newer moments than this second of the source, until another request has come or the feed has ended."""
+        following = asyncio.create_task(self._send_newer(message, source_s))
+        asked = asyncio.create_task(self._arrived.wait())
+        try:
+            await asyncio.wait({following, asked}, return_when=asyncio.FIRST_COMPLETED)
+            if following.done():
+                following.result()
+        finally:
+            for task in (following, asked):
+                task.cancel()
+            await asyncio.gather(following, asked, return_exceptions=True)
+
+    async def _send_newer(self, message: StreamMessage, source_s: float) -> None:
+        assert message.scene is not None
+        while True:
+            start = time.perf_counter()
+
+            async def ask(after_s: float) -> tuple[Shown, Answer]:
+                nonlocal start
+                start = time.perf_counter()
+                return await self._view(message, None if after_s == -math.inf else after_s)
+
+            try:
+                shown, answer = await self._services.followed.newer(message.scene, source_s, ask)
+            except Exception as error:
+                problem = await self._send_problem(error, message.id)
+                if problem.status not in (429, 503):
+                    return
+                await asyncio.sleep(AWAY_RETRY_S)
+                continue
+            if answer.head.feed is None:
+                return
+            source_s = answer.head.feed.source_s
+            await self._entrance.send(packed(message, shown, answer, (time.perf_counter() - start) * 1e3))
+
+    async def _send_problem(self, error: Exception, message_id: object) -> Problem:
         """Send the error; close the connection of a caller without a valid key."""
         problem = problem_of(error)
         if problem is None:
             logger.error("a fault in a stream: %s", type(error).__name__, exc_info=error)
             problem = fault()
         if problem.status == 401:
-            raise _HangUp(NOT_ALLOWED, problem)
+            raise HangUpError(NOT_ALLOWED, problem)
         if isinstance(problem, AccessRefusal):
             await self._services.audit.refused(problem)
-        document = {**problem.document(), "id": message_id}
-        async with asyncio.timeout(SEND_TIMEOUT_S):
-            await self._websocket.send_text(json.dumps(document))
-
-    async def _hang_up(self, reason: _HangUp) -> None:
-        if isinstance(reason.problem, AccessRefusal):
-            await self._services.audit.refused(reason.problem)
-        with contextlib.suppress(*GONE):
-            async with asyncio.timeout(SEND_TIMEOUT_S):
-                await self._websocket.send_text(json.dumps(reason.problem.document()))
-                await self._websocket.close(reason.code)
-
-    def _known_caller(self) -> Caller:
-        """The connection's caller, checked for each view, so that revoking a key ends its streams."""
-        assert self._caller is not None
-        caller = self._caller()
-        caller.require(KeyScope.VIEW)
-        return caller
-
-    def _caller_of_headers(self) -> Caller:
-        caller = self._services.access.caller(self._websocket.headers, self._address)
-        if caller is None:
-            raise key_missing(self._address)
-        return caller
-
-    def _authorized(self, document: dict[str, Any] | Problem) -> Callable[[], Caller]:
-        """The connection's caller, by the key in a message."""
-        key = document.get(AUTHORIZE) if isinstance(document, dict) else None
-        if not isinstance(key, str):
-            raise _HangUp(NOT_ALLOWED, key_missing(self._address))
-
-        def caller() -> Caller:
-            return self._services.access.caller_of_key(key, self._address)
-
-        try:
-            caller().require(KeyScope.VIEW)
-        except Problem as problem:
-            raise _HangUp(NOT_ALLOWED, problem) from None
-        return caller
-
-
-def document_of(text: str) -> dict[str, Any] | Problem:
-    """The JSON object of a message, or the problem if it is not one."""
-    try:
-        document = from_json(
-            text
-        )  # stricter than json: limits depth, and refuses lone surrogates, which cannot be sent back
-    except ValueError:
-        document = None
-    if not isinstance(document, dict):
-        return Problem(400, "The message is not a JSON object.", remedy=API_REMEDY)
-    return document
+        await self._entrance.send(json.dumps({**problem.document(), "id": message_id}))
+        return problem
 
 
 def message_of(document: dict[str, Any]) -> StreamMessage:
@@ -271,10 +251,14 @@ def message_of(document: dict[str, Any]) -> StreamMessage:
 
 def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float) -> bytes:
     """A view as one binary message."""
+    feed = answer.head.feed
+    of_feed: dict[str, Any] = {}
+    if feed is not None:
+        of_feed = {"captured_at": moment_text(feed.captured_at_s), "age_s": feed.age_s, "source_s": feed.source_s}
     head = StreamHead(
         id=message.id,
         scene=shown.scene_id,
-        state=shown.state,
+        state=shown.state if feed is None else feed.state,
         t=answer.head.t,
         iteration=answer.head.iteration,
         unseen=round(answer.head.unseen, 3),
@@ -285,6 +269,7 @@ def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float
         render_ms=answer.head.render_ms,
         total_ms=total_ms,
         camera=answer.head.camera,
+        **of_feed,
     )
     text = head.model_dump_json().encode()
     return len(text).to_bytes(LENGTH_BYTES, "big") + text + answer.body

@@ -126,7 +126,7 @@ def read_metrics(services: Services, caller: AnyCaller) -> Response:
 
 
 def _nobody_trains(workers: list[WorkerAddress]) -> Problem:
-    if any(worker.renders_only for worker in workers):
+    if any(worker.renders_only and worker.feed_id is None for worker in workers):
         detail = "The workers that are there only render."
         return Problem(503, detail, field="worker", remedy="Start one that trains: `intrasplat worker`.")
     return Problem(503, "No worker is ready yet.", field="worker", remedy=f"Wait for it. {WORKER_REMEDY}")

@@ -17,8 +17,9 @@ from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, ImageFormat, IntrinsicsOverride
 from service.access import Caller
 from service.deps import AnyCaller, Deps, Services
-from service.renders import Shown, answer_to, matches, problem_of_reply
+from service.renders import answer_to, matches, problem_of_reply
 from service.scenes import finished_job
+from service.shown import Shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 

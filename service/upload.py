@@ -84,6 +84,14 @@ SCENE_FORM = Form(
     "callback_url.",
 )
 
+CALIBRATION_PART = "calibration"
+FEED_FORM = Form(
+    {CALIBRATION_PART: SUFFIXES[CALIBRATION_PART]},
+    (OPTIONS,),
+    "Send multipart/form-data with calibration, and options, JSON such as "
+    '{"source": "rtsp://camera.example.org/1", "keep_s": 300}.',
+)
+
 
 @dataclass(frozen=True)
 class UploadLimits:

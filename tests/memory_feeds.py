@@ -24,11 +24,12 @@ class MemoryFeeds:
             self._records[record.feed_id] = record
         return self._records[record.feed_id]
 
-    def claim(self, owner: str) -> FeedRecord | None:
+    def claim(self, owner: str, *, to_end: bool) -> FeedRecord | None:
         for record in sorted(self._records.values(), key=lambda each: (each.created_at_s, each.feed_id)):
             followed_by = self._owner(record)
             is_of_same_worker = followed_by is not None and followed_by.rpartition(".")[0] == owner.rpartition(".")[0]
-            if followed_by is None or (is_of_same_worker and followed_by != owner):
+            is_free = followed_by is None or (is_of_same_worker and followed_by != owner)
+            if is_free and (record.wish is FeedWish.END or not to_end):
                 claimed = record.model_copy(update={"owner": owner, "epoch": record.epoch + 1})
                 self._records[record.feed_id] = claimed
                 self._lease_ends_s[record.feed_id] = time.monotonic() + self._lease_s
@@ -59,7 +60,9 @@ class MemoryFeeds:
 
     def wish(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
         record = self._records.get(feed_id)
-        if record is not None and record.wish is not FeedWish.END:
+        if record is not None and wish is FeedWish.END and record.epoch == 0:
+            del self._records[feed_id]
+        elif record is not None and record.wish is not FeedWish.END:
             self._records[feed_id] = record.model_copy(update={"wish": wish})
         return self.one(feed_id)
 

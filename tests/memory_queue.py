@@ -255,9 +255,9 @@ class MemoryQueue:
         with self._changed:
             return self._feeds.open(record, most, most_of_tenant)
 
-    def claim_feed(self, owner: str) -> FeedRecord | None:
+    def claim_feed(self, owner: str, *, to_end: bool = False) -> FeedRecord | None:
         with self._changed:
-            return self._feeds.claim(owner)
+            return self._feeds.claim(owner, to_end=to_end)
 
     def beat_feed(self, claim: FeedClaim, report: FeedReport) -> FeedWish | None:
         with self._changed:

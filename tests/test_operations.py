@@ -65,7 +65,8 @@ def test_the_figures_are_those_of_the_code() -> None:
 
 
 def test_every_metric_that_is_named_exists() -> None:
-    source = (REPOSITORY / "service" / "metrics.py").read_text(encoding="utf-8")
+    files = ("metrics.py", "feed_metrics.py")
+    source = "".join((REPOSITORY / "service" / name).read_text(encoding="utf-8") for name in files)
     named = {name.removesuffix("_total") for name in re.findall(r"intrasplat_[a-z_]+", PAGE)}
     assert [name for name in sorted(named) if f'"{name}"' not in source] == []
 

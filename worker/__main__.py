@@ -1,4 +1,5 @@
-"""`python -m worker consume` claims and trains jobs; `python -m worker device` is the child process that it starts."""
+"""`python -m worker consume` claims and trains jobs; `python -m worker device` is the child process that it starts,
+and `python -m worker feed` that of a live feed."""
 
 from __future__ import annotations
 
@@ -41,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
         "--renders-only", action="store_true", help="claim no jobs, only answer renders of finished scenes"
     )
     add_command(commands, "device", "started by consume: train and render on orders from stdin", _device)
+    add_command(commands, "feed", "started by consume: follow a live feed on orders from stdin", _feed)
     return parser
 
 
@@ -63,6 +65,16 @@ def _device(options: argparse.Namespace) -> int:
     from worker.device import run_device
 
     run_device(settings)
+    return ExitCode.OK
+
+
+def _feed(options: argparse.Namespace) -> int:
+    settings = Settings.from_environment()
+    configure(settings, "feed")
+    traces.configure("feed", settings.worker_name)
+    from worker.feed_process import run_feed
+
+    run_feed(settings)
     return ExitCode.OK
 
 

@@ -17,7 +17,7 @@ from typing import BinaryIO
 from pydantic import ValidationError
 
 from contract.runtime import traces
-from worker.orders import DeviceReport, RunJob, ScoreScene, line_of, read_order
+from worker.orders import Message, RunJob, ScoreScene, line_of, read_order
 
 TRACES_PATIENCE_S = 1.0
 """How long the process waits at its end for a trace collector: less than a supervisor waits for the process."""
@@ -31,7 +31,7 @@ class Channel:
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._lock = threading.Lock()
-        self._last: dict[type[DeviceReport], DeviceReport] = {}
+        self._last: dict[type[Message], Message] = {}
 
     @classmethod
     def instead_of_stdout(cls) -> Channel:
@@ -41,13 +41,13 @@ class Channel:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         return cls(os.fdopen(own, "wb"))
 
-    def send(self, message: DeviceReport) -> None:
+    def send(self, message: Message) -> None:
         """Write one report; do nothing if the supervisor has ended."""
         with self._lock, contextlib.suppress(BrokenPipeError):
             self._stream.write(line_of(message))
             self._stream.flush()
 
-    def send_if_new(self, message: DeviceReport) -> None:
+    def send_if_new(self, message: Message) -> None:
         """Write a report unless it equals the last of its type; only one thread may call this."""
         if self._last.get(type(message)) != message:
             self._last[type(message)] = message

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
-from contract.wire.rendering import ExportRequest
+from contract.wire.rendering import CutRequest, ExportRequest
 from intrasplat.errors import SceneError, UnavailableError
 
 MAX_OPEN = 8
@@ -16,7 +16,7 @@ IDLE_S = 120.0
 
 @dataclass(eq=False)
 class _Open:
-    key: tuple[str, int]
+    key: tuple[str, int | None]
     parts: Generator[bytes]
     next_part: int
     used_s: float
@@ -29,7 +29,7 @@ class OpenExports:
         self._clock = clock
         self._open: dict[str, _Open] = {}
 
-    def part(self, request: ExportRequest, begin: Callable[[], Generator[bytes]]) -> tuple[bytes, bool]:
+    def part(self, request: ExportRequest | CutRequest, begin: Callable[[], Generator[bytes]]) -> tuple[bytes, bool]:
         """The requested part, and whether more follow. The first part starts the export: begin() yields its parts.
 
         Raises:
@@ -57,7 +57,7 @@ class OpenExports:
         export.next_part, export.used_s = request.part + 1, self._clock()
         return content, True
 
-    def forget(self, is_gone: Callable[[str, int], bool] = lambda scene_id, attempt: False) -> None:
+    def forget(self, is_gone: Callable[[str, int | None], bool] = lambda scene_id, attempt: False) -> None:
         """End the exports of scenes that were removed, and those that their callers abandoned."""
         now_s = self._clock()
         for export_id, each in list(self._open.items()):

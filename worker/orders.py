@@ -24,11 +24,13 @@ FETCHING = "fetch"
 """The first stage that a caller sees: the job's files are fetched, and an imported scene is read."""
 
 
-class _Message(BaseModel):
+class Message(BaseModel):
+    """An order or a report."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class RunJob(_Message):
+class RunJob(Message):
     """Reconstruct the record's clip in the folder `spool` into the empty `out`; resume the state in `resume_dir`."""
 
     kind: Literal["run"] = "run"
@@ -38,7 +40,7 @@ class RunJob(_Message):
     resume_dir: Path
 
 
-class ScoreScene(_Message):
+class ScoreScene(Message):
     """Score the finished scene in the folder `scene`, whose clip is in `spool`: its worker ended before scoring it."""
 
     kind: Literal["score"] = "score"
@@ -47,13 +49,13 @@ class ScoreScene(_Message):
     scene: Path
 
 
-class StopJob(_Message):
+class StopJob(Message):
     """Stop what runs; an unfinished job stores its state in `resume_dir`. Ignored while nothing runs."""
 
     kind: Literal["stop"] = "stop"
 
 
-class Ready(_Message):
+class Ready(Message):
     """The kernels are compiled, and `endpoint` accepts render requests."""
 
     kind: Literal["ready"] = "ready"
@@ -61,41 +63,41 @@ class Ready(_Message):
     device: str
 
 
-class CachedScenes(_Message):
+class CachedScenes(Message):
     """The scenes in the child's memory."""
 
     kind: Literal["cached_scenes"] = "cached_scenes"
     scenes: tuple[str, ...]
 
 
-class Advanced(_Message):
+class Advanced(Message):
     """The progress of the job."""
 
     kind: Literal["advanced"] = "advanced"
     progress: JobProgress
 
 
-class Finished(_Message):
+class Finished(Message):
     """The scene in `out` is complete except for its scores."""
 
     kind: Literal["finished"] = "finished"
 
 
-class Scored(_Message):
+class Scored(Message):
     """The report of the finished scene, with its scores or with the reason why there are none."""
 
     kind: Literal["scored"] = "scored"
     report: Report
 
 
-class Stopped(_Message):
+class Stopped(Message):
     """The work stopped as ordered. checkpointed: training had started, and its state is in `resume_dir`."""
 
     kind: Literal["stopped"] = "stopped"
     checkpointed: bool
 
 
-class Failed(_Message):
+class Failed(Message):
     """The job failed."""
 
     kind: Literal["failed"] = "failed"
@@ -111,7 +113,7 @@ _ORDERS: TypeAdapter[DeviceOrder] = TypeAdapter(Annotated[DeviceOrder, Field(dis
 _REPORTS: TypeAdapter[DeviceReport] = TypeAdapter(Annotated[DeviceReport, Field(discriminator="kind")])
 
 
-def line_of(message: DeviceOrder | DeviceReport) -> bytes:
+def line_of(message: Message) -> bytes:
     """The message as a line of JSON."""
     return message.model_dump_json().encode() + b"\n"
 

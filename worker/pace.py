@@ -35,6 +35,7 @@ class RenderPace:
         clock: monotonic seconds.
         used_s: CPU seconds that this process has used; None: count all cores as used.
         max_debt_s: CPU seconds; a render never leaves more debt than that.
+        share: renders' share of the CPU time while a job trains.
     """
 
     def __init__(
@@ -43,8 +44,10 @@ class RenderPace:
         clock: Callable[[], float] = time.monotonic,
         used_s: Callable[[], float] | None = None,
         max_debt_s: float = math.inf,
+        share: float = SHARE,
     ) -> None:
         self._cores = cores
+        self._share = share
         self._max_debt_s = max_debt_s
         self._clock = clock
         self._used_s = used_s or (lambda: cores * clock())
@@ -99,7 +102,7 @@ class RenderPace:
 
     @property
     def _rate(self) -> float:
-        return SHARE * self._cores * self._use
+        return self._share * self._cores * self._use
 
     def _fill(self) -> None:
         now_s, used_s = self._clock(), self._used_s()
@@ -107,5 +110,5 @@ class RenderPace:
         gained_s = min(max(used_s - self._used_before_s, MIN_USE * self._cores * passed_s), self._cores * passed_s)
         if passed_s > 0:
             self._use += (gained_s / (self._cores * passed_s) - self._use) * min(1.0, passed_s)  # mean of about 1 s
-        self._left_s = min(MAX_SAVED_S, self._left_s + SHARE * gained_s)
+        self._left_s = min(MAX_SAVED_S, self._left_s + self._share * gained_s)
         self._at_s, self._used_before_s = now_s, used_s

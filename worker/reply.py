@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from contract.wire.feeds import CutRange, FeedShown
 from contract.wire.rendering import PictureCamera
 from intrasplat.errors import ErrorCode, IntrasplatError
 from intrasplat.notices import Notice
@@ -22,7 +23,7 @@ class Reply:
     iteration: iteration of the snapshot that is shown; None: the scene is finished.
     unseen: share of a render's pixels that no training frame saw.
     detail: share of a render's tissue whose detail comes from recorded frames.
-    gaussians, clip_size, camera, depth_range_mm: as in WorkerReply.
+    gaussians, clip_size, camera, depth_range_mm, feed, cut: as in WorkerReply.
     level: level of detail at which it was rendered (intrasplat/view/coarse.py); 0 is full detail.
     is_untimed: the reply comes from the cache or is no render; its time is not used to predict that of renders.
     more: further parts of the export follow.
@@ -42,3 +43,5 @@ class Reply:
     more: bool = False
     depth_range_mm: tuple[float, float] | None = None
     camera: PictureCamera | None = None
+    feed: FeedShown | None = None
+    cut: CutRange | None = None

@@ -31,6 +31,10 @@ ALL_WITHIN_S = 1.0
 MIN_CHARGE_S = 0.01
 """Least CPU seconds charged for an answer while a job trains: the service and the viewer have work with it, too."""
 
+MAX_WAIT_SHARE = 0.4
+"""Share of the time after which the service gives up a render. A request that would wait longer is refused, with the
+time at which to ask again."""
+
 Answer = Callable[[SceneRequest, int], Parts[Reply]]
 """Computes the reply to a request at a level of detail (intrasplat/view/coarse.py), in parts."""
 

@@ -31,6 +31,7 @@ from contract.wire.rendering import (
     WorkerRequest,
 )
 from intrasplat.errors import InputError, SceneError, UnavailableError
+from worker.aside import Aside
 from worker.job_errors import FAULT_REMEDY
 from worker.reply import NotYetError, Reply
 from worker.scheduler import Answered, Scheduler
@@ -58,6 +59,7 @@ class RequestServer:
     Args:
         scheduler: computes the answers. An InputError, SceneError or NotYetError is sent to the caller; any other error
             is logged, and the caller gets its type.
+        aside: answers the cuts and pushes of a live feed; None: they are refused.
         between: called about once a second, in the same thread.
         render_secret: needed only for tcp://.
     """
@@ -67,6 +69,7 @@ class RequestServer:
         endpoint: str,
         scheduler: Scheduler,
         *,
+        aside: Aside | None = None,
         between: Callable[[], None] | None = None,
         render_secret: str | None = None,
     ) -> None:
@@ -78,6 +81,7 @@ class RequestServer:
             )
         self.endpoint = endpoint
         self._scheduler = scheduler
+        self._aside = aside
         self._between = between
         self._between_at_s = 0.0
         self._render_secret = render_secret
@@ -86,6 +90,7 @@ class RequestServer:
         self._authenticator: ThreadAuthenticator | None = None
         self._thread = threading.Thread(target=self._serve, name="renders", daemon=True)
         self._socket: zmq.Socket[bytes] | None = None
+        self._poller = zmq.Poller()
 
     def __enter__(self) -> RequestServer:
         self._socket = self._context.socket(zmq.ROUTER)
@@ -101,6 +106,9 @@ class RequestServer:
             self._close()
             problem = f"Renders cannot be answered at {self.endpoint} ({error.strerror})."
             raise UnavailableError(problem, "Free the address, or set another INTRASPLAT_RENDER_ENDPOINT.") from error
+        self._poller.register(self._socket, zmq.POLLIN)
+        if self._aside is not None:
+            self._poller.register(self._aside.descriptor, zmq.POLLIN)
         self._thread.start()
         return self
 
@@ -122,24 +130,27 @@ class RequestServer:
             if (answered := self._scheduler.advance()) is not None:
                 self._send_answer(answered)
         self._scheduler.close()
+        if self._aside is not None:
+            self._aside.close()
         self._socket.close()
 
     def _read(self, wait_s: float) -> None:
-        """Read the waiting messages; wait up to wait_s if there are none."""
+        """Read the waiting messages; wait up to wait_s if there are none. Send what was answered aside."""
         assert self._socket is not None
-        if not self._socket.poll(math.ceil(wait_s * 1e3)):
-            return
+        self._poller.poll(math.ceil(wait_s * 1e3))
+        for done in self._aside.ready() if self._aside is not None else ():
+            self._send(done.caller, done.request_id, *_message(done.outcome, done.seconds))
         for _ in range(MAX_READ):
             try:
                 frames = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            if len(frames) == 3:
+            if len(frames) in (3, 4):
                 self._take_in(*frames)
             else:
                 logger.warning("a message of %d parts was ignored", len(frames))
 
-    def _take_in(self, caller: bytes, request_id: bytes, document: bytes) -> None:
+    def _take_in(self, caller: bytes, request_id: bytes, document: bytes, content: bytes = b"") -> None:
         try:
             envelope = WorkerRequest.model_validate_json(document)
         except ValidationError as error:
@@ -153,11 +164,10 @@ class RequestServer:
         if isinstance(request, CancelRequest):
             self._scheduler.give_up(caller, request_id)
             return
-        if isinstance(request, CutRequest | PushRequest):
-            no_feed = WorkerReply(error=_reply_error(SceneError("This process follows no feed.")))
-            self._send(caller, request_id, no_feed)
-            return
         try:
+            if isinstance(request, CutRequest | PushRequest):
+                self._lay_aside(caller, request_id, request, content)
+                return
             wait_s = self._scheduler.take_in(caller, request_id, request, envelope.trace)
         except Exception as error:  # one caller's request must not end the loop for all
             self._send(caller, request_id, WorkerReply(error=_reply_error(error)))
@@ -165,14 +175,15 @@ class RequestServer:
         if wait_s is not None:
             self._send(caller, request_id, WorkerReply(error=_busy(wait_s)))
 
+    def _lay_aside(self, caller: bytes, request_id: bytes, request: CutRequest | PushRequest, content: bytes) -> None:
+        if self._aside is None:
+            raise SceneError("This process follows no feed.")
+        self._aside.take_in(caller, request_id, request, content)
+
     def _send_answer(self, answered: Answered) -> None:
-        outcome, body = answered.outcome, b""
-        if isinstance(outcome, Reply):
-            head, body = _head(outcome, answered.seconds), outcome.body
-        else:
-            head = WorkerReply(error=_reply_error(outcome))
+        message = _message(answered.outcome, answered.seconds)
         for each in answered.requests:
-            self._send(each.caller, each.request_id, head, body)
+            self._send(each.caller, each.request_id, *message)
 
     def _send(self, caller: bytes, request_id: bytes, head: WorkerReply, body: bytes = b"") -> None:
         assert self._socket is not None
@@ -188,6 +199,13 @@ class RequestServer:
         self._between_at_s = time.monotonic() + BETWEEN_PERIOD_S
 
 
+def _message(outcome: Reply | Exception, seconds: float) -> tuple[WorkerReply, bytes]:
+    """Head and body of an answer."""
+    if isinstance(outcome, Reply):
+        return _head(outcome, seconds), outcome.body
+    return WorkerReply(error=_reply_error(outcome)), b""
+
+
 def _head(reply: Reply, seconds: float) -> WorkerReply:
     return WorkerReply(
         media_type=reply.media_type,
@@ -201,6 +219,8 @@ def _head(reply: Reply, seconds: float) -> WorkerReply:
         camera=reply.camera,
         more=reply.more,
         depth_range_mm=reply.depth_range_mm,
+        feed=reply.feed,
+        cut=reply.cut,
         render_ms=seconds * 1e3,
     )
 

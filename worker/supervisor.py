@@ -11,22 +11,21 @@ import os
 import secrets
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 from contract.queue.installed import check_queue
-from contract.queue.interface import ANNOUNCE_PERIOD_S, Queue
 from contract.queue.redis_queue import RedisQueue
 from contract.runtime.locks import FolderLock
 from contract.runtime.settings import Settings
+from contract.store.feed_files import FeedFiles
 from contract.store.store import Store, open_store
 from contract.wire.rendering import WorkerAddress
 from intrasplat.errors import UnavailableError
+from worker.announce import LOOK_PERIOD_S, announced
 from worker.child import ChildKeeper
 from worker.consume import Consumer
-
-LOOK_PERIOD_S = 0.1
-"""How soon a change of the address is announced."""
+from worker.feeds import FeedHost, endpoints_of, following
 
 TIDY_PERIOD_S = 600.0
 """Time between two clean-ups of the store: so long a local copy may outlive a scene purged on another machine."""
@@ -64,12 +63,17 @@ def run_supervisor(
     environment = {**os.environ, **settings.to_environment()}
     keeper = ChildKeeper(child_command or DEVICE_COMMAND, environment, store.run_dir / f"{name}.device.last-words")
     # The owner's name is new at each start, so that late messages of an earlier process of this name have no effect.
-    consumer = Consumer(queue, store, keeper, name, f"{name}.{secrets.token_hex(4)}", end, settings.min_free_bytes)
+    owner = f"{name}.{secrets.token_hex(4)}"
+    consumer = Consumer(queue, store, keeper, name, owner, end, settings.min_free_bytes)
+    # A worker without a place for feeds ends those that it has followed before.
+    endpoints = partial(endpoints_of, run_dir=store.run_dir, render_endpoint=settings.render_endpoint)
+    host = FeedHost(queue, FeedFiles(store.data_dir), owner, settings.feeds, endpoints, environment)
     try:
         check_queue(queue)
         with (
             announced(queue, name, lambda: address_of(name, keeper, consumer, renders_only=renders_only)),
             periodic_tidy(store),
+            contextlib.nullcontext() if renders_only else following(host),
         ):
             if renders_only:
                 keep_rendering(keeper, end)
@@ -124,34 +128,3 @@ def periodic_tidy(store: Store) -> Iterator[None]:
         yield
     finally:
         end.set()
-
-
-@contextlib.contextmanager
-def announced(queue: Queue, name: str, address: Callable[[], WorkerAddress | None]) -> Iterator[None]:
-    """Announce the worker's address every ANNOUNCE_PERIOD_S and at every change while the context lasts."""
-    end = threading.Event()
-
-    def announce() -> None:
-        last: WorkerAddress | None = None
-        next_s = 0.0
-        while not end.wait(LOOK_PERIOD_S):
-            now = address()
-            if now == last and (now is None or time.monotonic() < next_s):
-                continue
-            with contextlib.suppress(UnavailableError):
-                if now is None:
-                    queue.withdraw(name)
-                else:
-                    queue.announce(now)
-                last = now
-            next_s = time.monotonic() + ANNOUNCE_PERIOD_S
-
-    thread = threading.Thread(target=announce, name="announce", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join()
-        with contextlib.suppress(UnavailableError):
-            queue.withdraw(name)

@@ -11,50 +11,31 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
-from functools import partial
-
-import numpy as np
-from numpy.typing import NDArray
 
 from contract.runtime import traces
 from contract.runtime.settings import GIB
 from contract.store.store import Store
 from contract.wire.cameras import CamerasRequest, SceneCameras
 from contract.wire.rendering import (
-    TYPICAL_GAUSSIANS,
-    TYPICAL_SIZE,
     ExportRequest,
     MeasureRequest,
-    PictureCamera,
     RecordedRequest,
     RenderRequest,
     SceneRequest,
-    render_cost,
 )
-from intrasplat.camera import Intrinsics
-from intrasplat.errors import InputError
-from intrasplat.export import DRAWN, export_parts
-from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.machine.parts import Parts, whole
 from intrasplat.notices import Notice, NoticeCode
-from intrasplat.picture import MEDIA_TYPES, ImageFormat, Layer, RecordedMasks
+from intrasplat.picture import MEDIA_TYPES, ImageFormat, RecordedMasks
+from intrasplat.report import RightEye
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
-from intrasplat.splat.cpu.threads import beside
-from intrasplat.view.camera import camera_of, endoscope_pose, pose_of, right_eye, seen_through
-from intrasplat.view.coarse import LEVELS, thinned
 from intrasplat.view.detail import detail_bytes
-from intrasplat.view.encode import FOR_EYES, encode_layer
-from intrasplat.view.frame import View
-from intrasplat.view.lenses import Lenses
-from intrasplat.view.measure import WINDOW_PX
-from intrasplat.view.measured import measured
+from intrasplat.view.encode import FOR_EYES
 from intrasplat.view.recorded import live_frame, stored_frame
-from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts
-from intrasplat.view.renderer import renderer_of
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
+from worker.rendered import MEDIA_TYPE_OF_JSON, cost_of, export_reply, measured_reply, rendered, typical_cost
 from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshot, Snapshots
 
@@ -62,14 +43,8 @@ COPIES = 3
 """A loaded scene takes three times its size in memory: its tensors, the arrays of its renderer, and about as much in
 buffers (measured: 100 MB for each scene of 32 MB, with 36,000 Gaussians and 17 bases, shown at 640 x 512)."""
 
-MEDIA_TYPE_OF_BYTES, MEDIA_TYPE_OF_JSON = "application/octet-stream", "application/json"
-
 MAX_CACHED_SCENES = 64
 """Most scenes in memory, however small: each announcement of the worker names all of them."""
-
-
-LARGE_PIXELS = 1 << 19
-"""Pictures of more pixels take so long to encode that other answers are computed meanwhile."""
 
 
 class Views:
@@ -117,9 +92,9 @@ class Views:
         if isinstance(request, RecordedRequest):
             return self._recorded(request)
         if isinstance(request, ExportRequest):
-            return self._export(self._stored(request.scene_id, request.attempt), request)
+            return export_reply(self._exports, self._stored(request.scene_id, request.attempt), request, self._device)
         if isinstance(request, MeasureRequest):
-            return self._measured(self._stored(request.scene_id, request.attempt), request)
+            return measured_reply(self._stored(request.scene_id, request.attempt), request, self._device)
         if request.attempt is not None:
             scene, snapshot = self._stored(request.scene_id, request.attempt), None
             yield  # loading the scene may have taken long
@@ -131,7 +106,8 @@ class Views:
         reply = self._replies.get(request)
         level = level if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
-            reply = yield from self._rendered(scene, request, snapshot, level)
+            reply = yield from rendered(scene, request, level, self._device, lambda: self._right_eye(request))
+            reply = reply if snapshot is None else _of_snapshot(reply, snapshot)
             # Between the parts of a render, a scene may be purged or a newer snapshot shown.
             is_current = (
                 (request.scene_id, request.attempt) in self._scenes if snapshot is None else self._is_newest(scene)
@@ -153,20 +129,7 @@ class Views:
         else:
             snapshot = self._snapshots.shown(request.scene_id)
             scene = snapshot.scene if snapshot is not None else None
-        gaussians = len(scene.gaussians) if scene is not None else TYPICAL_GAUSSIANS
-        size = (scene.intrinsics.width, scene.intrinsics.height) if scene is not None else TYPICAL_SIZE
-        if isinstance(request, MeasureRequest):
-            return len(request.points) * render_cost(WINDOW_PX**2, gaussians)
-        if isinstance(request, ExportRequest):
-            return render_cost(size[0] * size[1] if request.format in DRAWN else 0, gaussians)
-        if scene is not None:
-            asked = seen_through(scene.intrinsics, request.camera)
-            is_own, is_judged = request.is_from_endoscope, request.layer is Layer.CONFIDENCE
-            lenses = Lenses.of(asked, scene.intrinsics, request.max_pixels)
-            drawn = lenses.pixels_drawn(confidence=is_judged, from_endoscope=is_own)
-        else:
-            drawn = request.most_drawn(size)
-        return sum(render_cost(each, gaussians) for each in drawn)
+        return typical_cost(request) if scene is None else cost_of(scene, request)
 
     def forget_purged(self) -> None:
         """Drop scenes whose folders were removed, and jobs that have ended. Call it regularly."""
@@ -224,76 +187,12 @@ class Views:
         self.cached = tuple(name for name, _ in self._scenes)
         return self._scenes[key]
 
-    def _rendered(
-        self, scene: TrainedScene, request: RenderRequest, snapshot: Snapshot | None, level: int
-    ) -> Parts[Reply]:
-        """One render. snapshot: the one that the scene comes from; None: the scene is finished. level: of detail."""
-        pose, lens = self._pose_and_lens(scene, request)
-        camera = camera_of(lens, request.camera, request.max_pixels)
-        size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
-        own = endoscope_pose(scene, clamped_to_clip(scene, request.t)[0]) if pose is None else pose
-        pose_rows = tuple(own[:3].flatten().tolist())
-        picture_camera = PictureCamera.model_validate({**camera.numbers(), "world_from_camera": pose_rows})
-        coarse = LEVELS[level]
-        camera = camera.resized(-(-camera.width // coarse.pixels), -(-camera.height // coarse.pixels))
-        drawn = thinned(scene, coarse.gaussians)
-        attributes = traces.Attributes(width=size[0], height=size[1], level=level, gaussians=len(drawn.gaussians))
-        view = ViewRequest(
-            drawn, request.t, pose, camera, self._device,
-            highlights=highlights, light=request.light, smoke=request.smoke,
-            detail=request.detail if request.layer is Layer.RGB else "off",
-            is_coarse=level > 0, max_pixels=request.max_pixels,
-        )  # fmt: skip
-        with traces.span("draw", **attributes):
-            frame = yield from frame_in_parts(view, with_confidence=request.layer is Layer.CONFIDENCE)
-        range_mm = None
-        if request.layer is Layer.DEPTH and request.format in FOR_EYES:
-            range_mm = renderer_of(drawn, self._device).depth_range.before(pose)
-        frame = frame.enlarged(*size) if level else frame
-        body = yield from _encoded(frame, request, range_mm)
-        reply = _reply(scene, frame, request, snapshot, body)
-        return dataclasses.replace(reply, level=level, depth_range_mm=range_mm, camera=picture_camera)
-
-    def _pose_and_lens(
-        self, scene: TrainedScene, request: RenderRequest
-    ) -> tuple[NDArray[np.float64] | None, Intrinsics]:
-        """The pose of the caller's camera (None: the endoscope's left eye), and its lens before the caller's overrides.
-
-        Raises:
-            InputError: the right eye is asked for, and it is not known, or a pose is given, too.
-        """
-        if request.eye == "left":
-            return pose_of(scene, request.pose), scene.intrinsics
-        if request.pose is not None:
-            raise InputError("eye", "an eye and a pose exclude each other.", "Leave out one of them.")
+    def _right_eye(self, request: RenderRequest) -> RightEye | None:
+        """What is known of the right eye of a scene, or of a job in training."""
         if request.attempt is not None:
-            registration = self._store.newest_report(request.scene_id, request.attempt).right_eye
-        else:
-            clip = self._snapshots.clip(request.scene_id)
-            registration = None if clip is None else clip.registration
-        if registration is None:
-            problem = "the right eye's camera is not known: the clip has one eye, or came with its depth."
-            raise InputError("eye", problem, "Ask for eye=left.")
-        return right_eye(scene, clamped_to_clip(scene, request.t)[0], registration)
-
-    def _measured(self, scene: TrainedScene, request: MeasureRequest) -> Reply:
-        """A Measurement as JSON. Its time does not predict that of renders."""
-        camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-        found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, self._device)
-        return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_untimed=True)
-
-    def _export(self, scene: TrainedScene, request: ExportRequest) -> Reply:
-        """One part of an export. Its time does not predict that of renders."""
-        content, more = self._exports.part(
-            request, lambda: export_parts(scene, request.format, request.options, self._device)
-        )
-        known, t = EXPORT_FORMATS.get(request.format), request.options.t or 0.0
-        shown, warnings = clamped_to_clip(scene, t)[0], scene.pose_warnings
-        if t > shown + ROUNDING:
-            outside = f"t = {t:g} lies outside the clip; t = {shown:.4g} is exported."
-            warnings = (Notice.warning(NoticeCode.TIME_OUTSIDE_CLIP, outside), *warnings)
-        media_type = MEDIA_TYPE_OF_BYTES if known is None else known.media_type
-        return Reply(content, media_type, shown, warnings, is_untimed=True, more=more)
+            return self._store.newest_report(request.scene_id, request.attempt).right_eye
+        clip = self._snapshots.clip(request.scene_id)
+        return None if clip is None else clip.registration
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)
@@ -304,34 +203,18 @@ class Views:
         return sum(COPIES * scene.byte_count + detail_bytes(scene) for scene in self._scenes.values())
 
 
-def _encoded(frame: View, request: RenderRequest, depth_range_mm: tuple[float, float] | None) -> Parts[bytes]:
-    """The encoded file. A large picture takes long and cannot be encoded in parts, so another thread does it."""
-    how = request.layer, request.format, request.quality, request.unseen
-    encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
-    with traces.span("encode", layer=request.layer.value, format=request.format.value):
-        if frame.unseen.size > LARGE_PIXELS:
-            return (yield from beside(encode))
-        return encode()
-
-
-def _reply(scene: TrainedScene, frame: View, request: RenderRequest, snapshot: Snapshot | None, body: bytes) -> Reply:
-    """The reply with a rendered frame."""
-    iteration = None if snapshot is None else snapshot.iteration
-    warnings = frame.warnings
-    if snapshot is not None:
-        # `seen` is computed only when training has ended, so until then the trust is unknown.
-        text = f"Training goes on: this is iteration {iteration}, and how far to trust it is not known yet."
-        goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
-        unknown = {NoticeCode.HARDLY_SEEN}
-        if snapshot.of_one_moment:
-            goes_on = Notice.warning(NoticeCode.FIRST_PICTURE, "First picture: one moment, not yet a model.")
-            # One moment is shown at every time, and no eye has trained the scene.
-            unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
-        warnings = (goes_on, *(each for each in warnings if each.code not in unknown))
-    shown, _ = clamped_to_clip(scene, request.t)
-    clip_size = scene.intrinsics.width, scene.intrinsics.height
-    media_type, count = MEDIA_TYPES[request.format], len(scene.gaussians)
-    return Reply(body, media_type, shown, warnings, iteration, frame.unseen_share, frame.detail_share, count, clip_size)
+def _of_snapshot(reply: Reply, snapshot: Snapshot) -> Reply:
+    """The reply with a rendered frame of a snapshot."""
+    # `seen` is computed only when training has ended, so until then the trust is unknown.
+    text = f"Training goes on: this is iteration {snapshot.iteration}, and how far to trust it is not known yet."
+    goes_on = Notice.warning(NoticeCode.TRAINING_GOES_ON, text)
+    unknown = {NoticeCode.HARDLY_SEEN}
+    if snapshot.of_one_moment:
+        goes_on = Notice.warning(NoticeCode.FIRST_PICTURE, "First picture: one moment, not yet a model.")
+        # One moment is shown at every time, and no eye has trained the scene.
+        unknown |= {NoticeCode.TIME_OUTSIDE_CLIP, NoticeCode.HIGHLIGHTS_UNKNOWN}
+    warnings = (goes_on, *(each for each in reply.warnings if each.code not in unknown))
+    return dataclasses.replace(reply, warnings=warnings, iteration=snapshot.iteration)
 
 
 def _cameras(scene: TrainedScene, snapshot: Snapshot | None) -> Reply:

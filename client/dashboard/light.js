@@ -19,8 +19,8 @@ const WEIGHTS = {
     "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "light_flickers", "little_depth", "mask_gaps",
     "mask_levels", "masks_mark_nothing", "masks_unsure", "motion_guessed", "no_instrument_masked", "no_texture",
     "out_of_focus", "outlier_frames", "pose_far", "pose_jitter", "poses_contradict", "poses_unsure", "repeated_frames",
-    "right_eye_low", "sharpness_changes", "stereo_unsure", "time_outside_clip", "time_too_short", "training_goes_on",
-    "unclassified", "unseen", "veiled"
+    "right_eye_low", "sharpness_changes", "stereo_unsure", "time_in_gap", "time_outside_clip", "time_too_short",
+    "training_goes_on", "unclassified", "unseen", "veiled"
   ],
   "fine": [
     "colours_unknown", "eyes_coloured_apart", "frame_count_unknown", "gpu_idle",

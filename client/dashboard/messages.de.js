@@ -97,6 +97,7 @@ export const DE = {
     "hardly_seen": "Das Endoskop hat diesen Teil kaum gesehen.",
     "highlights_unknown": "Glanzlichter lassen sich nicht ausblenden: Diese Szene wurde nur aus einem Auge gelernt.",
     "pose_far": "Diese Ansicht blickt weit neben dem Endoskop herein: Das meiste ist geraten.",
+    "time_in_gap": "Von diesem Moment der Übertragung ist nichts bekannt; der nächste wird gezeigt.",
     "time_outside_clip": "Dieser Moment liegt außerhalb des Clips; der nächste wird gezeigt.",
     "first_picture": "Ein Moment des Clips, noch kein Modell.",
     "training_goes_on": "Das Training läuft noch; das Bild ändert sich weiter.",

@@ -97,6 +97,7 @@ export const EN = {
     "hardly_seen": "The endoscope hardly saw this part.",
     "highlights_unknown": "Highlights cannot be hidden: one eye alone taught this scene.",
     "pose_far": "This view looks from far beside the endoscope: most of it is a guess.",
+    "time_in_gap": "Nothing is known of this moment of the feed; the nearest one is shown.",
     "time_outside_clip": "This moment lies outside the clip; the nearest one is shown.",
     "first_picture": "One moment of the clip, not yet a model.",
     "training_goes_on": "Training goes on; the picture still changes.",

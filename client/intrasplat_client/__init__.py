@@ -4,7 +4,7 @@ from intrasplat_client import Client         # blocking
 from intrasplat_client import AsyncClient    # the same methods, to be awaited
 
 client.py, async_client.py         the two clients
-core.py                            every route, written once for both
+core.py, feeds.py                  every route, written once for both
 submission.py, events.py           sending a clip; following a job
 views.py, viewer.py                one view; many views over one connection
 session.py, connection.py          repeating calls; a call on a connection that blocks or awaits
@@ -29,8 +29,12 @@ from intrasplat_client.errors import (
     Unauthorized,
     Unreachable,
 )
+from intrasplat_client.feeds import CutJob
 from intrasplat_client.models import (
     ErrorCode,
+    FeedReceipt,
+    FeedState,
+    FeedView,
     JobOptions,
     JobState,
     JobView,
@@ -46,7 +50,11 @@ __all__ = [
     "AsyncClient",
     "Client",
     "Conflict",
+    "CutJob",
     "ErrorCode",
+    "FeedReceipt",
+    "FeedState",
+    "FeedView",
     "Forbidden",
     "Image",
     "InputError",

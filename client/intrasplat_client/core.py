@@ -16,6 +16,7 @@ from typing_extensions import Unpack
 from intrasplat_client import events, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
+from intrasplat_client.feeds import FeedCalls
 from intrasplat_client.models import Delivery, GivenOptions, JobState, JobView, Measurement, Report, SceneCameras
 from intrasplat_client.session import OnWait, Session, parsed
 from intrasplat_client.submission import OnUpload
@@ -32,7 +33,7 @@ NEXT_HEADER = "X-Intrasplat-Next"
 """The cursor of the next page of a list."""
 
 
-class Core:
+class Core(FeedCalls):
     """Every route of a service as a coroutine."""
 
     def __init__(self, connection: Connection, url: str, patience_s: float, on_wait: OnWait | None = None) -> None:
@@ -184,7 +185,7 @@ class Core:
     async def render(
         self,
         /,
-        t: float = 0.0,
+        t: float | str | None = None,
         *,
         scene: str | None = None,
         pose: str | None = None,
@@ -199,10 +200,11 @@ class Core:
         known: Image | None = None,
         **camera: float,
     ) -> Image:
-        """One view of a finished scene, or of a job that trains.
+        """One view of a finished scene, of a job that trains, or of a live feed.
 
-        t: time as a fraction of the clip, in [0, 1].
-        scene: the job's id; needed unless the service holds one scene only.
+        t: time as a fraction of the clip, in [0, 1]; of a live feed "live" (the default), seconds before that (-12.5),
+            seconds of the source, or a time of RFC 3339.
+        scene: the job's or feed's id; needed unless the service holds one scene only.
         pose: orbit:YAW,PITCH,ZOOM in degrees, orbit:YAW,PITCH,ZOOM,X,Y,Z with the point looked at in mm, or
             world_from_camera as 12 or 16 numbers in mm, row-major.
         layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
@@ -223,7 +225,7 @@ class Core:
     async def render_array(
         self,
         /,
-        t: float = 0.0,
+        t: float | str | None = None,
         *,
         scene: str | None = None,
         pose: str | None = None,
@@ -284,7 +286,9 @@ class Core:
         """A small JPEG of a finished scene's first moment."""
         return (await self._get("scenes", scene, "thumbnail")).content
 
-    async def recorded(self, scene: str, t: float = 0.0, eye: str = "left", masks: str = "marked") -> bytes:
+    async def recorded(
+        self, scene: str, t: float | str | None = None, eye: str = "left", masks: str = "marked"
+    ) -> bytes:
         """The recorded frame nearest to t as JPEG, with the masked parts marked; also while the job trains.
 
         `masks="off"` marks nothing; `masks="only"` is the mask, a PNG. `report(scene).recorded` lists the frames.
@@ -301,7 +305,7 @@ class Core:
         /,
         scene: str,
         points: Sequence[tuple[float, float]],
-        t: float = 0.0,
+        t: float | str | None = None,
         pose: str | None = None,
         **camera: float,
     ) -> Measurement:
@@ -314,7 +318,9 @@ class Core:
         response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, **camera)
         return parsed(response, Measurement.model_validate_json, response.content)
 
-    async def export(self, /, scene: str, t: float | None = None, format: str = "ply", **options: float | str) -> bytes:
+    async def export(
+        self, /, scene: str, t: float | str | None = None, format: str = "ply", **options: float | str
+    ) -> bytes:
         """Export the scene to a file format; docs/export.md lists the formats and their options."""
         return (await self._get("scenes", scene, "export", t=t, format=format, **options)).content
 

@@ -47,6 +47,58 @@ class ErrorCode(StrEnum):
     UNCLASSIFIED = "unclassified"
 
 
+class FeedReason(StrEnum):
+    """Why a feed is in its state, why its last segment ended, or why nothing is recorded."""
+
+    UNREACHABLE = "unreachable"
+    HOST_REFUSED = "host_refused"
+    REDIRECTED = "redirected"
+    REFUSED = "refused"
+    CLOSED = "closed"
+    SILENT = "silent"
+    UNDECODABLE = "undecodable"
+    NO_VIDEO = "no_video"
+    TIMES_JUMPED = "times_jumped"
+    SIZE_CHANGED = "size_changed"
+    PACKING_CHANGED = "packing_changed"
+    PACKING_UNKNOWN = "packing_unknown"
+    PICTURE_LIMIT = "picture_limit"
+    DECODER_ENDED = "decoder_ended"
+    DECODER_MEMORY = "decoder_memory"
+    TOO_SLOW = "too_slow"
+    FAULT = "fault"
+    NO_WORKER = "no_worker"
+    UNCLASSIFIED = "unclassified"
+    BY_HAND = "by_hand"
+    END_OF_FILE = "end_of_file"
+    NO_SCENE = "no_scene"
+    CALIBRATION = "calibration"
+    DISK_FULL = "disk_full"
+    DISK_FAILS = "disk_fails"
+    DISK_SLOW = "disk_slow"
+    NOT_RECORDABLE = "not_recordable"
+
+
+class FeedState(StrEnum):
+    """What a feed does now."""
+
+    CONNECTING = "connecting"
+    LIVE = "live"
+    BEHIND = "behind"
+    STALLED = "stalled"
+    PAUSED = "paused"
+    NO_TISSUE = "no_tissue"
+    ENDED = "ended"
+
+
+class FeedWish(StrEnum):
+    """What the caller wants of a feed."""
+
+    RUN = "run"
+    PAUSE = "pause"
+    END = "end"
+
+
 class JobState(StrEnum):
     """Where a job stands."""
 
@@ -155,6 +207,7 @@ class NoticeCode(StrEnum):
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"
+    TIME_IN_GAP = "time_in_gap"
     TIME_OUTSIDE_CLIP = "time_outside_clip"
     FIRST_PICTURE = "first_picture"
     TRAINING_GOES_ON = "training_goes_on"
@@ -229,6 +282,18 @@ class ClipCamera(Model):
     cy: float
 
 
+class CutRange(Model):
+    """What a cut holds. All times are of the arrival of pairs, UNIX s."""
+
+    from_s: float
+    """of its first frame"""
+    to_s: float
+    """of its last frame"""
+    frames: int
+    is_whole: bool = True
+    """whether it holds all recorded frames of the range: a change of the coding ends it"""
+
+
 class Delivery(Model):
     """A webhook about one end of a job, and all tries to deliver it so far."""
 
@@ -267,6 +332,89 @@ class DetailScores(Model):
     psnr_tissue_db: float | None
     psnr_right_db: float | None
     ssim: float | None
+
+
+class FeedOptions(Model):
+    """The options of POST /feeds."""
+
+    source: str | None = None
+    """where the video is: rtsp(s)://, tcp:// or udp:// (MPEG-TS), http(s)://; left out, you push it: PUT
+    /feeds/{id}/video, or the WebSocket /feeds/{id}/pictures
+    """
+    layout: str = "auto"
+    """two eyes in one picture, side by side or top-bottom, or in two streams of one source"""
+    label: str | None = None
+    """a short text to find the job by. Not for names of persons: whoever may view the job reads it."""
+    keep_s: float = 300.0
+    """seconds of the past that can be viewed and cut out"""
+    width: int | None = None
+    """width in pixels of the pictures that the model learns; left out, what the machine keeps up with"""
+    camera: str = "fixed"
+    """fixed: the endoscope's motion counts as the tissue's"""
+
+
+class FeedReceipt(Model):
+    """What became of a feed that was to end."""
+
+    feed_id: str
+    ended_at: str
+    """ISO 8601, UTC: when it was asked for"""
+    bytes: int
+    """bytes that the feed had on disk, as its worker last reported them"""
+    record: bool
+    """the queue has no record of it any more, so its worker has deleted all files"""
+    verified: bool
+    """it was looked whether the data directory has files of it, and it has none"""
+
+
+class FeedView(Model):
+    """A feed as the API shows it: what was asked for, and what its worker said of it last."""
+
+    state: Annotated[FeedState | str, Field(union_mode="left_to_right")]
+    reason: Annotated[FeedReason | str, Field(union_mode="left_to_right")] | None = None
+    """why it is in this state; null while all is well"""
+    text: str = ""
+    """the same for people; its words may change"""
+    since_s: float
+    """when the state began"""
+    recording: Annotated[FeedReason | str, Field(union_mode="left_to_right")] | None = None
+    """why nothing is recorded at the moment; null: it is recorded"""
+    received_fps: float = 0.0
+    """pairs that came in a second, over the last seconds"""
+    used_fps: float = 0.0
+    """pairs that the model learnt a second, over the last seconds"""
+    dropped: int = 0
+    """whole pairs that came in and that the model did not learn, in all"""
+    model_age_s: float | None = None
+    """from the arrival of the newest pair that the model knows until now"""
+    decode_lag_s: float | None = None
+    """from the arrival of a pair to its picture"""
+    reconnects: int = 0
+    """connections after the first"""
+    last_frame_at_s: float | None = None
+    """when the newest pair arrived"""
+    kept_bytes: int = 0
+    """bytes of the recording and of the model's past on disk"""
+    begins_s: float | None = None
+    """the oldest moment that can be viewed; null: none yet"""
+    ends_s: float | None = None
+    """the newest moment that can be viewed"""
+    source_begins_s: float | None = None
+    """begins_s in seconds of the source"""
+    source_ends_s: float | None = None
+    """ends_s in seconds of the source"""
+    width: int | None = None
+    """of the pictures that the model learns, in pixels"""
+    height: int | None = None
+    gaussians: int = 0
+    id: str
+    label: str | None = None
+    wish: Annotated[FeedWish | str, Field(union_mode="left_to_right")]
+    """what its caller wants; the state follows within a second"""
+    options: FeedOptions
+    """as they were given, the source without user and password"""
+    created_at_s: float
+    links: dict[str, str]
 
 
 class FieldOfView(Model):

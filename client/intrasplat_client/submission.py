@@ -157,15 +157,32 @@ async def submit(session: Session, submission: Submission) -> JobView:
             document = {**uploads, **submission.texts, **submission.labels, "options": submission.options}
             call = Call("POST", "/reconstruct", headers=headers, json=document, is_repeatable=True)
         else:
-            boundary = uuid.uuid4().hex
-            headers["Content-Type"] = f"multipart/form-data; boundary={boundary}"
-            call = Call("POST", submission.route, headers=headers, body=_form(submission, boundary), is_repeatable=True)
+            call = form_call(submission)
         response = await session.request(call)
     except ServiceUnavailable as failure:
         if failure.job_id is None:
             raise
         return await _job_of_accepted_clip(session, failure)
     return parsed(response, JobView.model_validate_json, response.content)
+
+
+def form_call(submission: Submission) -> Call:
+    """The request that sends all files in one form."""
+    boundary = uuid.uuid4().hex
+    headers = {"Idempotency-Key": submission.idempotency_key}
+    headers["Content-Type"] = f"multipart/form-data; boundary={boundary}"
+    return Call("POST", submission.route, headers=headers, body=_form(submission, boundary), is_repeatable=True)
+
+
+def prepare_feed(calibration: Path, options: Mapping[str, Any], idempotency_key: str | None) -> Submission:
+    """A live feed that is ready to be opened.
+
+    Raises:
+        InputError: the calibration cannot be read or is empty.
+    """
+    part = "calibration"
+    sizes, key = {part: _size_of(part, calibration)}, idempotency_key or str(uuid.uuid4())
+    return Submission({part: calibration}, sizes, {}, dict(options), {}, key, False, None, "/feeds")
 
 
 async def _job_of_accepted_clip(session: Session, failure: ServiceUnavailable) -> JobView:

@@ -35,7 +35,7 @@ class StreamMessages:
 
     def request(
         self,
-        t: float,
+        t: float | str | None,
         pose: str | None,
         layer: str,
         format: str,
@@ -95,7 +95,7 @@ class Viewer:
 
     def render(
         self,
-        t: float = 0.0,
+        t: float | str | None = None,
         pose: str | None = None,
         *,
         layer: str = "rgb",
@@ -144,7 +144,7 @@ class AsyncViewer:
 
     async def render(
         self,
-        t: float = 0.0,
+        t: float | str | None = None,
         pose: str | None = None,
         *,
         layer: str = "rgb",

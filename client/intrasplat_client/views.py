@@ -52,7 +52,9 @@ class Image:
 
     state is "running" for a view of a job that still trains; iteration is then the step of the snapshot. unseen is the
     share of the view that no training frame saw, detail that of its tissue whose detail comes from recorded frames, and
-    camera the picture's; None: the service is too old to send them.
+    camera the picture's; None: the service is too old to send them. Of a live feed, state is the feed's, captured_at is
+    when the moment's pair arrived (RFC 3339), age_s the seconds from then until the answer, and source_s the moment in
+    seconds of the source; None of a scene.
     warning_codes are those of docs/codes.md, and warning their texts; they say nothing of the scene itself, as its
     report does.
     """
@@ -70,6 +72,9 @@ class Image:
     etag: str | None = None
     render_ms: float | None = None
     camera: PictureCamera | None = None
+    captured_at: str | None = None
+    age_s: float | None = None
+    source_s: float | None = None
 
     def array(self) -> NDArray[Any]:
         """The values of a view requested with format="npy".
@@ -90,7 +95,7 @@ class Image:
 
 
 def view_query(
-    t: float,
+    t: float | str | None,
     scene: str | None,
     pose: str | None,
     layer: str,
@@ -134,6 +139,9 @@ def _image_of(response: httpx.Response) -> Image:
         etag=about.get("etag"),
         render_ms=_duration_ms(about.get("server-timing", ""), "render"),
         camera=PictureCamera.of_document(json.loads(about.get("camera", "null"))),
+        captured_at=about.get("captured-at"),
+        age_s=float(about["age-s"]) if "age-s" in about else None,
+        source_s=float(about["source-s"]) if "source-s" in about else None,
     )
 
 
@@ -167,6 +175,9 @@ def image_of_message(message: bytes | str) -> tuple[object, Image | IntrasplatEr
             warning_codes=tuple(each["code"] for each in head["warnings"]),
             render_ms=head["render_ms"],
             camera=PictureCamera.of_document(head.get("camera")),
+            captured_at=head.get("captured_at"),
+            age_s=head.get("age_s"),
+            source_s=head.get("source_s"),
         )
         return head["id"], image
     except (ValueError, KeyError, TypeError, AttributeError):

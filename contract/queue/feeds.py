@@ -48,8 +48,10 @@ class Feeds(Protocol):
         """
         ...
 
-    def claim_feed(self, owner: str) -> FeedRecord | None:
+    def claim_feed(self, owner: str, *, to_end: bool = False) -> FeedRecord | None:
         """Claim the oldest feed that nobody follows, for FEED_LEASE_S, in a new epoch; None: there is none.
+
+        to_end: of those alone that are to end, as a worker without a free place can do that, too.
 
         Feeds that are to end are claimed, too: their worker deletes what it has of them. An owner whose name before
         the last dot is the same takes a feed over at once: a worker has one process of its name.
@@ -65,7 +67,10 @@ class Feeds(Protocol):
         ...
 
     def wish_feed(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
-        """Change what the caller wants. END is never taken back. Returns the record; None if there is none."""
+        """Change what the caller wants. END is never taken back. Returns the record; None if there is none.
+
+        A feed that no worker ever claimed ends at once: its record is removed.
+        """
         ...
 
     def forget_feed(self, claim: FeedClaim) -> bool:

@@ -35,8 +35,8 @@ class RedisFeeds:
             check_feeds(answer[1], most, answer[2], most_of_tenant)
         return _record_of(table_of(answer[1])) or record
 
-    def claim_feed(self, owner: str) -> FeedRecord | None:
-        answer = self._scripts.run("claim_feed", owner, self._feed_lease_ms)
+    def claim_feed(self, owner: str, *, to_end: bool = False) -> FeedRecord | None:
+        answer = self._scripts.run("claim_feed", owner, self._feed_lease_ms, "1" if to_end else "")
         return _record_of(table_of(answer[1])) if answer else None
 
     def beat_feed(self, claim: FeedClaim, report: FeedReport) -> FeedWish | None:

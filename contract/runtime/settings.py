@@ -15,7 +15,7 @@ from pydantic_core.core_schema import ValidationInfo
 from contract.runtime.queue_url import parse_queue_url
 from intrasplat.errors import InputError
 from intrasplat.intake.limits import EYES, ClipLimits
-from intrasplat.live.spec import MAX_KEEP_S
+from intrasplat.live.spec import MAX_KEEP_S, parsed
 from intrasplat.names import DeviceName
 
 GIB = 2**30
@@ -176,6 +176,18 @@ class Settings(BaseModel):
                 raise ValueError(f"{host!r} is not HOST, HOST:PORT or http://HOST:PORT")
         if hosts and not given.data.get("webhook_secret"):
             raise ValueError(f"webhooks are signed; set {ENVIRONMENT_PREFIX}WEBHOOK_SECRET (openssl rand -hex 32), too")
+        return hosts
+
+    @field_validator("feed_hosts")
+    @classmethod
+    def _sources(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        for host in hosts:
+            try:
+                is_host = parsed(host).host != ""
+            except InputError:
+                is_host = False
+            if not is_host:
+                raise ValueError(f"{host!r} is not SCHEME://HOST or SCHEME://HOST:PORT")
         return hosts
 
     @classmethod

@@ -11,6 +11,7 @@
     │                       and, if there are any, recorded.zip, masks.zip (found masks) and thumbnail.jpg
     ├── unscored/<name>/    an empty file <job>.<n> for each scene that worker <name> has finished and not scored yet
     ├── purging/<job>       an empty file for each job whose removal has started and not ended (service/purge.py)
+    ├── feeds/<id>/         of a live feed: its recording and the past of its model (contract/store/feed_files.py)
     ├── restoring           exists while the data directory is filled from a backup
     ├── run/                of live processes: sockets, locks, claims, last words, the workers' known addresses
     └── valkey/             the embedded queue's log

@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from contract.wire.job import LOCAL_TENANT, TENANT_PATTERN
+from contract.wire.job import LOCAL_TENANT, TENANT_PATTERN, Forecast, JobRecord, JobView
 from contract.wire.labels import LABEL_ABOUT, Label
 from intrasplat.codes import known_code
 from intrasplat.errors import InputError
-from intrasplat.live.spec import MAX_KEEP_S, MAX_URL_CHARACTERS
+from intrasplat.live.spec import MAX_KEEP_S, MAX_URL_CHARACTERS, without_user
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.names import JOB_ID_PATTERN
 
@@ -119,6 +119,99 @@ class FeedRecord(BaseModel):
     epoch: int = 0
     report: FeedReport | None = None
     reported_at_s: float | None = None
+
+
+class FeedView(FeedReport):
+    """A feed as the API shows it: what was asked for, and what its worker said of it last."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    id: str
+    label: str | None = None
+    wish: FeedWish = Field(description="what its caller wants; the state follows within a second")
+    options: FeedOptions = Field(description="as they were given, the source without user and password")
+    created_at_s: float
+    model_age_s: float | None = Field(
+        default=None, description="from the arrival of the newest pair that the model knows until now"
+    )
+    links: dict[str, str]
+
+    @classmethod
+    def of(cls, record: FeedRecord, now_s: float) -> FeedView:
+        """The view of one record at a UNIX time. A feed that no worker follows is connecting for that reason."""
+        known = record.report or FeedReport(state=FeedState.CONNECTING, since_s=record.created_at_s)
+        about = known.model_dump()
+        if known.model_age_s is not None and record.reported_at_s is not None:
+            about["model_age_s"] = known.model_age_s + max(0.0, now_s - record.reported_at_s)
+        if record.owner is None:
+            text = "No worker follows this feed; the next one with a free place does."
+            about |= {"state": FeedState.CONNECTING, "reason": FeedReason.NO_WORKER, "text": text}
+            about |= {"since_s": record.reported_at_s or record.created_at_s, "received_fps": 0.0, "used_fps": 0.0}
+        source, path = record.options.source, f"/feeds/{record.feed_id}"
+        links = {"self": path, "events": f"{path}/events", "cut": f"{path}/cut"}
+        links |= {"pause": f"{path}/pause", "resume": f"{path}/resume", "render": f"/render?scene={record.feed_id}"}
+        if source is None:
+            links |= {"video": f"{path}/video", "pictures": f"{path}/pictures"}
+        return cls(
+            id=record.feed_id,
+            label=record.options.label,
+            wish=record.wish,
+            options=record.options.model_copy(update={"source": None if source is None else without_user(source)}),
+            created_at_s=record.created_at_s,
+            links=links,
+            **about,
+        )
+
+
+class FeedReceipt(BaseModel):
+    """What became of a feed that was to end."""
+
+    feed_id: str
+    ended_at: str = Field(description="ISO 8601, UTC: when it was asked for")
+    bytes: int = Field(description="bytes that the feed had on disk, as its worker last reported them")
+    record: bool = Field(description="the queue has no record of it any more, so its worker has deleted all files")
+    verified: bool = Field(description="it was looked whether the data directory has files of it, and it has none")
+
+
+class CutRange(BaseModel):
+    """What a cut holds. All times are of the arrival of pairs, UNIX s."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    from_s: float = Field(description="of its first frame")
+    to_s: float = Field(description="of its last frame")
+    frames: int
+    is_whole: bool = Field(
+        default=True, description="whether it holds all recorded frames of the range: a change of the coding ends it"
+    )
+
+
+class GivenCut(BaseModel):
+    """The body of POST /feeds/{id}/cut."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    from_: float | str = Field(
+        alias="from",
+        union_mode="left_to_right",
+        description="a moment as t has it: -30, seconds of the source, or a time of RFC 3339",
+    )
+    to: float | str = Field(default=LIVE, union_mode="left_to_right", description="the same; live: until now")
+    options: dict[str, object] = Field(default={}, description="as POST /reconstruct has them")
+    label: str | None = Field(default=None, description=LABEL_ABOUT)
+    metadata: dict[str, object] | None = Field(default=None, description="as POST /reconstruct has it")
+    callback_url: str | None = None
+
+
+class CutJob(JobView):
+    """The job of a part of a feed's recording."""
+
+    cut: CutRange
+
+    @classmethod
+    def of_cut(cls, record: JobRecord, cut: CutRange, forecast: Forecast | None = None) -> CutJob:
+        """The view of its record."""
+        return cls(**JobView.of(record, forecast).model_dump(), cut=cut)
 
 
 class FeedTime(BaseModel):

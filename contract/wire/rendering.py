@@ -15,7 +15,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
-from contract.wire.feeds import FeedShown, FeedTime
+from contract.wire.feeds import CutRange, FeedShown, FeedTime
 from intrasplat.formats import ExportOptions
 from intrasplat.measuring import MAX_POINTS, Point
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
@@ -151,7 +151,8 @@ class MeasureRequest(BaseModel):
 class CutRequest(BaseModel):
     """One part of the recording of a live feed as a video file, asked for one after the other while `more` follow.
 
-    from_s and to_s are UNIX times of the arrival of pairs. The file begins and ends at key frames.
+    from_s and to_s are UNIX times of the arrival of pairs. The file begins and ends at key frames. media_type is
+    video/mp4 or video/x-matroska. A first part without bytes says that the file is being made.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -173,7 +174,8 @@ class CutRequest(BaseModel):
 class PushRequest(BaseModel):
     """The next bytes of the video that a caller pushes, as the body of the message: at most MAX_PUSH_BYTES.
 
-    The answer comes when the feed has taken them. is_last: the caller's connection has ended.
+    The answer comes when the feed has taken them. The bodies of one push are one stream of bytes: a picture may go over
+    several. is_last: the caller's connection has ended.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -248,6 +250,8 @@ class WorkerReply(BaseModel):
     """The camera of a render; None for other answers."""
     feed: FeedShown | None = None
     """The moment that is shown, of a live feed."""
+    cut: CutRange | None = Field(default=None, exclude_if=lambda cut: cut is None)
+    """What the file holds whose first part this is; None for other answers."""
     more: bool = False
     """More parts of the export follow."""
     depth_range_mm: tuple[float, float] | None = None

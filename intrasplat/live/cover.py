@@ -53,21 +53,21 @@ class Cover:
         self.use_px = np.zeros(count, np.float32)
         self._stride, self._waited = stride, 0
 
-    def renew(self, window: Window) -> int:
+    def renew(self, window: Window) -> NDArray[np.intp]:
         """Give Gaussians to the newest frame's tissue without any, if it is much or has not been for long; returns
-        their number M."""
+        their columns [M]."""
         means_mm = window.model.deformed_mean(window.slot).T / np.float32(window.scale)
         pixels, share = self._bare(window.newest.clip, window.shown(), means_mm[self.use_px > 0])
         self._waited += 1
         if share < LEAST_SHARE or (share < MUCH_SHARE and self._waited < LONG_FRAMES):
-            return 0
+            return np.zeros(0, np.intp)
         self._waited = 0
         used_px = self._look(window)
         columns = np.flatnonzero(used_px <= MAX_USE_PX)
         columns = columns[np.argsort(self.use_px[columns], kind="stable")][: len(pixels)]
         if len(columns):
             self._put(window, pixels[: len(columns)], columns, means_mm, used_px)
-        return len(columns)
+        return columns
 
     def _look(self, window: Window) -> NDArray[np.float32]:
         """[N] what the newest frame's pictures use, px; use_px learns it."""

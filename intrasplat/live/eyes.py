@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from intrasplat.clip import DepthClip, StereoClip
-from intrasplat.clip.calibration import rectify
+from intrasplat.clip.calibration import load_calibration, rectify
 from intrasplat.clip.features import find_features
 from intrasplat.clip.sampling import thumbnail
 from intrasplat.clip.shown import find_shown
@@ -26,7 +27,8 @@ from intrasplat.clip.splashes import Splashes
 from intrasplat.clip.types import Eye, RgbFrame
 from intrasplat.errors import InputError
 from intrasplat.instruments import Finder
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.fit import fitted
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.names import Fov
 from intrasplat.options import MAX_DEPTH_MM, MIN_DEPTH_MM
 from intrasplat.stereo.alignment import agreed_disparities, choose_range, match_features
@@ -59,12 +61,12 @@ class LiveEyes:
     """
 
     def __init__(
-        self, calibration: RectifiedCalibration | RawCalibration, settings: EyesSettings, recorded_size: tuple[int, int]
+        self, calibration: StereoCalibration | Path, settings: EyesSettings, recorded_size: tuple[int, int]
     ) -> None:
-        """recorded_size: width and height of one eye of the feed.
+        """calibration: of these eyes, in any size; a path: its file. recorded_size: width and height of one eye.
 
         Raises:
-            InputError: the calibration is of no such eyes.
+            InputError: the calibration cannot be read, or is of no such eyes.
         """
         self.recorded_size, self._settings = recorded_size, settings
         width, height = recorded_size
@@ -72,7 +74,9 @@ class LiveEyes:
         self._size = new_width, max(1, round(height * new_width / width))
         nothing = np.zeros((*self._size[::-1], 3), np.uint8)
         self._pair = nothing, nothing
-        self._rectified = rectify(self._stereo_clip(), calibration.resized(*self._size))
+        if isinstance(calibration, Path):
+            calibration = load_calibration(calibration, eye_width=width, eye_height=height)
+        self._rectified = rectify(self._stereo_clip(), fitted(calibration, width, height).resized(*self._size))
         self._work: FrameWork | None = None
 
     def moment(self, left: RgbFrame, right: RgbFrame, time_s: float) -> DepthClip | None:

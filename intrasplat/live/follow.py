@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 from threading import Lock
 from typing import Literal
 
@@ -21,15 +22,16 @@ import torch
 from intrasplat.clip import DepthClip
 from intrasplat.errors import TrainingDiverged
 from intrasplat.fusion import FusionSettings, fuse
-from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.camera import Placer
 from intrasplat.live.cover import Cover, with_spares
 from intrasplat.live.eyes import EyesSettings, LiveEyes
 from intrasplat.live.motion import Carried, FlowStart
 from intrasplat.live.pair import FeedPair
+from intrasplat.live.trusted import Trusted
 from intrasplat.live.window import Moment, Window
 from intrasplat.machine.cores import cores
-from intrasplat.machine.hooks import ignore
+from intrasplat.machine.hooks import always, ignore
 from intrasplat.machine.opencv import one_opencv_thread
 from intrasplat.methods.fast import INSTANT
 from intrasplat.scene.scene import TrainedScene
@@ -59,6 +61,8 @@ MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
 MANY_CORES = 4
 """With fewer cores, steps beside the reading of a pair use one."""
+LOOK_EVERY = 2
+"""Used frames from one look at what is to be trusted to the next."""
 MIN_STEPS = 2
 """Steps that a pair gets, however short the time is."""
 
@@ -70,6 +74,8 @@ class Added(StrEnum):
     FOLLOWED = "followed"
     NO_SCENE = "no_scene"
     """It shows too little tissue with depth, or nothing that the eyes can be registered by."""
+    NO_TISSUE = "no_tissue"
+    """It does not show tissue."""
     LOST = "lost"
     """The moving camera's pose was not found."""
     RESTARTED = "restarted"
@@ -107,17 +113,20 @@ class FollowSettings:
 class Follower:
     """Follows one feed. One thread calls add(); any thread asks for scenes.
 
-    on_segment is called with every segment as the thread of add() writes it off.
+    on_segment is called with every segment as the thread of add() writes it off. A pair for which is_tissue is False is
+    not learnt.
     """
 
     def __init__(
         self,
-        calibration: RectifiedCalibration | RawCalibration,
+        calibration: StereoCalibration | Path,
         settings: FollowSettings | None = None,
         device: Device = CPU,
         on_segment: Callable[[TrainedScene], None] = ignore,
+        is_tissue: Callable[[DepthClip], bool] = always,
     ) -> None:
         self.settings = settings or FollowSettings()
+        self._is_tissue = is_tissue
         self.segments: tuple[TrainedScene, ...] = ()
         self.used = 0
         self.iteration = 0
@@ -131,12 +140,25 @@ class Follower:
         self._flow: FlowStart
         self._placer: Placer
         self._cover: Cover
+        self._trusted: Trusted
         torch.set_num_threads(1)  # the kernels have threads of their own
 
     @property
     def newest(self) -> Moment | None:
         """The newest moment that the model knows; None: none so far."""
         return None if self._window is None else self._window.newest
+
+    @property
+    def span(self) -> tuple[Moment, Moment] | None:
+        """The oldest and the newest moment of the window; None: nothing is known so far."""
+        with self._lock:
+            return None if self._window is None else (self._window.moments[0], self._window.newest)
+
+    @property
+    def gaussians(self) -> int:
+        """The number of Gaussians of the model."""
+        window = self._window
+        return 0 if window is None else window.model.count
 
     def add(self, pair: FeedPair, budget_s: float = 0.2) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
@@ -161,12 +183,19 @@ class Follower:
             if _psnr_db(shown, ready.moment.clip) < MIN_PSNR_DB:
                 return self._begin(ready, end_s)
             self._flow.look_at(shown)
-            self._version += 1
+            self._look(self._window)
         except TrainingDiverged:
             self._window = None  # what it has learnt is lost
             ready = reading.result()
             return ready if isinstance(ready, Added) else self._begin(ready, end_s)
         return Added.FOLLOWED
+
+    def write_off(self) -> None:
+        """Make all that the model knows a segment; the next pair begins another model."""
+        scene = None if self._window is None else self._current()
+        if scene is not None:
+            self._keep(scene)
+            self._window = None
 
     def close(self) -> None:
         """End the thread that reads pairs. Scenes can still be had; no pair can be added."""
@@ -204,8 +233,19 @@ class Follower:
             if self._window is None:
                 return None if self._scene is None else self._scene[1]
             if self._scene is None or self._scene[0] != self._version:
-                self._scene = self._version, self._window.scene(0, len(self._window.moments), seed=self.settings.seed)
+                self._scene = self._version, self._scene_of(self._window, len(self._window.moments))
             return self._scene[1]
+
+    def _scene_of(self, window: Window, end: int) -> TrainedScene:
+        """The scene of the window's first `end` frames."""
+        return window.scene(end, self._trusted.trust(), seed=self.settings.seed)
+
+    def _look(self, window: Window) -> None:
+        """Look at how the model shows what it has just learnt; from now on its scene is another one."""
+        with self._lock:
+            if self.used % LOOK_EVERY == 1:
+                self._trusted.look(window)
+            self._version += 1
 
     def _prepared(self, pair: FeedPair) -> _Ready | Added:
         """What can be computed of a pair without the model, or why it is not used."""
@@ -213,6 +253,8 @@ class Follower:
             clip = self.read(pair)
             if clip is None:
                 return Added.NO_SCENE
+            if not self._is_tissue(clip):
+                return Added.NO_TISSUE
             window = self._window
             if window is not None and self.settings.camera == "moving":
                 placed = self._placer.placed(clip)
@@ -227,8 +269,7 @@ class Follower:
     def _begin(self, ready: _Ready, end_s: float) -> Added:
         """Begin a model with a frame; the one that was there becomes a segment."""
         moment, settings, is_first = ready.moment, self.settings, self.used == 0
-        if self._window is not None:
-            self._keep(self._window.scene(0, len(self._window.moments), seed=settings.seed))
+        self.write_off()
         stride = stride_for(settings.points, moment.clip.intrinsics)
         fusion = FusionSettings(mode="fill", stride=stride)
         cloud = fuse(moment.clip, [0], fusion, seed=settings.seed, right=moment.clip.right)
@@ -236,11 +277,12 @@ class Follower:
         window = Window(gaussians, moment, settings.segment_frames, self._device)
         with self._lock:
             self._window, self._cover = window, Cover(len(gaussians), stride)
+            self._trusted = Trusted(len(gaussians))
             self.used, self.iteration, self._rehearsed = self.used + 1, 0, 0
             self._version += 1
         self._learn(window, end_s, settings.first_steps)
         self._flow.look_at(window.shown())
-        self._version += 1
+        self._look(window)
         return Added.FIRST if is_first else Added.RESTARTED
 
     def _go_on(self, window: Window, moment: Moment, carried: Carried) -> None:
@@ -252,13 +294,13 @@ class Follower:
         with self._lock:
             window.append(moment, ((MEAN, moved_mm * np.float32(window.scale)), (COLOUR, colour)))
             self.used, self._version = self.used + 1, self._version + 1
-            self._cover.renew(window)
+            self._trusted.forget(self._cover.renew(window))
 
     def _write_off(self, window: Window) -> None:
         """Make the window's first segment a scene of the past."""
         assert self._eyes is not None
         count = self.settings.segment_frames
-        self._keep(window.scene(0, count + 1, seed=self.settings.seed))  # one more frame: no gap is between them
+        self._keep(self._scene_of(window, count + 1))  # one more frame: no gap is between them
         with self._lock:
             window.give_up()
         self._eyes.follow_range(window.newest.clip)

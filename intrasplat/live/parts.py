@@ -14,7 +14,7 @@ import re
 import stat
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +25,9 @@ from intrasplat.live.spec import RecordingSpec
 NAME = re.compile(r"(\d{8})-(\d+)-(-?\d+)-(-?\d+)-(\d+)-(\d+)\.mp4", re.ASCII)
 MICRO = 1_000_000
 MAX_DIGITS = 18
+MAX_UNJUDGED_S = 60.0
+"""A part of which nobody has said for longer whether it may be kept is deleted."""
+Keeps = Callable[[float, float], bool | None]
 MAX_AHEAD_S = 60.0
 """A part that arrives later than now by more is none of ours."""
 
@@ -68,9 +71,14 @@ def read_part(path: Path) -> Part | None:
 class Parts:
     """The parts of a feed, in order. Any thread may call it."""
 
-    def __init__(self, spec: RecordingSpec) -> None:
-        """Find the parts of earlier runs. OSError: the folder cannot be made or read."""
-        self._spec = spec
+    def __init__(self, spec: RecordingSpec, keeps: Keeps | None = None) -> None:
+        """Find the parts of earlier runs.
+
+        keeps: whether a range of source times may be kept; None: not known yet. Without it all is kept.
+
+        OSError: the folder cannot be made or read.
+        """
+        self._spec, self._keeps = spec, keeps
         self._lock = threading.Lock()
         self._pinned: dict[int, int] = {}
         self.incoming, self._folder = spec.folder / "incoming", spec.folder / "parts"
@@ -78,8 +86,9 @@ class Parts:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         found = (read_part(path) for path in self._folder.iterdir())
         self._parts = sorted((each for each in found if each is not None), key=lambda each: each.number)
-        self.adopt()
-        self.clear_incoming()
+        if keeps is None:  # else nobody can say whether what an earlier run left there may be kept
+            self.adopt()
+        self._clear_incoming(is_all=True)
 
     @property
     def kept_bytes(self) -> int:
@@ -99,6 +108,12 @@ class Parts:
             for part in found:
                 if part.to_s < part.from_s or part.last_arrived_at > time.time() + MAX_AHEAD_S:
                     continue
+                keeps = True if self._keeps is None else self._keeps(part.from_s, part.to_s)
+                if keeps is None and time.time() - part.last_arrived_at < MAX_UNJUDGED_S:
+                    break
+                if not keeps:
+                    part.path.unlink()
+                    continue
                 number = self._parts[-1].number + 1 if self._parts else 0
                 times = part.from_s, part.to_s, part.first_arrived_at, part.last_arrived_at
                 target = self._folder / part_name(number, part.segment, *times)
@@ -109,10 +124,22 @@ class Parts:
 
     def clear_incoming(self) -> None:
         """Remove what a process that ended left unfinished."""
+        self._clear_incoming(is_all=self._keeps is None)
+
+    def _clear_incoming(self, *, is_all: bool) -> None:
+        """is_all: also the parts that wait to be judged."""
         with contextlib.suppress(OSError):
             for path in self.incoming.iterdir():
-                with contextlib.suppress(OSError):
-                    path.unlink()
+                if is_all or read_part(path) is None:
+                    with contextlib.suppress(OSError):
+                        path.unlink()
+
+    def forget(self, after_s: float) -> None:
+        """Delete the parts that end after a source time."""
+        with self._lock:
+            for part in [each for each in self._parts if each.to_s > after_s]:
+                part.path.unlink(missing_ok=True)
+                self._parts.remove(part)
 
     def prune(self) -> None:
         """Delete parts that are too old or too many, oldest first, apart from those that a cut reads."""

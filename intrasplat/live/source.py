@@ -16,7 +16,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.connecting import Connection, ConnectionFailed, connect
 from intrasplat.live.cut import Cut, cut_parts
 from intrasplat.live.pair import FeedPair
-from intrasplat.live.parts import Part, Parts
+from intrasplat.live.parts import Keeps, Part, Parts
 from intrasplat.live.process import HandedOver, Numbers, ReadingProcess
 from intrasplat.live.push import Push
 from intrasplat.live.spec import FIELD, PICTURE_HEADER, SourceKind, SourceSpec
@@ -43,10 +43,14 @@ class Source:
         parts: what is recorded; None if nothing is.
     """
 
-    def __init__(self, spec: SourceSpec) -> None:
-        """Raises InputError as SourceSpec.target; OSError: the folder of the recording cannot be used."""
+    def __init__(self, spec: SourceSpec, place: tuple[float, float] | None = None, keeps: Keeps | None = None) -> None:
+        """place: source time, s, and arrival (UNIX time, s) of the last frame of an earlier run, after which this one
+        goes on; the recording may know a later one. keeps: as for Parts.
+
+        Raises InputError as SourceSpec.target; OSError: the folder of the recording cannot be used.
+        """
         self._spec, self._target = spec, spec.target()
-        self.parts = None if spec.recording is None else Parts(spec.recording)
+        self.parts = None if spec.recording is None else Parts(spec.recording, keeps)
         self._changed = threading.Condition()
         self._status = FeedStatus(FeedState.CONNECTING, None, "", time.time())
         self._process: ReadingProcess | None = None
@@ -57,10 +61,10 @@ class Source:
         self._ended_for: FeedReason | None = None
         self._expected: tuple[int, int, str] | None = None
         self._sequence = 0
-        self._place: tuple[float, float] | None = None
+        self._place = place
         index = self.parts.index() if self.parts else ()
         if index:  # goes on after an earlier run
-            self._place = (index[-1].to_s, index[-1].last_arrived_at)
+            self._place = max((index[-1].to_s, index[-1].last_arrived_at), place or (0.0, 0.0))
             self._segments = index[-1].segment + 1
         self._numbers = Numbers()
         self._used = 0
@@ -204,6 +208,7 @@ class Source:
         except Exception as error:
             logger.exception("a live source failed")
             self._set(FeedState.ENDED, FeedReason.FAULT, f"a fault of the program ({type(error).__name__})")
+        self._wait(lambda: False, None)  # what is recorded still grows old
 
     def _read(self) -> None:
         failures = 0
@@ -223,13 +228,12 @@ class Source:
             is_over = reason is FeedReason.END_OF_FILE
             if is_over or (self._target.kind is SourceKind.FILE and reason is not FeedReason.DECODER_ENDED):
                 self._set(FeedState.ENDED, reason, text)
-                break
+                return
             self._set(FeedState.STALLED, reason, text)
             failures = 0 if self._sequence > before else failures + 1
             if self._push is None:
                 self._wait(lambda: self._paused, self._back_off_s(failures))
-        if self._status.state is not FeedState.ENDED:
-            self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
+        self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
 
     def _is_interrupted(self) -> bool:
         """Whether the caller wants no connection any more."""
@@ -260,6 +264,7 @@ class Source:
                 if not self._closed and not enough():
                     self._changed.wait(min(left_s, PRUNE_PERIOD_S))
             if self.parts is not None:
+                self.parts.adopt()
                 self.parts.prune()
         return not self._closed
 

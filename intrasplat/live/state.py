@@ -14,10 +14,11 @@ class FeedState(StrEnum):
     BEHIND = "behind"
     """Pairs come in, but decoding or training cannot keep up: frames are skipped."""
     STALLED = "stalled"
-    """No pair comes in; the source is tried again, or may go on by itself."""
+    """No pair comes in, or the model cannot use those that do; it is tried again."""
     PAUSED = "paused"
     """Nothing is read, decoded or kept."""
     NO_TISSUE = "no_tissue"
+    """Pairs come in, but show no tissue: nothing of them is learnt, shown or kept."""
     ENDED = "ended"
 
 
@@ -47,6 +48,9 @@ class FeedReason(StrEnum):
     """A reason that a later version names."""
     BY_HAND = "by_hand"
     END_OF_FILE = "end_of_file"
+    # of the model alone
+    NO_SCENE = "no_scene"
+    CALIBRATION = "calibration"
     # of the recording alone
     DISK_FULL = "disk_full"
     DISK_FAILS = "disk_fails"
@@ -113,3 +117,52 @@ class FeedNumbers:
     last_frame_at: float | None
     kept_bytes: int
     model_age_s: float | None = None
+
+
+@dataclass(frozen=True)
+class ModelNumbers:
+    """The model of a feed now.
+
+    iteration      steps of its training so far; another model begins at 0
+    gaussians      their number
+    width, height  of its pictures, px
+    pair_steps     steps for each of the last pairs, their median
+    """
+
+    iteration: int
+    gaussians: int
+    width: int
+    height: int
+    pair_steps: float
+
+
+@dataclass(frozen=True)
+class PastRange:
+    """What can be looked at: seconds of the source's clock, and the UNIX times, s, at which these moments came in."""
+
+    begins_s: float
+    ends_s: float
+    begins_at: float
+    ends_at: float
+
+
+@dataclass(frozen=True)
+class FeedReport:
+    """A feed and its model.
+
+    state, reason, text, since, recording  as in FeedStatus, but of both; recording covers segments of the model, too
+    numbers   used_fps, dropped and model_age_s are those of the model
+    model     None: there is none yet
+    past      None: nothing is known yet
+    segment   of the source; None before the first pair
+    """
+
+    state: FeedState
+    reason: FeedReason | None
+    text: str
+    since: float
+    recording: FeedReason | None
+    numbers: FeedNumbers
+    model: ModelNumbers | None
+    past: PastRange | None
+    segment: Segment | None

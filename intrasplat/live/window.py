@@ -37,6 +37,10 @@ SLOT_WIDTH = 0.2
 SCENE_WIDTH = 0.5
 """Width of a basis in a scene, in frames: half-way between two frames it is nearly linear."""
 WEIGHT, SECOND_MOMENTS, STEPS = "motion.weight", "motion.second", "motion.steps"
+ARRIVED_AT = "arrived_at"
+"""Setting of a scene of a feed: UNIX times, s, at which its frames came in."""
+RIGHT_EYE = "right_eye"
+"""Setting of a scene of a feed: a RightEye of intrasplat/report.py."""
 SIDES = (-0.5, 0.5)
 """Camera.side of the left and the right eye, for the gloss."""
 
@@ -155,13 +159,13 @@ class Window:
             right=None,
         )
 
-    def scene(self, first: int, end: int, *, seed: int = 0) -> TrainedScene:
-        """The scene of the frames in slots [first, end), as a copy."""
-        moments = self.moments[first:end]
+    def scene(self, end: int, seen: NDArray[np.float32], *, seed: int = 0) -> TrainedScene:
+        """The scene of the first `end` frames, as a copy. seen: [N] as in TrainedScene."""
+        moments = self.moments[:end]
         count = len(moments)
         gaussians, motion = self.model.export(as_it_lies=True)
         assert isinstance(motion, SharedBasis)
-        states = np.ascontiguousarray(motion.weight.permute(2, 1, 0)[first:end].numpy())
+        states = np.ascontiguousarray(motion.weight.permute(2, 1, 0)[:end].numpy())
         times = torch.arange(count).float() / count
         form = SharedBasis(torch.zeros(0, ROWS, count), times, torch.full((count,), SCENE_WIDTH / count))
         values = np.stack([form.basis(float(t)).double().numpy() for t in times])
@@ -179,8 +183,12 @@ class Window:
             units_per_mm=self.scale,
             preset="live",
             trained_t=tuple(times.tolist()),
-            seen=torch.zeros(len(gaussians)),
+            seen=torch.from_numpy(seen),
             right_eye_mm=tuple(right_mm),
             seed=seed,
+            settings={
+                ARRIVED_AT: [moment.arrived_at for moment in moments],
+                RIGHT_EYE: clip.registration and clip.registration.model_dump(),
+            },
             pictures=WindowPictures(moments),
         )

@@ -47,6 +47,12 @@ def never() -> bool:
     return False
 
 
+def always(*arguments: object) -> bool:
+    """A check that is always passed."""
+    del arguments
+    return True
+
+
 @dataclass(frozen=True)
 class Hooks:
     """The caller's callbacks. The first two are called between steps of the work (worker/hang.py has the longest step).

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from intrasplat.clip import DepthClip
 from intrasplat.poses.rigid import Reals, exp, inverse, log
@@ -74,6 +73,8 @@ def steadied(given: Reals, found: Reals, unsure: Sequence[int]) -> Steadied:
     it. The window is the one with the least expected error: jitter that passes plus drift that the filter loses, as
     leave-one-out prediction shows it. Unsure frames keep their given pose, and so does a clip too short.
     """
+    from scipy.signal import savgol_coeffs, savgol_filter  # takes long, and few processes need it
+
     count = len(given)
     sure = np.setdiff1d(np.arange(count), unsure)
     between = np.stack([log(one @ inverse(two)) for one, two in zip(given, found, strict=True)])

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.clip import spread
+from intrasplat.clip import Eye, spread
 from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.layout import COLOUR
 from intrasplat.splat.metrics import RIGHT_COLOUR, RIGHT_DEPTH
@@ -40,7 +40,11 @@ LEAST_TRUST = 1 / 63
 
 def trust(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float32]:
     """[N] in [0, 1]: the probability that a Gaussian is right; 0 if no training frame saw it."""
-    found = evidence(model, eyes)
+    return trust_of(evidence(model, eyes))
+
+
+def trust_of(found: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N] the trust that evidence [2, N] gives."""
     likely = 1 / (1 + np.exp(-(WEIGHTS @ logarithms(found) + BIAS)))
     return np.where(found[0] > 0, np.clip(likely, LEAST_TRUST, 1), 0).astype(np.float32)
 
@@ -59,9 +63,9 @@ def evidence(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float64
     on_tissue, error = np.zeros((2, model.count))
     for index in sampled:
         for place, frames in enumerate(eyes):
-            here, drawn, wrong = _weights(model, frames, index)
-            sees = (here >= MIN_TISSUE_PX) & (here >= MIN_TISSUE_SHARE * drawn)
-            seen[place] += np.where(sees, np.minimum(here / np.where(sees, drawn, 1), 1), 0)
+            camera, t = frames.cameras[index], float(frames.t[index])
+            here, drawn, wrong = weights_in(model, camera, t, frames.eye, index, frames.scale)
+            seen[place] += sees(here, drawn)
             on_tissue += here
             error += wrong
             frames.eye.let_go(index)
@@ -69,27 +73,37 @@ def evidence(model: Model, eyes: Sequence[TrainingFrames]) -> NDArray[np.float64
     return np.stack([seen.max(0) / len(sampled), mean_error])
 
 
-def _weights(model: Model, frames: TrainingFrames, index: int) -> NDArray[np.floating]:
-    """[3, N]: each Gaussian's blending weights in frame `index`, summed over tissue, over all pixels, and over tissue
-    times the pixel's error.
+def sees(on_tissue: NDArray[np.floating], drawn: NDArray[np.floating]) -> NDArray[np.floating]:
+    """[N] how much a frame saw each Gaussian, in [0, 1], by its weights on tissue and in the whole picture."""
+    seen = (on_tissue >= MIN_TISSUE_PX) & (on_tissue >= MIN_TISSUE_SHARE * drawn)
+    return np.where(seen, np.minimum(on_tissue / np.where(seen, drawn, 1), 1), 0)
+
+
+def weights_in(
+    model: Model, camera: NDArray[np.float64], t: float, eye: Eye, index: int, scale: float
+) -> NDArray[np.floating]:
+    """[3, N]: each Gaussian's blending weights in an eye's frame `index`, summed over tissue, over all pixels, and over
+    tissue times the pixel's error.
 
     A Gaussian's weights, summed over chosen pixels, are the gradient of a colour summed over them.
+
+    Args:
+        camera, t: the eye's camera, and the model's time of the frame.
+        scale: optimiser units per mm.
     """
-    camera, t = frames.cameras[index], float(frames.t[index])
-    tissue = frames.eye.tissue[index]
+    tissue = eye.tissue[index]
     cotangents = np.zeros((5, *tissue.shape), np.float32)
-    cotangents[2] = tissue * _errors(frames, index, model.render(camera, t))
+    cotangents[2] = tissue * _errors(eye, index, scale, model.render(camera, t))
     cotangents[0], cotangents[1] = tissue, 1
     return np.asarray(model.image_gradient(camera, t, cotangents)[COLOUR] / np.float32(SH_C0))
 
 
-def _errors(frames: TrainingFrames, index: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _errors(eye: Eye, index: int, scale: float, image: NDArray[np.float32]) -> NDArray[np.float32]:
     """[H, W] sum of the errors of colour and depth, each divided by the largest that counts as right. Depth that stereo
     did not measure is a guess: its error counts as 1.
     """
-    eye = frames.eye
     colour = np.abs(np.clip(image[:3], 0, 1) - eye.rgb[index].transpose(2, 0, 1) / np.float32(255)).mean(0)
-    shown_mm = image[3] / np.maximum(image[4], 1e-3) / np.float32(frames.scale)
+    shown_mm = image[3] / np.maximum(image[4], 1e-3) / np.float32(scale)
     measured = eye.depth_mm[index] > 0
     relative = np.abs(shown_mm / np.where(measured, eye.depth_mm[index], 1) - 1)
     depth = np.where(measured, np.minimum(relative, MAX_DEPTH_ERROR), RIGHT_DEPTH)

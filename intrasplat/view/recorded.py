@@ -27,6 +27,7 @@ from intrasplat.picture import RecordedMasks
 from intrasplat.report import Recorded
 from intrasplat.scene.recorded_file import EYES, MASK, PICTURE, name_of, nearest, read_frame
 from intrasplat.scene.recorded_video import RecordedEye, encoded
+from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.training_pictures import coded
 
 MAX_MOMENTS = 120
@@ -109,7 +110,7 @@ def _zipped(
                 is_masked = is_masked or bool(tool.any())
                 if index not in filmed:
                     archive.writestr(zipfile.ZipInfo(name_of(name, index, PICTURE)), _jpeg(_rgb(eye, index)))
-                masks[name_of(name, index, MASK)] = _png(tool)
+                masks[name_of(name, index, MASK)] = mask_png(tool)
         for path, png in masks.items() if is_masked else ():
             archive.writestr(zipfile.ZipInfo(path), png)
     return content.getvalue(), is_masked
@@ -126,9 +127,27 @@ def live_frame(
     index = nearest(clip.used, t, clip.frame_count)
     of = _eye(clip, eye)
     if masks is RecordedMasks.ONLY:
-        return index, _png(_tool(of, index))
+        return index, mask_png(_tool(of, index))
     rgb = _rgb(of, index)
     return index, _jpeg(_marked(rgb, _tool(of, index)) if masks is RecordedMasks.MARKED else rgb)
+
+
+def pictured_frame(
+    scene: TrainedScene, t: float, eye: EyeName = "left", masks: RecordedMasks = RecordedMasks.MARKED
+) -> tuple[int, bytes]:
+    """As live_frame, from the training pictures that a scene has in memory.
+
+    Raises:
+        InputError: it has none, or none of this eye.
+    """
+    pictures, place = scene.pictures, EYES.index(eye)
+    if pictures is None or place >= len(pictures.eyes):
+        raise InputError("eye", f"the scene has no recorded frames of the {eye} eye.", "Ask for eye=left.")
+    index = nearest(pictures.frames, t, scene.frame_count)
+    rgb, tissue = pictures.picture(place, index)
+    if masks is RecordedMasks.ONLY:
+        return index, mask_png(~tissue)
+    return index, _jpeg(_marked(rgb.copy(), ~tissue) if masks is RecordedMasks.MARKED else rgb)
 
 
 def stored_frame(
@@ -217,7 +236,7 @@ def _decoded(content: bytes, flags: int) -> Picture:
     return np.asarray(picture, np.uint8)
 
 
-def _png(tool: Mask) -> bytes:
+def mask_png(tool: Mask) -> bytes:
     """255 on instruments, transparent elsewhere, 1 bit a pixel."""
     png = cv2.imencode(".png", tool.view(np.uint8) * np.uint8(255), [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
     return png[:AFTER_HEADER] + BLACK_IS_CLEAR + png[AFTER_HEADER:]

@@ -12,12 +12,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from intrasplat.live.spec import PICTURE_HEADER
+from lab.phantom import Phantom
 
 HEIGHT, WIDTH = 48, 64  # of an eye
 RATE_HZ = 30
@@ -168,3 +171,44 @@ def video_file(path: Path, frames: int, **options: str) -> Path:
     """A Matroska file of moving pictures."""
     path.write_bytes(recorded(frames, "matroska", **options))
     return path
+
+
+class PhantomSender:
+    """Sends a small phantom's pictures, to and fro, in real time.
+
+    cover  a picture to send instead; None: the phantom
+    url    of the server that sends to whoever connects
+    """
+
+    def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
+        frames = [phantom.frame(index) for index in range(phantom.settings.frames)]
+        self._pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
+        self.calibration, self.cover, self.url = phantom.settings.calibration, cover, ""
+
+    @contextmanager
+    def serving(self) -> Iterator[Self]:
+        """Serve at `url`."""
+        with tcp_server(self._serve) as self.url:
+            yield self
+
+    def stream(self) -> Iterator[bytes]:
+        """The pieces of an MPEG-TS, each when it is due."""
+        stream = Stream()
+        for index in in_real_time():
+            yield stream.frame(self._shown(index))
+
+    def pictures(self) -> Iterator[bytes]:
+        """JPEG pictures of both eyes, each after its header and when it is due."""
+        for index in in_real_time():
+            bgr = cv2.cvtColor(self._shown(index), cv2.COLOR_RGB2BGR)
+            content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+            yield PICTURE_HEADER.pack(time.time(), len(content)) + content
+
+    def _shown(self, index: int) -> NDArray[np.uint8]:
+        last = len(self._pictures) - 1
+        place = index % (2 * last)
+        return self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
+
+    def _serve(self, connection: socket.socket) -> None:
+        for content in self.stream():
+            connection.sendall(content)

@@ -191,3 +191,23 @@ def test_a_smaller_model_follows_larger_pictures() -> None:
     follower = _following(phantom, 3, replace(SETTINGS, eyes=replace(SETTINGS.eyes, width=96)))
     scene, _ = follower.scene_at() or pytest.fail("there is a scene")
     assert (scene.intrinsics.width, scene.intrinsics.height) == (96, 72)
+
+
+def test_what_the_pictures_show_is_trusted_and_what_lies_beside_them_is_not() -> None:
+    phantom = _phantom("breathing")
+    follower = _following(phantom, 8)
+    for scene, t in (follower.scene_at() or pytest.fail("no scene"), (follower.segments[0], 0.25)):
+        view = render_frame(scene, t)
+        solid = view.depth_mm > 0
+        assert view.unseen_share < 0.1
+        assert np.median(view.confidence[solid]) > 0.2
+        assert not {"unseen", "hardly_seen"} & {each.code for each in view.warnings}
+        aside = render_frame(scene, t, view_beside(scene))
+        assert np.median(aside.confidence) < np.median(view.confidence[solid])
+
+
+def view_beside(scene: TrainedScene) -> NDArray[np.float64]:
+    """A pose far to the side of the endoscope's."""
+    pose = scene.world_from_camera[0].copy()
+    pose[0, 3] += 40.0
+    return pose

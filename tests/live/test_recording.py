@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import socket
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -168,3 +169,12 @@ def test_only_parts_are_adopted(tmp_path: Path) -> None:
     assert [(part.number, part.from_s) for part in parts.index()] == [(0, 198.0)]
     with pytest.raises(InputError, match="cannot be read"):
         cut_parts(parts, 198.0, 199.0, tmp_path / "cut.mp4")
+
+
+def test_parts_grow_old_also_when_the_source_has_ended(opened: Open, recording: RecordingSpec, tmp_path: Path) -> None:
+    video = tmp_path / "clip.mkv"
+    video.write_bytes(recorded(FRAMES, "matroska"))
+    source = opened(str(video), recording=replace(recording, keep_s=2.0))
+    until_state(source, FeedState.ENDED, FeedReason.END_OF_FILE)
+    assert source.index()
+    until(lambda: not source.index())

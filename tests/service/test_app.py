@@ -52,6 +52,8 @@ OPERATIONS = {
         "purge_scene",
     ),
     *("get_file", "get_thumbnail", "import_scene", "get_key"),
+    *("open_feed", "list_feeds", "get_feed", "watch_feed", "pause_feed", "resume_feed", "end_feed"),
+    *("cut_feed", "push_video"),
     *("healthz", "readyz", "info", "metrics"),
 }
 """What clients are generated from: renaming or removing one breaks them."""

@@ -15,7 +15,7 @@ from contract.queue.interface import Event
 from contract.store.shelf import new_job_id
 from contract.wire.job import JobError, JobFiles, JobProgress, JobRecord
 from intrasplat.errors import UnavailableError
-from service.events import NOTHING_SEEN, Feeds
+from service.events import NOTHING_SEEN, JobChannels
 from tests.memory_queue import MemoryQueue
 from tests.service.under_test import ServiceUnderTest, assert_problem
 
@@ -102,7 +102,7 @@ def test_a_purged_job_ends_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
 
     async def listen() -> list[bytes]:
         pieces = []
-        async for piece in Feeds(queue).stream(job_id, NOTHING_SEEN):
+        async for piece in JobChannels(queue).stream(job_id, NOTHING_SEEN):
             pieces.append(piece)
             if b"queued" in piece:
                 queue.cancelled_and_forgotten(job_id)
@@ -119,7 +119,7 @@ def test_a_position_in_the_queue_that_moves_is_told(monkeypatch: pytest.MonkeyPa
 
     async def listen() -> list[int]:
         positions: list[int] = []
-        async for piece in Feeds(queue).stream(second, NOTHING_SEEN):
+        async for piece in JobChannels(queue).stream(second, NOTHING_SEEN):
             if b"data:" not in piece:
                 continue
             position = json.loads(piece.split(b"data: ", 1)[1].splitlines()[0])["position"]
@@ -136,10 +136,10 @@ def test_a_position_in_the_queue_that_moves_is_told(monkeypatch: pytest.MonkeyPa
 def test_many_listeners_share_one_poller_and_a_silent_queue_costs_them_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.events.POLL_PERIOD_S", 0.01)
     queue, job_id = submitted()
-    feeds = Feeds(queue)
+    channels = JobChannels(queue)
 
     async def listen() -> bytes:
-        return b"".join([piece async for piece in feeds.stream(job_id, NOTHING_SEEN)])
+        return b"".join([piece async for piece in channels.stream(job_id, NOTHING_SEEN)])
 
     async def all_of_them() -> list[bytes]:
         listeners = [asyncio.create_task(listen()) for _ in range(50)]
@@ -153,19 +153,19 @@ def test_many_listeners_share_one_poller_and_a_silent_queue_costs_them_nothing(m
 
     heard = asyncio.run(limited(all_of_them()))
     assert all(each.count(b"cancelled") == heard[0].count(b"cancelled") > 0 for each in heard)
-    assert feeds._feeds == {}
+    assert channels._channels == {}
 
 
 def test_the_end_of_the_service_ends_every_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.events.POLL_PERIOD_S", 0.01)
     queue, job_id = submitted()
-    feeds = Feeds(queue)
+    channels = JobChannels(queue)
 
     async def listen() -> int:
         count = 0
-        async for _ in feeds.stream(job_id, NOTHING_SEEN):
+        async for _ in channels.stream(job_id, NOTHING_SEEN):
             count += 1
-            feeds.end()
+            channels.end()
         return count
 
     assert asyncio.run(limited(listen())) > 0
@@ -176,7 +176,7 @@ def test_silence_is_filled_with_heartbeats(monkeypatch: pytest.MonkeyPatch) -> N
     queue, job_id = submitted()
 
     async def listen() -> bytes:
-        async for piece in Feeds(queue).stream(job_id, NOTHING_SEEN):
+        async for piece in JobChannels(queue).stream(job_id, NOTHING_SEEN):
             if piece.startswith(b":"):
                 return piece
         return b""

@@ -274,7 +274,7 @@ def test_who_does_not_is_shown_out(guarded: LiveService, first: str) -> None:
 
 
 def test_who_sends_no_key_at_all_is_shown_out_too(guarded: LiveService, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.stream.AUTHORIZE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("service.sockets.AUTHORIZE_TIMEOUT_S", 0.1)
     with viewing(guarded) as viewer:
         assert problem(viewer)["status"] == 401
 

@@ -23,9 +23,10 @@ from intrasplat.names import CURVE, MANIFEST, REPORT, RESUME
 from tests.memory_queue import MemoryQueue
 from tests.worker.jobs import STANDIN, Jobs, eventually
 from worker import child, consume, hang
+from worker.announce import announced
 from worker.child import ChildKeeper
 from worker.consume import Consumer
-from worker.supervisor import address_of, announced
+from worker.supervisor import address_of
 
 
 class JobLoop(Jobs):

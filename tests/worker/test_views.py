@@ -35,7 +35,7 @@ from intrasplat.splat.gaussians import Gaussians
 from intrasplat.view.camera import camera_of, pose_of
 from intrasplat.view.render import clamped_to_clip
 from tests.worker.exports import export_request, exported
-from worker import views as views_module
+from worker import rendered as rendered_module
 from worker.reply import NotYetError, Reply
 from worker.snapshot import Snapshots
 from worker.views import COPIES, Views
@@ -483,14 +483,14 @@ def test_a_small_picture_through_a_wide_lens_counts_what_is_drawn_for_it_towards
 def test_others_are_answered_while_a_large_picture_is_encoded(
     store: Store, scene_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, answered, encode = threading.Event(), threading.Event(), views_module.encode_layer
+    begun, answered, encode = threading.Event(), threading.Event(), rendered_module.encode_layer
 
     def slow(*args: Any, **named: Any) -> bytes:
         begun.set()
         assert answered.wait(60), "nobody was answered meanwhile"
         return encode(*args, **named)
 
-    monkeypatch.setattr(views_module, "encode_layer", slow)
+    monkeypatch.setattr(rendered_module, "encode_layer", slow)
 
     def look(number: int) -> None:
         if begun.is_set():

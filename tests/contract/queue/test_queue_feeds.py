@@ -129,6 +129,25 @@ def test_an_end_is_final_and_its_worker_removes_the_feed(queue: Queue) -> None:
     assert queue.wish_feed(record.feed_id, FeedWish.RUN) is None
 
 
+def test_a_feed_that_no_worker_ever_claimed_ends_at_once(queue: Queue) -> None:
+    record = opened(queue)
+    assert queue.wish_feed(record.feed_id, FeedWish.END) is None
+    assert queue.feeds() == []
+    assert queue.claim_feed("worker-1.a") is None
+    assert opened(queue, record).epoch == 0
+
+
+def test_a_worker_without_a_free_place_claims_what_is_to_end_alone(queue: Queue) -> None:
+    _, second = opened(queue, feed(1000.0)), opened(queue, feed(2000.0))
+    for claim in [claimed(queue), claimed(queue)]:
+        assert queue.release_feed(claim)
+    assert queue.claim_feed("worker-2.b", to_end=True) is None
+    queue.wish_feed(second.feed_id, FeedWish.END)
+    found = queue.claim_feed("worker-2.b", to_end=True)
+    assert found is not None
+    assert found.feed_id == second.feed_id
+
+
 def test_a_reason_of_a_later_version_can_be_read(queue: Queue) -> None:
     document = LIVE.model_dump(mode="json") | {"reason": "solar_flare", "flares": 3}
     assert FeedReport.model_validate(document).reason is FeedReason.UNCLASSIFIED

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -35,3 +36,17 @@ def test_after_the_with_statement_signals_do_what_they_did_before() -> None:
         signal.raise_signal(signal.SIGTERM)
         assert end.wait(10)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_process_lets_others_first_with_its_whole_session() -> None:
+    program = """
+import os
+from pathlib import Path
+from intrasplat.machine.processes import let_others_first
+let_others_first(7)
+let_others_first(7)
+group = Path("/proc/self/autogroup")
+print(os.nice(0), group.read_text().split()[-1] if group.exists() else 7)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, start_new_session=True)
+    assert done.stdout.split() == [str(max(7, os.nice(0))), "7"], done.stderr

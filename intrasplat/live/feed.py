@@ -1,0 +1,197 @@
+"""Feed: a live source, the model that follows it, and its past, as one object."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+from intrasplat.intake.calibration.types import StereoCalibration
+from intrasplat.live.cut import Cut
+from intrasplat.live.follow import FollowSettings
+from intrasplat.live.kept import KeptSegment
+from intrasplat.live.looking import FeedView, find_view, range_of
+from intrasplat.live.model import FeedModel
+from intrasplat.live.parts import Part
+from intrasplat.live.past import Past, PastSpec
+from intrasplat.live.source import Source
+from intrasplat.live.spec import SourceSpec
+from intrasplat.live.state import FeedReason, FeedReport, FeedState
+from intrasplat.live.times import LIVE, FeedTime
+from intrasplat.live.tissue import TissueWatch
+from intrasplat.splat.backend import CPU, Device
+
+
+@dataclass(frozen=True)
+class FeedSettings:
+    """How a feed is followed, and what of it is kept. The SourceSpec says what is recorded.
+
+    width        of the model's pictures, px; None: what the machine keeps up with
+    camera       as in FollowSettings
+    keep_s       seconds that can be looked back
+    segments     folder of the past, of this feed alone; None: it is in memory, and ends with the feed
+    max_bytes    of the past on disk
+    max_age_s    a feed whose model is older is behind, and its newest moment is stale
+    budget_s     seconds for each pair; None: chosen by size and device
+    finds_tissue whether nothing is learnt, shown or kept while the pictures show no tissue
+    follow       the other settings of the follower; its width, camera and keep_s are not used
+    """
+
+    width: int | None = None
+    camera: Literal["fixed", "moving"] = "fixed"
+    keep_s: float = 600.0
+    segments: Path | None = None
+    max_bytes: int = 8 << 30
+    max_age_s: float = 2.5
+    budget_s: float | None = None
+    finds_tissue: bool = True
+    follow: FollowSettings = field(default_factory=FollowSettings)
+
+    def of_follower(self) -> FollowSettings:
+        """The follower's settings."""
+        return replace(self.follow, eyes=replace(self.follow.eyes, width=self.width), camera=self.camera)
+
+    def of_past(self) -> PastSpec:
+        """What is kept of the model."""
+        return PastSpec(self.segments, self.keep_s, self.max_bytes)
+
+
+class Feed:
+    """A feed that is read and followed since it was made. Any thread may call it. A context manager.
+
+    Example:
+        with Feed(SourceSpec("rtsp://camera.example.org/stereo"), calibration) as feed:
+            newest_s = feed.wait_for_newer(-1.0, timeout_s=10.0)
+            shown = feed.view_of(FeedTime.before_live(2.0))
+            view = render_frame(shown.scene, shown.t)
+    """
+
+    def __init__(
+        self,
+        source: SourceSpec,
+        calibration: StereoCalibration | Path,
+        settings: FeedSettings | None = None,
+        device: Device = CPU,
+    ) -> None:
+        """Raises InputError as SourceSpec.target; OSError: a folder cannot be used."""
+        self.settings = settings or FeedSettings()
+        self._past = Past(self.settings.of_past())
+        earlier = self._past.segments()
+        place = (earlier[-1].source_s[1], earlier[-1].arrived_at[1]) if earlier else None
+        self._watch = TissueWatch() if self.settings.finds_tissue else None
+        self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
+        of_follower, budget_s = self.settings.of_follower(), self.settings.budget_s
+        self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
+        self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def report(self) -> FeedReport:
+        """State, numbers, model and past of now."""
+        status, numbers, window = self._source.status, self._source.numbers(), self._model.span()
+        past = range_of(window, self._past)
+        age_s = None if past is None else time.time() - past.ends_at
+        state, reason, text = status.state, status.reason, status.text
+        if state in (FeedState.LIVE, FeedState.BEHIND):
+            trouble = self._model.trouble
+            if self._watch is not None and self._watch.is_out:
+                state, reason, text = FeedState.NO_TISSUE, None, "the pictures show no tissue: nothing is kept of them"
+            elif trouble is not None:
+                state, reason, text = FeedState.STALLED, trouble.reason, trouble.text
+            elif age_s is None or not self._model.has_begun:
+                state, reason, text = FeedState.CONNECTING, None, "the model begins"
+            elif age_s > self.settings.max_age_s:
+                state, reason, text = FeedState.BEHIND, FeedReason.TOO_SLOW, "the model does not keep up"
+        numbers = replace(
+            numbers,
+            used_fps=self._model.used_fps(),
+            dropped=numbers.dropped + self._model.left_out,
+            kept_bytes=numbers.kept_bytes + self._past.kept_bytes,
+            model_age_s=age_s,
+        )
+        return FeedReport(
+            state=state,
+            reason=reason,
+            text=text,
+            since=self._since(state, reason),
+            recording=status.recording or self._past.problem,
+            numbers=numbers,
+            model=self._model.numbers(),
+            past=past,
+            segment=self._source.segment,
+        )
+
+    def view_of(self, when: FeedTime = LIVE) -> FeedView | None:
+        """The moment of a time, to be rendered; None: nothing is known yet.
+
+        Raises:
+            InputError: the time lies before the past that is kept; its field is "t".
+        """
+        return find_view(when, self._model.scene(), self._past, self.settings.max_age_s)
+
+    def wait_for_newer(self, source_s: float, timeout_s: float) -> float | None:
+        """The source time of the newest known moment as soon as that is after source_s; None: not in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            known = range_of(self._model.span(), self._past)
+            if known is not None and known.ends_s > source_s:
+                return known.ends_s
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            with self._model.changed:
+                self._model.changed.wait(min(left_s, 0.1))
+
+    def segments(self) -> tuple[KeptSegment, ...]:
+        """The past's segments, oldest first."""
+        return self._past.segments()
+
+    def recorded(self) -> tuple[Part, ...]:
+        """What is recorded, oldest first."""
+        return self._source.index()
+
+    def cut(self, from_s: float, to_s: float, path: Path) -> Cut:
+        """One playable file of the recorded packets of [from_s, to_s] in source time; see cut_parts."""
+        return self._source.cut(from_s, to_s, path)
+
+    def pause(self) -> None:
+        """Read, learn and keep nothing from now on; what is known stays."""
+        self._source.pause()
+
+    def resume(self) -> None:
+        """Go on at the source's present."""
+        self._source.resume()
+
+    def write(self, data: bytes, timeout_s: float = 10.0) -> None:
+        """Push bytes of a stream; see Source.write."""
+        self._source.write(data, timeout_s)
+
+    def write_picture(self, data: bytes, captured_s: float | None = None, timeout_s: float = 10.0) -> None:
+        """Push a picture of both eyes; see Source.write_picture."""
+        self._source.write_picture(data, captured_s, timeout_s)
+
+    def end_push(self) -> None:
+        """The pushed stream has ended; another may begin."""
+        self._source.end_push()
+
+    def close(self) -> None:
+        """End it. What is on disk stays, and is the past of a feed that is made with the same folders."""
+        self._model.close()
+        if self._watch is not None:
+            self._watch.end()
+        self._source.close()
+        self._past.close()
+
+    def _since(self, state: FeedState, reason: FeedReason | None) -> float:
+        """The UNIX time, s, at which this state was found first."""
+        if self._state[:2] != (state, reason):
+            self._state = (state, reason, time.time())
+        return self._state[2]

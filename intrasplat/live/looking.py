@@ -1,0 +1,136 @@
+"""Where a feed's time lies in what its model knows: the window's scene, or a segment of the past."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from intrasplat.errors import InputError
+from intrasplat.live.kept import KeptSegment, arrivals
+from intrasplat.live.past import Past
+from intrasplat.live.state import PastRange
+from intrasplat.live.times import FIELD, LIVE, FeedTime, FeedTimeKind
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.scene.scene import TrainedScene
+
+MAX_STEP_S = 1.0
+"""Between used frames that are farther apart nothing is known: the nearest one is shown."""
+TOLERANCE_S = 0.05
+"""A moment that is shown in place of one that is so near needs no notice."""
+WINDOW = -1
+"""Number of what the window covers, which is no segment yet."""
+Axis = Literal["source_s", "arrived_at"]
+
+
+@dataclass(frozen=True, eq=False)
+class FeedView:
+    """A moment of a feed, to be rendered.
+
+    scene, t     the scene and its model time
+    source_s     the moment, in seconds of the source's clock
+    captured_at  UNIX time, s, at which it came in
+    age_s        from then until now
+    is_live      whether it is the newest moment that the model knows
+    is_stale     whether it is, and is older than the feed's greatest age
+    notices      time_in_gap: another moment than that which was asked for is shown, the nearest one that is known
+    """
+
+    scene: TrainedScene
+    t: float
+    source_s: float
+    captured_at: float
+    age_s: float
+    is_live: bool
+    is_stale: bool
+    notices: tuple[Notice, ...] = ()
+
+
+def range_of(window: KeptSegment | None, past: Past) -> PastRange | None:
+    """What can be looked at; None: nothing. window: what the newest frames cover."""
+    spans = _spans(window, past)
+    if not spans:
+        return None
+    first, last = spans[0], spans[-1]
+    return PastRange(first.source_s[0], last.source_s[1], first.arrived_at[0], last.arrived_at[1])
+
+
+def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedView | None:
+    """The view of a time; None: nothing is known yet.
+
+    Raises:
+        InputError: the time lies before all that is kept.
+    """
+    newest = None if window is None else KeptSegment.of(WINDOW, window)
+    while spans := _spans(newest, past):
+        newest_s = spans[-1].source_s[1]
+        axis: Axis = "arrived_at" if asked.kind is FeedTimeKind.UNIX else "source_s"
+        wanted = {FeedTimeKind.LIVE: newest_s, FeedTimeKind.BEFORE_LIVE: newest_s - asked.seconds}.get(
+            asked.kind, asked.seconds
+        )
+        begins = getattr(spans[0], axis)[0]
+        if wanted < begins - TOLERANCE_S:
+            raise _too_early(asked, spans)
+        chosen = _chosen(spans, axis, wanted)
+        scene = window if chosen is newest else past.load(chosen)
+        if scene is not None:
+            return _view(asked, scene, axis, wanted, newest_s, max_age_s)
+    return None
+
+
+def _spans(window: KeptSegment | None, past: Past) -> list[KeptSegment]:
+    """What each scene covers, oldest first."""
+    spans = [*past.segments()]
+    if window is not None and (not spans or spans[-1].source_s[1] < window.source_s[1]):
+        spans.append(window)
+    return spans
+
+
+def _chosen(spans: list[KeptSegment], axis: Axis, wanted: float) -> KeptSegment:
+    """The newest span that begins before a time, or the next one if that is nearer."""
+    before = max((i for i, span in enumerate(spans) if getattr(span, axis)[0] <= wanted), default=0)
+    after = min(before + 1, len(spans) - 1)
+    ends, begins = getattr(spans[before], axis)[1], getattr(spans[after], axis)[0]
+    return spans[after] if wanted > ends and begins - wanted < wanted - ends else spans[before]
+
+
+def _view(
+    asked: FeedTime, scene: TrainedScene, axis: Axis, wanted: float, newest_s: float, max_age_s: float
+) -> FeedView:
+    times = {"source_s": np.asarray(scene.frame_times_s), "arrived_at": arrivals(scene)}
+    frames, along = np.arange(scene.frame_count), times[axis]
+    place = float(np.interp(wanted, along, frames))
+    before = min(int(place), scene.frame_count - 1)
+    after = min(before + 1, scene.frame_count - 1)
+    if times["source_s"][after] - times["source_s"][before] > MAX_STEP_S:
+        place = float(before if wanted - along[before] < along[after] - wanted else after)
+    shown, source_s, captured_at = (float(np.interp(place, frames, each)) for each in (along, *times.values()))
+    off_s, notices = abs(shown - wanted), tuple[Notice, ...]()
+    if off_s > TOLERANCE_S and asked != LIVE:
+        text = f"Nothing is known of this moment: the nearest one is shown, {off_s:.1f} s {_side(shown, wanted)} it."
+        notices = (Notice.warning(NoticeCode.TIME_IN_GAP, text),)
+    age_s, is_live = time.time() - captured_at, source_s >= newest_s
+    t = place / scene.frame_count
+    return FeedView(scene, t, source_s, captured_at, age_s, is_live, is_live and age_s > max_age_s, notices)
+
+
+def _side(shown: float, wanted: float) -> str:
+    return "before" if shown < wanted else "after"
+
+
+def _too_early(asked: FeedTime, spans: list[KeptSegment]) -> InputError:
+    first, last = spans[0], spans[-1]
+    problem = "it lies before the past that is kept."
+    if asked.kind is FeedTimeKind.UNIX:
+        remedy = f"Ask for a time after {_utc(first.arrived_at[0])}."
+    elif asked.kind is FeedTimeKind.BEFORE_LIVE:
+        remedy = f"Ask for live to -{last.source_s[1] - first.source_s[0]:.1f}."
+    else:
+        remedy = f"Ask for {first.source_s[0]:.1f} to {last.source_s[1]:.1f} s of the source."
+    return InputError(FIELD, problem, remedy)
+
+
+def _utc(unix_s: float) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_s))

@@ -1,0 +1,266 @@
+"""The model of a feed while it is followed: a thread gives the newest pairs of a source to a follower.
+
+It chooses the size of the model's pictures, and begins another follower after a fault.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+from intrasplat.errors import InputError
+from intrasplat.intake.calibration.types import StereoCalibration
+from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
+from intrasplat.live.kept import KeptSegment
+from intrasplat.live.looking import WINDOW
+from intrasplat.live.pair import FeedPair
+from intrasplat.live.past import Past
+from intrasplat.live.source import Source
+from intrasplat.live.state import FeedReason, FeedState, ModelNumbers
+from intrasplat.live.tissue import TissueWatch, has_colours_of_tissue, is_near
+from intrasplat.machine.hooks import always
+from intrasplat.scene.scene import TrainedScene
+from intrasplat.splat.backend import CPU, Device
+
+logger = logging.getLogger(__name__)
+
+POLL_S = 0.5
+IDLE_S = 0.1
+"""Between looks at a source that is paused or has ended."""
+WINDOW_S = 5.0
+"""Over which the rate of used pairs is measured."""
+WIDTHS = (240, 320, 480, 640, 960)
+"""Widths of the model's pictures, px, from which one is chosen; the first pairs have FIRST_WIDTH."""
+FIRST_WIDTH = 320
+JUDGED_PAIRS = 12
+"""Pairs over which the steps are counted before a width is chosen."""
+WANTED_STEPS = 10.0
+"""Steps a pair that a larger width must leave."""
+NO_SCENE_S = 3.0
+"""Without a used pair for longer the feed is stalled."""
+FIRST_BACK_OFF_S, MOST_BACK_OFF_S = 0.5, 8.0
+"""After a fault, and after several in turn."""
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Why the model does not go on."""
+
+    reason: FeedReason
+    text: str
+
+
+def chosen_width(steps: float, width: int, recorded_width: int) -> int:
+    """The largest width that leaves WANTED_STEPS a pair, where `width` leaves `steps`."""
+    sizes = [each for each in WIDTHS if each < recorded_width] + [recorded_width]
+    fitting = [each for each in sizes if steps * (width / each) ** 2 >= WANTED_STEPS]
+    return max(fitting, default=sizes[0])
+
+
+class FeedModel:
+    """Follows a source since it was made. Any thread may call it."""
+
+    def __init__(
+        self,
+        source: Source,
+        calibration: StereoCalibration | Path,
+        settings: FollowSettings,
+        past: Past,
+        device: Device = CPU,
+        budget_s: float | None = None,
+        watch: TissueWatch | None = None,
+    ) -> None:
+        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device.
+
+        watch: learns what shows tissue; pairs without it are not learnt. None: all are.
+        """
+        self._watch = watch
+        self._source, self._calibration, self._settings, self._past = source, calibration, settings, past
+        self._device, self._budget_s = device, budget_s
+        self.changed = threading.Condition()
+        self._follower: Follower | None = None
+        self._trouble: Trouble | None = None
+        self._closed = False
+        self._used = self._given = 0
+        self._used_at: deque[float] = deque()
+        self._steps: deque[int] = deque(maxlen=JUDGED_PAIRS)
+        self._width = settings.eyes.width
+        self._has_chosen = settings.eyes.width is not None
+        self._began_s = self._last_used_at = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
+        self._thread.start()
+
+    @property
+    def trouble(self) -> Trouble | None:
+        """Why pairs that come in are not learnt; None: they are."""
+        trouble = self._trouble
+        if trouble is None and self._given > self._used and time.monotonic() - self._last_used_at > NO_SCENE_S:
+            return Trouble(FeedReason.NO_SCENE, "the pairs show no scene with depth")
+        return trouble
+
+    def scene(self) -> TrainedScene | None:
+        """The scene of the newest frames; None: no model has begun since this one was made."""
+        follower = self._follower
+        found = None if follower is None else follower.scene_at()
+        return None if found is None else found[0]
+
+    def span(self) -> KeptSegment | None:
+        """What the scene of the newest frames covers."""
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if found is None:
+            return None
+        first, newest = found
+        return KeptSegment(WINDOW, (first.source_s, newest.source_s), (first.arrived_at, newest.arrived_at))
+
+    def used_fps(self) -> float:
+        """Pairs that were learnt a second, over the last seconds."""
+        with self.changed:
+            while self._used_at and time.monotonic() - self._used_at[0] > WINDOW_S:
+                self._used_at.popleft()
+            age_s = time.monotonic() - self._began_s
+            return len(self._used_at) / min(WINDOW_S, max(age_s, 1.0))
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether it has learnt a pair."""
+        return self._used > 0
+
+    @property
+    def left_out(self) -> int:
+        """Pairs that the source handed over and no model has learnt."""
+        return self._given - self._used
+
+    def numbers(self) -> ModelNumbers | None:
+        """Iteration, size and steps; None: there is no model yet."""
+        follower = self._follower
+        found = None if follower is None else follower.span
+        if follower is None or found is None:
+            return None
+        camera, steps = found[1].clip.intrinsics, float(median([*self._steps] or [0]))
+        return ModelNumbers(follower.iteration, follower.gaussians, camera.width, camera.height, steps)
+
+    def close(self) -> None:
+        """End. What the model knows becomes a segment."""
+        self._closed = True
+        with self.changed:
+            self.changed.notify_all()
+        self._thread.join(MOST_BACK_OFF_S)
+
+    def _run(self) -> None:
+        failures, after = 0, 0
+        while not self._closed:
+            try:
+                pair = self._source.newest(after, POLL_S)
+                self._past.prune()
+                if pair is None:
+                    if self._watch is not None and self._source.state is FeedState.ENDED:
+                        self._watch.end()
+                    self._rest(IDLE_S)
+                    continue
+                after = pair.sequence
+                if self._is_tissue(pair):
+                    self._take(pair)
+                failures = 0
+            except Exception as error:
+                failures += 1
+                self._fail(error)
+                self._rest(min(MOST_BACK_OFF_S, FIRST_BACK_OFF_S * 2.0 ** min(failures - 1, 10)))
+        self._end_follower()
+
+    def _take(self, pair: FeedPair) -> None:
+        """Learn a pair."""
+        follower = self._follower or self._begun()
+        before = follower.iteration
+        became = follower.add(pair, self._budget())
+        if became is not Added.NO_SCENE or self._used:  # without a scene so far, the calibration may be wrong
+            self._saw(pair, is_tissue=became not in (Added.NO_TISSUE, Added.NO_SCENE))
+        if became not in (Added.FIRST, Added.FOLLOWED, Added.RESTARTED):
+            return
+        with self.changed:
+            self._used += 1
+            self._last_used_at = time.monotonic()
+            self._used_at.append(self._last_used_at)
+            if became is Added.FOLLOWED:
+                self._steps.append(follower.iteration - before)
+            self._trouble = None
+            self.changed.notify_all()
+        self._choose_width(pair.left.shape[1])
+
+    def _is_tissue(self, pair: FeedPair) -> bool:
+        """Whether a pair is to be learnt, by its colours."""
+        self._given += 1
+        if self._watch is None:
+            return True
+        if has_colours_of_tissue(pair.left):
+            return self._watch.may_be_back()
+        self._saw(pair, is_tissue=False)
+        self._rest(IDLE_S)
+        return False
+
+    def _saw(self, pair: FeedPair, *, is_tissue: bool) -> None:
+        """Note what a pair shows. When the endoscope goes out, the model ends, and what it recorded is deleted."""
+        if self._watch is not None and self._watch.see(pair.source_s, is_tissue=is_tissue):
+            if self._follower is not None:
+                self._follower.write_off()
+            if self._source.parts is not None:
+                self._source.parts.forget(self._watch.tissue_until_s)
+
+    def _begun(self) -> Follower:
+        """Another follower."""
+        width = self._width or FIRST_WIDTH
+        settings = replace(self._settings, eyes=replace(self._settings.eyes, width=width), keep_s=0.0)
+        judge = always if self._watch is None else is_near
+        self._follower = Follower(self._calibration, settings, self._device, self._past.add, judge)
+        return self._follower
+
+    def _budget(self) -> float:
+        """Seconds for the next pair."""
+        if self._budget_s is not None:
+            return self._budget_s
+        if self._device.kind != CPU.kind:
+            return 0.03
+        return 0.165 if (self._width or FIRST_WIDTH) <= 400 else 0.28
+
+    def _choose_width(self, recorded_width: int) -> None:
+        """Once, after some pairs, the width that the machine keeps up with; later a smaller one if it does not."""
+        if self._settings.eyes.width is not None or len(self._steps) < JUDGED_PAIRS:
+            return
+        width, steps = self._width or min(FIRST_WIDTH, recorded_width), float(median(self._steps))
+        if self._has_chosen and steps > MIN_STEPS:
+            return
+        self._has_chosen, chosen = True, chosen_width(steps, width, recorded_width)
+        if chosen != width:
+            self._width = chosen
+            self._steps.clear()
+            self._end_follower()
+
+    def _end_follower(self) -> None:
+        """End the follower; what it knows becomes a segment."""
+        follower, self._follower = self._follower, None
+        if follower is not None:
+            try:
+                follower.write_off()
+            except Exception:  # what it knows is what failed
+                logger.exception("a model of a feed is lost")
+            follower.close()
+
+    def _fail(self, error: Exception) -> None:
+        if isinstance(error, InputError):
+            self._trouble = Trouble(FeedReason.CALIBRATION, str(error))
+        else:
+            logger.error("the model of a feed failed", exc_info=error)
+            text = f"a fault of the program ({type(error).__name__}); another model begins"
+            self._trouble = Trouble(FeedReason.FAULT, text)
+        self._end_follower()
+
+    def _rest(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        with self.changed:
+            if not self._closed and not until():
+                self.changed.wait(seconds)

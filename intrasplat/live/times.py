@@ -1,0 +1,85 @@
+"""The times at which one looks at a feed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+
+from intrasplat.errors import InputError
+
+REMEDY = "Give live, -12.5 (seconds before live), 73.2 (seconds of the source), or 2026-11-29T08:15:00.5Z (RFC 3339)."
+FIELD = "t"
+
+
+class FeedTimeKind(StrEnum):
+    """What a FeedTime counts from."""
+
+    LIVE = "live"
+    BEFORE_LIVE = "before_live"
+    SOURCE = "source"
+    UNIX = "unix"
+
+
+@dataclass(frozen=True)
+class FeedTime:
+    """A moment of a feed.
+
+    kind     live: the newest moment that the model knows
+    seconds  before live; of the source's clock; or UNIX time, at which the moment came in
+    """
+
+    kind: FeedTimeKind = FeedTimeKind.LIVE
+    seconds: float = 0.0
+
+    @classmethod
+    def before_live(cls, seconds: float) -> FeedTime:
+        """Seconds before the newest moment that the model knows."""
+        return cls(FeedTimeKind.BEFORE_LIVE, seconds)
+
+    @classmethod
+    def of_source(cls, seconds: float) -> FeedTime:
+        """Seconds of the source's clock since the feed's first frame."""
+        return cls(FeedTimeKind.SOURCE, seconds)
+
+    @classmethod
+    def at(cls, unix_s: float) -> FeedTime:
+        """The moment that came in at a UNIX time, s."""
+        return cls(FeedTimeKind.UNIX, unix_s)
+
+    @classmethod
+    def parse(cls, value: str | float) -> FeedTime:
+        """live, seconds before live (below 0), seconds of the source, or RFC 3339.
+
+        Raises:
+            InputError: it is none of these.
+        """
+        text = str(value).strip()
+        if text == FeedTimeKind.LIVE:
+            return LIVE
+        try:
+            seconds = float(text)
+        except ValueError:
+            return cls.at(_unix_s(text))
+        if not math.isfinite(seconds):
+            raise _no_time(text)
+        is_before = seconds < 0 or text.startswith("-")
+        return cls.before_live(-seconds) if is_before else cls.of_source(seconds)
+
+
+LIVE = FeedTime()
+
+
+def _unix_s(text: str) -> float:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise _no_time(text) from None
+    if moment.tzinfo is None:
+        raise InputError(FIELD, f"{text[:40]!r} has no time zone.", "Append Z, or an offset such as +01:00.")
+    return moment.timestamp()
+
+
+def _no_time(text: str) -> InputError:
+    return InputError(FIELD, f"{text[:40]!r} is no time of a feed.", REMEDY)

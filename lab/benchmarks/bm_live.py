@@ -1,0 +1,249 @@
+"""How soon and how old a feed is shown: a clip is played to and fro by another process, and a Feed follows it.
+
+    python -m lab.benchmarks.bm_live [--clips d4d_stereo phantom:breathing:72frames:stereo] [--width 320]
+        [--seconds 60] [--fps 30] [--views-hz 5] [--detail off] [--kill 0] [--out lab/rows/live.csv]
+
+The clip is encoded once (H.264, both eyes side by side in the recorded size) and sent as MPEG-TS over TCP in real time.
+The feed records it, and keeps its past on disk. A thread asks for the newest moment views-hz times a second and renders
+it. Measured are seconds from the start of the feed to the first picture (`first_s`); the age of what is shown, from the
+arrival of the newest pair in the model to the rendered picture, p50 and p95 after SETTLED_S, and p50 of the first and
+the last third (`age_early_s`, `age_late_s`); rates and steps of training a pair; lag of decoding; the memory of this
+process and of the one that reads; bytes on disk. --kill N: kill the reading process N times, and measure the longest
+time until something newer is shown (`back_s`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+from numpy.typing import NDArray
+
+from intrasplat.live.feed import Feed, FeedSettings
+from intrasplat.live.spec import RecordingSpec, SourceSpec
+from intrasplat.live.state import FeedReport
+from intrasplat.splat.backend import Device, choose_device
+from intrasplat.splat.cpu import compile_kernels
+from intrasplat.view.render import render_frame
+from lab.benchmarks.bm_follow import Played, played_of
+from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
+from lab.evaluate.sources import DATA_VARIABLE, source_of
+
+CLIPS = ("d4d_stereo", "phantom:breathing:72frames:stereo")
+SETTLED_S = 10.0
+"""After the start; a shorter run counts from its first quarter."""
+REPORT_PERIOD_S = 1.0
+KILL_PERIOD_S = 8.0
+OPTIONS = {"preset": "veryfast", "tune": "zerolatency", "crf": "18", "x264-params": "scenecut=0"}
+KEY = ("clip", "width", "fps", "seconds", "detail", "kills", "device")
+FIELDS = (
+    *KEY, "height", "received_fps", "used_fps", "steps", "age_p50_s", "age_p95_s", "age_early_s", "age_late_s",
+    "first_s", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load", "machine",
+    "commit",
+)  # fmt: skip
+
+
+@dataclass(eq=False)
+class Found:
+    """What was seen: (seconds since the start, age in s) of each shown picture; reports; seconds until back."""
+
+    shown: list[tuple[float, float]] = field(default_factory=list)
+    reports: list[tuple[float, FeedReport]] = field(default_factory=list)
+    back_s: list[float] = field(default_factory=list)
+    child_kib: int = 0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = _parser().parse_args(arguments)
+    os.environ.setdefault(DATA_VARIABLE, "../shared/data")
+    compile_kernels(lambda _: None)
+    device = choose_device(options.device)
+    with adding_alone(options.out.parent):
+        for name in options.clips:
+            played = played_of(source_of(name), options.fps)
+            with TemporaryDirectory() as folder:
+                stream = Path(folder) / "clip.ts"
+                encode(played, stream)
+                row = {"clip": name, "width": options.width, "fps": options.fps, "seconds": options.seconds}
+                row |= {"detail": options.detail, "kills": options.kill, "device": device.kind}
+                row |= followed(played, stream, options, device)
+            row |= {"load": os.getloadavg()[0], "machine": machine(device.kind), "commit": commit()}
+            text = texts_of(row, FIELDS)
+            replace_row(options.out, FIELDS, KEY, text)
+            print("  ".join(f"{field} {text[field]}" for field in FIELDS[:-2] if text[field]), flush=True)
+
+
+def encode(played: Played, path: Path) -> None:
+    """The clip to and fro, once, as MPEG-TS."""
+    with av.open(str(path), "w", format="mpegts") as container:
+        left = played.pairs[0][0]
+        height, width = left.shape[0] // 2 * 2, left.shape[1] // 2 * 2
+        stream: Any = container.add_stream("libx264", rate=Fraction(played.fps).limit_denominator(1000))
+        stream.width, stream.height, stream.pix_fmt, stream.options = 2 * width, height, "yuv420p", OPTIONS
+        stream.codec_context.gop_size = round(played.fps)
+        for number in range(2 * (len(played.pairs) - 1)):
+            eyes: list[NDArray[np.uint8]] = [eye[:height, :width] for eye in played.pairs[played.place(number)]]
+            frame = av.VideoFrame.from_ndarray(np.concatenate(eyes, axis=1), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def send(path: Path, fps: float, port: int) -> None:
+    """Serve the stream in a file again and again, in real time, to whoever connects."""
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        template = container.streams.video[0]
+        listener = socket.create_server(("127.0.0.1", port))
+        print(listener.getsockname()[1], flush=True)
+        while True:
+            connection, _ = listener.accept()
+            with suppress(OSError, av.error.FFmpegError), connection, connection.makefile("wb", buffering=0) as sink:
+                _send(packets, template, fps, sink)
+
+
+def _send(packets: Sequence[Any], template: Any, fps: float, sink: Any) -> None:
+    began_s, tick = time.monotonic(), Fraction(1, 90_000)
+    with av.open(sink, "w", format="mpegts", options={"flush_packets": "1"}) as container:
+        stream = container.add_stream_from_template(template)
+        for number in range(sys.maxsize):
+            packet = packets[number % len(packets)]
+            again: Any = av.Packet(bytes(packet))
+            again.pts = again.dts = round(number / fps / tick)
+            again.time_base, again.is_keyframe, again.stream = tick, packet.is_keyframe, stream
+            container.mux(again)
+            time.sleep(max(0.0, began_s + (number + 1) / fps - time.monotonic()))
+
+
+def followed(played: Played, stream: Path, options: argparse.Namespace, device: Device) -> dict[str, object]:
+    """Follow the sent clip for some seconds; what was measured."""
+    command = [sys.executable, "-m", "lab.benchmarks.bm_live", "--send", str(stream), "--fps", str(options.fps)]
+    sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert sender.stdout is not None
+        url = f"tcp://127.0.0.1:{int(sender.stdout.readline())}"
+        recording = RecordingSpec(stream.parent / "recording", keep_s=options.keep_s)
+        spec = SourceSpec(url, layout="sbs", recording=recording)
+        settings = FeedSettings(options.width, options.camera, options.keep_s, stream.parent / "segments")
+        found, ended, began_s = Found(), threading.Event(), time.monotonic()
+        with Feed(spec, played.calibration, settings, device) as feed:
+            looking = (feed, found, ended, began_s, options.views_hz, options.detail, device)
+            viewer = threading.Thread(target=_look, args=looking)
+            viewer.start()
+            kills = 0
+            while (now_s := time.monotonic() - began_s) < options.seconds:
+                found.reports.append((now_s, feed.report()))
+                found.child_kib = max(found.child_kib, _resident_kib(_reading_pid(feed)))
+                if kills < options.kill and now_s > SETTLED_S + kills * KILL_PERIOD_S:
+                    kills += 1
+                    found.back_s.append(_killed(feed))
+                time.sleep(REPORT_PERIOD_S)
+            ended.set()
+            viewer.join()
+            return _summary(found, options.seconds)
+    finally:
+        sender.kill()
+        sender.wait()
+
+
+def _look(
+    feed: Feed, found: Found, ended: threading.Event, began_s: float, views_hz: float, detail: Any, device: Device
+) -> None:
+    while not ended.wait(1 / views_hz if found.shown else 0.02):
+        view = feed.view_of()
+        if view is not None:
+            render_frame(view.scene, view.t, device=device, detail=detail)
+            found.shown.append((time.monotonic() - began_s, time.time() - view.captured_at))
+
+
+def _killed(feed: Feed) -> float:
+    """Kill the reading process; seconds until a pair that came in later is known."""
+    killed_at = time.time()
+    if (pid := _reading_pid(feed)) is not None:
+        os.kill(pid, signal.SIGKILL)
+    while (view := feed.view_of()) is None or view.captured_at <= killed_at:
+        time.sleep(0.02)
+    return time.time() - killed_at
+
+
+def _reading_pid(feed: Feed) -> int | None:
+    process = feed._source._process
+    return None if process is None else process.pid
+
+
+def _resident_kib(pid: int | None) -> int:
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmRSS"):
+                return int(line.split()[1])
+    return 0
+
+
+def _summary(found: Found, seconds: float) -> dict[str, object]:
+    settled_s = min(SETTLED_S, seconds / 4)
+    shown = [each for each in found.shown if each[0] > settled_s]
+    reports = [report for now_s, report in found.reports if now_s > settled_s]
+    ages, third = [age_s for _, age_s in shown], len(shown) // 3
+    last = reports[-1]
+    assert last.model is not None
+    assert last.past is not None
+    return {
+        "width": last.model.width,
+        "height": last.model.height,
+        "received_fps": median(each.numbers.received_fps for each in reports),
+        "used_fps": float(np.mean([each.numbers.used_fps for each in reports])),
+        "steps": median(each.model.pair_steps for each in reports if each.model is not None),
+        "age_p50_s": float(np.percentile(ages, 50)),
+        "age_p95_s": float(np.percentile(ages, 95)),
+        "age_early_s": median(ages[:third]),
+        "age_late_s": median(ages[-third:]),
+        "first_s": found.shown[0][0],
+        "decode_lag_s": median(each.numbers.decode_lag_s or 0.0 for each in reports),
+        "rss_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "child_mib": round(found.child_kib / 1024),
+        "disk_mb": last.numbers.kept_bytes / 1e6,
+        "past_s": last.past.ends_s - last.past.begins_s,
+        "behind_share": sum(each.state.value == "behind" for each in reports) / len(reports),
+        "back_s": max(found.back_s) if found.back_s else None,
+    }
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clips", nargs="+", default=list(CLIPS))
+    parser.add_argument("--width", type=int, help="default: what the machine keeps up with")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--views-hz", type=float, default=5.0)
+    parser.add_argument("--detail", choices=("on", "off"), default="off")
+    parser.add_argument("--camera", choices=("fixed", "moving"), default="fixed")
+    parser.add_argument("--keep-s", type=float, default=600.0)
+    parser.add_argument("--kill", type=int, default=0)
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu")
+    parser.add_argument("--out", type=Path, default=Path("lab/rows/live.csv"))
+    parser.add_argument("--send", type=Path, help=argparse.SUPPRESS)
+    return parser
+
+
+if __name__ == "__main__":
+    if (sent := _parser().parse_args()).send is not None:
+        send(sent.send, sent.fps, 0)
+    else:
+        main()

@@ -1,0 +1,102 @@
+"""Hands the bytes that a caller pushes to the process that follows its feed, in order and as fast as it takes them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+import uuid
+from types import TracebackType
+
+from starlette.concurrency import run_in_threadpool
+
+from contract.wire.rendering import MAX_PUSH_BYTES, PushRequest, ReplyError
+from intrasplat.errors import UnavailableError
+from service.deps import Deps
+from service.problems import Problem
+from service.renders import problem_of_reply
+
+PATIENCE_S = 60.0
+"""How long a push waits for a process that follows the feed: when it begins, and when another takes its place."""
+RETRY_S = 0.2
+END_TIMEOUT_S = 2.0
+MPEG_TS = 0x47
+"""The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
+REPLACED = "push"
+"""The field of the worker's error to a push in whose place another one came."""
+
+
+class Push:
+    """A context manager: one connection that pushes. bytes: how many the feed has taken."""
+
+    def __init__(self, services: Deps, feed_id: str, *, pictures: bool) -> None:
+        self.bytes = 0
+        self._services = services
+        self._request = PushRequest(scene_id=feed_id, push_id=uuid.uuid4().hex, pictures=pictures)
+        self._can_be_joined = pictures
+
+    async def __aenter__(self) -> Push:
+        self._services.metrics.pushes.inc()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._services.metrics.pushes.dec()
+        if isinstance(error, Problem) and error.field == REPLACED:
+            return
+        last = self._request.model_copy(update={"is_last": True})
+        with contextlib.suppress(UnavailableError, TimeoutError):  # a feed without a process has nothing to end
+            async with asyncio.timeout(END_TIMEOUT_S):
+                await self._services.renderer.ask(last, body=b"")
+
+    async def send(self, piece: bytes) -> None:
+        """Return when the feed has taken the bytes; of pictures, all of one.
+
+        Raises:
+            Problem: 404: the feed has ended. 409: another push has taken the place of this one. 422: it cannot be used.
+            UnavailableError: nobody follows the feed, or another process does that cannot join this stream.
+        """
+        if not self.bytes and piece[:1] == bytes([MPEG_TS]):
+            self._can_be_joined = True
+        start, until_s = 0, time.monotonic() + PATIENCE_S
+        while start < len(piece):
+            body = piece[start : start + MAX_PUSH_BYTES]
+            if await self._is_taken(body, until_s):
+                start, until_s = start + len(body), time.monotonic() + PATIENCE_S
+            elif self._request.pictures:
+                start = 0
+
+    async def _is_taken(self, body: bytes, until_s: float) -> bool:
+        """Whether the feed has taken the bytes. False: another push goes on in place of this one from now."""
+        try:
+            answer = await self._services.renderer.ask(self._request, body=body)
+            error = answer.head.error
+            if error is None:
+                self.bytes += len(body)
+                return True
+            if error.kind not in ("busy", "not-yet"):
+                raise _problem_of(error)
+            if not self._may_wait(until_s):
+                raise problem_of_reply(error)
+        except UnavailableError:
+            if not self._may_wait(until_s):
+                raise
+        await run_in_threadpool(self._check_is_open)
+        await asyncio.sleep(RETRY_S)
+        self._request = self._request.model_copy(update={"push_id": uuid.uuid4().hex})
+        return False
+
+    def _may_wait(self, until_s: float) -> bool:
+        return time.monotonic() < until_s and (self._can_be_joined or not self.bytes)
+
+    def _check_is_open(self) -> None:
+        if self._services.feeds.record(self._request.scene_id) is None:
+            remedy = "Open another: POST /feeds."
+            raise Problem(404, "The feed has ended.", field="feed_id", remedy=remedy)
+
+
+def _problem_of(error: ReplyError) -> Problem:
+    if error.kind == "input" and error.field == REPLACED:
+        return Problem(409, error.problem, field=REPLACED, remedy=error.remedy or "Push over one connection at a time.")
+    return problem_of_reply(error)

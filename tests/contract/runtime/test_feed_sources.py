@@ -1,0 +1,59 @@
+"""Sources of live feeds: only what the operator has listed."""
+
+from __future__ import annotations
+
+import pytest
+
+from contract.runtime.feed_sources import allowed_hosts
+from contract.runtime.settings import Settings
+from intrasplat.errors import InputError
+
+SETTINGS = Settings(
+    feed_hosts=("rtsp://camera.example.org", "udp://0.0.0.0:5000"),
+    feed_private="yes",
+    feed_devices=("/dev/video0", "/srv/demo.mp4"),
+)
+
+
+@pytest.mark.parametrize(
+    "source", ["rtsp://user:secret@camera.example.org/1", "rtsp://camera.example.org:554/", "udp://0.0.0.0:5000"]
+)
+def test_listed_hosts_are_allowed(source: str) -> None:
+    hosts = allowed_hosts(source, SETTINGS)
+    assert hosts is not None
+    assert hosts.permits("192.168.1.2")
+
+
+@pytest.mark.parametrize("source", ["/srv/demo.mp4", "file:///srv/demo.mp4", "v4l2:///dev/video0"])
+def test_listed_files_and_devices_need_no_host(source: str) -> None:
+    assert allowed_hosts(source, SETTINGS) is None
+
+
+def test_a_push_connects_to_nothing() -> None:
+    assert allowed_hosts(None, SETTINGS) is not None
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        *(
+            "rtsp://other.example.org/1",
+            "rtsp://camera.example.org:8554/",
+            "http://camera.example.org/",
+            "udp://0.0.0.0:1",
+        ),
+        *("/srv/other.mp4", "/srv/../srv/x/demo.mp4", "v4l2:///dev/video1", "ftp://camera.example.org/", "tcp://x"),
+    ],
+)
+def test_all_else_is_refused(source: str) -> None:
+    with pytest.raises(InputError) as refused:
+        allowed_hosts(source, SETTINGS)
+    assert refused.value.field == "source"
+    with pytest.raises(InputError):
+        allowed_hosts(source, Settings())
+
+
+@pytest.mark.parametrize("host", ["camera.example.org", "/dev/video0", "tcp://camera.example.org", "ftp://x"])
+def test_a_setting_that_names_no_host_is_refused(host: str) -> None:
+    with pytest.raises(InputError, match="FEED_HOSTS"):
+        Settings.from_environment({"INTRASPLAT_FEED_HOSTS": host})

@@ -1,0 +1,61 @@
+"""`isp.follow` and `intrasplat live` show, print and keep a live source."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import intrasplat as isp
+from intrasplat.__main__ import main
+from intrasplat.commands.exits import ExitCode
+from intrasplat.errors import InputError
+from tests.live.conftest import until
+from tests.live.senders import PhantomSender
+
+
+def test_a_followed_source_is_shown_and_cut(sender: PhantomSender, tmp_path: Path) -> None:
+    calibration = sender.calibration.model_dump(exclude={"assumptions"})
+    with isp.follow(sender.url, calibration, out=tmp_path, width=128, layout="sbs", device="cpu") as live:
+        with pytest.raises(InputError, match="nothing is known yet"):
+            live.view()
+        assert live.wait(20.0), live.report()
+        until(lambda: (past := live.report().past) and past.ends_s > 3.0, live.report)
+        now, before = live.view(pose=isp.orbit(10, 0)), live.view("-1.0", width=64)
+        assert now.rgb.shape == (96, 128, 3)
+        assert before.rgb.shape == (48, 64, 3)
+        assert np.median(now.confidence) > 0
+        assert live.moment(-1.0).source_s == pytest.approx(live.moment().source_s - 1.0, abs=0.5)
+        live.pause()
+        cut = live.cut(0.5, 2.5, tmp_path / "cut.mp4")
+        assert cut.frames > 30
+        with pytest.raises(InputError, match="before the past"):
+            live.view(-1000.0)
+    again = isp.follow(sender.url, calibration, out=tmp_path, width=128, layout="sbs", device="cpu")
+    again.close()
+    assert again.moment("-1.5").age_s > 1.5
+
+
+def test_the_command_prints_reports_and_writes_a_cut(
+    sender: PhantomSender, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = tmp_path / "calibration.json"
+    calibration.write_text(sender.calibration.model_dump_json(exclude={"assumptions"}))
+    asked = ["live", sender.url, "--calibration", str(calibration), "--out", str(tmp_path / "feed")]
+    asked += ["--width", "128", "--seconds", "5", "--cut", "2", "--json", "--device", "cpu"]
+    assert main(asked) == ExitCode.OK
+    reports = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(reports) == 5
+    assert reports[-1]["state"] in ("live", "behind")
+    assert reports[-1]["model"]["width"] == 128
+    assert (tmp_path / "feed" / "cut.mp4").stat().st_size > 1000
+    assert any((tmp_path / "feed" / "segments").iterdir())
+
+
+def test_a_source_or_a_calibration_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        isp.follow("tcp://127.0.0.1:9", tmp_path / "none.json")
+    assert refused.value.field == "calibration"
+    assert main(["live", "tcp://127.0.0.1", "--calibration", str(tmp_path)]) == ExitCode.BAD_INPUT

@@ -1,0 +1,397 @@
+"""Live feeds over HTTP: opened, shown, paused, cut and ended; for their own tenant, and with the scope alone."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from contract.access.audit import AUDIT_FILE
+from contract.access.keys import DEFAULT_SCOPES, KeyScope
+from contract.wire.feeds import FeedTime, FeedWish
+from contract.wire.rendering import CutRequest, ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
+from intrasplat.live.state import FeedState
+from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
+from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
+
+CAMERA = {"width": 64, "height": 48, "fx_px": 80, "fy_px": 80, "cx_px": 32, "cy_px": 24, "baseline_mm": 4}
+RECTIFIED = json.dumps({"model": "rectified", **CAMERA})
+MAY_ALL = {*DEFAULT_SCOPES, KeyScope.FEEDS}
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[ServiceUnderTest]:
+    hosts = ("rtsp://camera.example.org",)
+    yield from running_service(tmp_path, feed_hosts=hosts, feed_devices=("/dev/video0",), feed_keep_s=600.0)
+
+
+@pytest.fixture
+def worker(service: ServiceUnderTest) -> Iterator[FeedWorker]:
+    with following(service.queue, service.store.run_dir, CLIP) as worker:
+        yield worker
+
+
+def posted(service: ServiceUnderTest, options: str = "{}", **arguments: Any) -> httpx.Response:
+    files = {"calibration": arguments.pop("calibration", ("endoscope.json", RECTIFIED.encode()))}
+    return service.http.post("/feeds", files=files, data={"options": options}, **arguments)
+
+
+def opened(service: ServiceUnderTest, options: str = "{}", **arguments: Any) -> str:
+    response = posted(service, options, **arguments)
+    assert response.status_code == 201, response.text
+    assert response.headers["location"] == f"/feeds/{response.json()['id']}"
+    return str(response.json()["id"])
+
+
+def followed(service: ServiceUnderTest, **arguments: Any) -> str:
+    """A feed that a worker follows."""
+    feed_id = opened(service, **arguments)
+    wait_until(lambda: any(each.feed_id == feed_id for each in service.queue.workers()))
+    return feed_id
+
+
+def actions(service: ServiceUnderTest) -> list[tuple[str, str]]:
+    lines = (service.store.data_dir / AUDIT_FILE).read_text().splitlines()
+    return [(each["action"], each["job_id"]) for each in map(json.loads, lines) if each["action"].startswith("feed-")]
+
+
+def test_an_opened_feed_is_shown_without_its_password(service: ServiceUnderTest) -> None:
+    options = '{"source": "rtsp://user:secret@camera.example.org/1", "label": "room 4", "keep_s": 120, "layout": "sbs"}'
+    feed_id = opened(service, options)
+    response = service.http.get(f"/feeds/{feed_id}")
+    feed = response.json()
+    assert (feed["id"], feed["label"], feed["wish"]) == (feed_id, "room 4", "run")
+    assert (feed["state"], feed["reason"]) == ("connecting", "no_worker")
+    assert feed["options"]["source"] == "rtsp://camera.example.org/1"
+    assert feed["options"]["keep_s"] == 120
+    assert "secret" not in response.text
+    assert feed["links"]["render"] == f"/render?scene={feed_id}"
+    assert service.http.get("/feeds").json() == [feed]
+    record = service.queue.feed(feed_id)
+    assert record is not None
+    assert record.options.source == "rtsp://user:secret@camera.example.org/1"
+    assert (record.calibration, record.calibration_name) == (RECTIFIED, "calibration.json")
+    assert not service.spooled()
+    assert actions(service) == [("feed-opened", feed_id)]
+
+
+def test_a_feed_shows_what_its_worker_says(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    feed = service.http.get(f"/feeds/{feed_id}").json()
+    assert (feed["received_fps"], feed["used_fps"], feed["dropped"], feed["kept_bytes"]) == (30.0, 5.0, 7, 12345)
+    assert feed["model_age_s"] >= 0.4
+    assert feed["links"]["video"] == f"/feeds/{feed_id}/video"
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ('{"source": "rtsp://other.example.org/1"}', "options.source"),
+        ('{"source": "camera"}', "options.source"),
+        ('{"source": "/etc/passwd"}', "options.source"),
+        ('{"source": "v4l2:///dev/video1"}', "options.source"),
+        ('{"keep_s": 601}', "options.keep_s"),
+        ('{"keep_s": 0}', "options.keep_s"),
+        ('{"layout": "round"}', "options.layout"),
+        ('{"sauce": "rtsp://camera.example.org/1"}', "options.sauce"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused(service: ServiceUnderTest, options: str, field: str) -> None:
+    assert_problem(posted(service, options), 422, field)
+    assert service.http.get("/feeds").json() == []
+
+
+@pytest.mark.parametrize(
+    "calibration",
+    [("a.json", b"{}"), ("a.json", b"not json"), ("a.yaml", b"<!DOCTYPE x>"), ("a.exe", b"{}"), ("a.json", b"\0\1\2")],
+)
+def test_a_calibration_that_is_none_is_refused(service: ServiceUnderTest, calibration: tuple[str, bytes]) -> None:
+    assert_problem(posted(service, calibration=calibration), 422, "calibration")
+
+
+def test_a_feed_needs_a_calibration_and_nothing_else_belongs_to_it(service: ServiceUnderTest) -> None:
+    only_options = service.http.post("/feeds", files={"options": (None, b"{}")})
+    assert_problem(only_options, 422, "calibration")
+    files = {"calibration": ("a.json", RECTIFIED.encode()), "clip": ("a.mp4", CLIP)}
+    assert_problem(service.http.post("/feeds", files=files), 422, "clip")
+
+
+def test_the_past_is_no_longer_than_the_installation_allows(tmp_path: Path) -> None:
+    for service in running_service(tmp_path, feed_keep_s=60.0):
+        assert service.http.get(f"/feeds/{opened(service)}").json()["options"]["keep_s"] == 60
+
+
+def test_as_many_feeds_as_allowed_are_open(tmp_path: Path) -> None:
+    for service in running_service(tmp_path, max_feeds=2, feeds_of_tenant=1):
+        for tenant in ("ward-1", "ward-2"):
+            key = bearer(service, tenant, MAY_ALL)
+            opened(service, headers=key)
+        assert_problem(posted(service, headers=key), 429, "feeds")
+        assert_problem(posted(service, headers=bearer(service, "ward-3", MAY_ALL)), 503, "feeds")
+
+
+def test_the_same_key_opens_the_same_feed(service: ServiceUnderTest) -> None:
+    key = {"Idempotency-Key": "room-4"}
+    feed_id = opened(service, headers=key)
+    assert opened(service, headers=key) == feed_id
+    assert_problem(posted(service, '{"width": 320}', headers=key), 422, "Idempotency-Key")
+    another = opened(service, headers=key | bearer(service, "ward-2", MAY_ALL))
+    assert another != feed_id
+
+
+def test_changes_need_the_scope_and_another_tenants_feed_does_not_exist(
+    service: ServiceUnderTest, worker: FeedWorker
+) -> None:
+    own, other = bearer(service, "ward-1", MAY_ALL), bearer(service, "ward-2", MAY_ALL)
+    feed_id = followed(service, headers=own)
+    viewer = bearer(service, "ward-1")
+    assert service.http.get(f"/feeds/{feed_id}", headers=viewer).status_code == 200
+    assert service.http.get("/render", params={"scene": feed_id}, headers=viewer).status_code == 200
+    for method, path in [("POST", "/pause"), ("POST", "/resume"), ("POST", "/cut"), ("PUT", "/video"), ("DELETE", "")]:
+        assert_problem(service.http.request(method, f"/feeds/{feed_id}{path}", headers=viewer), 403, "Authorization")
+    for scopes in ({KeyScope.FEEDS}, {KeyScope.RECONSTRUCT}):  # a cut changes a feed and makes a job
+        some = bearer(service, "ward-1", scopes)
+        assert_problem(service.http.post(f"/feeds/{feed_id}/cut", headers=some), 403, "Authorization")
+    assert_problem(posted(service, headers=viewer), 403, "Authorization")
+    assert_problem(service.http.get(f"/feeds/{feed_id}", headers=other), 404, "feed_id")
+    assert_problem(service.http.post(f"/feeds/{feed_id}/pause", headers=other), 404, "feed_id")
+    assert_problem(service.http.request("DELETE", f"/feeds/{feed_id}", headers=other), 404, "feed_id")
+    assert_problem(service.http.get("/render", params={"scene": feed_id}, headers=other), 404, "scene")
+    assert service.http.get("/feeds", headers=other).json() == []
+    record = service.queue.feed(feed_id)
+    assert record is not None
+    assert record.wish == "run"
+
+
+def test_a_feed_is_paused_and_goes_on(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    paused = service.http.post(f"/feeds/{feed_id}/pause")
+    assert (paused.status_code, paused.json()["state"], paused.json()["wish"]) == (200, "paused", "pause")
+    resumed = service.http.post(f"/feeds/{feed_id}/resume")
+    assert (resumed.status_code, resumed.json()["state"]) == (200, "live")
+    assert actions(service)[1:] == [("feed-paused", feed_id), ("feed-resumed", feed_id)]
+
+
+def test_a_pause_that_no_worker_has_done_says_so(
+    service: ServiceUnderTest, worker: FeedWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.feeds.FOLLOWED_WITHIN_S", 0.05)
+    worker.obeys = False
+    feed_id = followed(service)
+    paused = service.http.post(f"/feeds/{feed_id}/pause")
+    assert (paused.status_code, paused.json()["state"], paused.json()["wish"]) == (202, "live", "pause")
+    ended = service.http.delete(f"/feeds/{feed_id}")
+    assert (ended.status_code, ended.json()["record"], ended.json()["verified"]) == (202, False, False)
+    assert service.http.get(f"/feeds/{feed_id}").json()["wish"] == "end"
+
+
+def test_an_ended_feed_leaves_nothing_and_a_receipt_says_so(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    assert service.http.get("/render", params={"scene": feed_id}).status_code == 200
+    response = service.http.delete(f"/feeds/{feed_id}")
+    receipt = response.json()
+    assert response.status_code == 200
+    assert (receipt["feed_id"], receipt["bytes"], receipt["record"], receipt["verified"]) == (
+        feed_id,
+        12345,
+        True,
+        True,
+    )
+    assert_problem(service.http.get(f"/feeds/{feed_id}"), 404, "feed_id")
+    assert_problem(service.http.delete(f"/feeds/{feed_id}"), 404, "feed_id")
+    assert_problem(service.http.get("/render", params={"scene": feed_id}), 404, "scene")
+    assert actions(service)[-1] == ("feed-ended", feed_id)
+
+
+def test_files_that_are_left_are_not_denied(service: ServiceUnderTest) -> None:
+    feed_id = opened(service)
+    (service.store.data_dir / "feeds" / feed_id).mkdir(parents=True)
+    receipt = service.http.delete(f"/feeds/{feed_id}").json()
+    assert (receipt["record"], receipt["verified"]) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("t", "moment", "shown_s"),
+    [
+        (None, FeedTime(before_live_s=0), 60),
+        ("live", FeedTime(before_live_s=0), 60),
+        ("-12.5", FeedTime(before_live_s=12.5), 47.5),
+        ("31.4", FeedTime(source_s=31.4), 31.4),
+        ("2023-11-14T22:13:30Z", FeedTime(at_s=BEGAN_S + 10), 10),
+    ],
+)
+def test_a_render_shows_a_moment_and_how_fresh_it_is(
+    service: ServiceUnderTest, worker: FeedWorker, t: str | None, moment: FeedTime, shown_s: float
+) -> None:
+    feed_id = followed(service)
+    response = service.http.get("/render", params={"scene": feed_id} | ({} if t is None else {"t": t}))
+    assert response.status_code == 200, response.text
+    assert response.content == b"picture"
+    assert response.headers["x-intrasplat-state"] == worker.state
+    assert float(response.headers["x-intrasplat-source-s"]) == pytest.approx(shown_s)
+    assert float(response.headers["x-intrasplat-age-s"]) == pytest.approx(60.5 - shown_s)
+    assert response.headers["x-intrasplat-captured-at"].startswith("2023-11-14T22:1")
+    assert response.headers["cache-control"] == "no-store"
+    assert "etag" not in response.headers
+    (request,) = worker.asked
+    assert isinstance(request, RenderRequest)
+    assert (request.moment, request.attempt, request.newer_than_s) == (moment, None, None)
+
+
+def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
+    service: ServiceUnderTest, worker: FeedWorker
+) -> None:
+    scene, feed_id = service.finished_scene(), followed(service)
+    for path in ("recorded", "measure", "export"):
+        query = {"t": "-1", **({"points": "10,20"} if path == "measure" else {})}
+        response = service.http.get(f"/scenes/{feed_id}/{path}", params=query)
+        assert response.status_code == 200, response.text
+    assert [type(each) for each in worker.asked] == [RecordedRequest, MeasureRequest, ExportRequest]
+    assert {each.moment.before_live_s for each in worker.asked} == {1}
+    assert service.http.get("/render", params={"scene": scene, "t": "0.5"}).content == b"png"
+    assert len(worker.asked) == 3
+    assert len(service.painter.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "query"),
+    [
+        ("/render?scene={scene}", "t=live"),
+        ("/render?scene={scene}", "t=-1"),
+        ("/scenes/{scene}/recorded?", "t=-1"),
+        ("/scenes/{scene}/measure?points=1,2", "t=live"),
+        ("/scenes/{scene}/export?", "t=2026-05-04T10:20:30Z"),
+    ],
+)
+def test_a_scene_has_no_moments(service: ServiceUnderTest, path: str, query: str) -> None:
+    answer = service.http.get(f"{path.format(scene=service.finished_scene())}&{query}")
+    problem = assert_problem(answer, 422, "t")
+    assert "first frame" in problem["remedy"]
+
+
+@pytest.mark.parametrize("t", ["soon", "-700000", "2026-05-04T10:20:30", "-61"])
+def test_what_is_no_moment_of_a_feed_is_refused(service: ServiceUnderTest, worker: FeedWorker, t: str) -> None:
+    assert_problem(service.http.get("/render", params={"scene": followed(service), "t": t}), 422, "t")
+
+
+def test_a_feed_that_nobody_follows_shows_nothing_yet(service: ServiceUnderTest) -> None:
+    response = service.http.get("/render", params={"scene": opened(service)})
+    assert_problem(response, 503, "scene")
+    assert response.headers["retry-after"] == "1"
+    assert not service.painter.requests
+
+
+def test_a_feed_is_no_scene_of_the_lists_and_no_trainer(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    assert service.http.get("/scenes").json() == []
+    assert_problem(service.http.get(f"/scenes/{feed_id}"), 404, "scene")
+    assert_problem(service.http.get(f"/scenes/{feed_id}/export", params={"format": "scene"}), 404, "scene")
+    assert_problem(service.http.get(f"/scenes/{feed_id}/cameras"), 404, "scene")
+    assert service.http.get("/readyz").json()["workers"] == ["worker-1"]
+    service.queue.withdraw("worker-1")
+    assert "No worker is ready" in assert_problem(service.http.get("/readyz"), 503, "worker")["detail"]
+
+
+def test_the_events_of_a_feed_are_its_states_until_its_end(
+    service: ServiceUnderTest, worker: FeedWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.events.POLL_PERIOD_S", 0.01)
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+
+    def change() -> None:
+        for state in (FeedState.STALLED, FeedState.LIVE):
+            time.sleep(0.3)
+            worker.state = state
+        time.sleep(0.3)
+        service.queue.wish_feed(feed_id, FeedWish.END)
+
+    changing = threading.Thread(target=change)
+    changing.start()
+    response = service.http.get(f"/feeds/{feed_id}/events")
+    changing.join()
+    assert response.headers["content-type"].startswith("text/event-stream")
+    events = [json.loads(line[6:]) for line in response.text.splitlines() if line.startswith("data: ")]
+    assert "event: feed" in response.text
+    states = [each["state"] for each in events]
+    assert [state for at, state in enumerate(states) if at == 0 or states[at - 1] != state] == [
+        "live",
+        "stalled",
+        "live",
+    ]
+    assert {each["id"] for each in events} == {feed_id}
+    assert_problem(service.http.get(f"/feeds/{feed_id}/events"), 404, "feed_id")
+
+
+def test_a_cut_becomes_a_job_with_the_calibration(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service, options='{"layout": "sbs"}')
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    given = {"from": -30, "to": "2023-11-14T22:14:20Z", "options": {"budget_s": 20}, "label": "the bleeding"}
+    response = service.http.post(f"/feeds/{feed_id}/cut", json=given)
+    assert response.status_code == 202, response.text
+    job = response.json()
+    assert response.headers["location"] == f"/jobs/{job['id']}"
+    assert (job["state"], job["label"], job["options"]["layout"]) == ("queued", "the bleeding", "sbs")
+    assert job["cut"] == {"from_s": BEGAN_S + 30, "to_s": BEGAN_S + 60, "frames": 900, "is_whole": True}
+    requests = [each for each in worker.asked if isinstance(each, CutRequest)]
+    assert {(each.from_s, each.to_s) for each in requests} == {(BEGAN_S + 30, BEGAN_S + 60)}
+    assert [each.part for each in requests] == [0, 1, 2]
+    folder = service.store.spool_folder(job["id"])
+    assert (folder / "clip.mp4").read_bytes() == CLIP
+    assert (folder / "calibration.json").read_text() == RECTIFIED
+    assert ("feed-cut", feed_id) in actions(service)
+
+
+def test_a_cut_until_live_ends_with_the_newest_pairs(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    response = service.http.post(f"/feeds/{feed_id}/cut", json={"from": 20})
+    assert response.status_code == 202, response.text
+    (asked,) = {(each.from_s, each.to_s) for each in worker.asked if isinstance(each, CutRequest)}
+    assert asked[0] == BEGAN_S + 20
+    assert 60 <= asked[1] - BEGAN_S < 65
+
+
+@pytest.mark.parametrize(
+    ("given", "status", "field"),
+    [
+        ({"from": "then"}, 422, "from"),
+        ({"from": -10, "to": -20}, 422, "from"),
+        ({"from": -10, "to": "then"}, 422, "to"),
+        ({"from": 0, "to": "2027-01-01T00:00:00Z"}, 413, "from"),
+        ({"from": -100, "to": -1}, 422, "from"),  # before the recording: its worker says so
+        ({"from": -10, "to": -1, "options": {"preset": "best"}}, 422, "options.preset"),
+        ({"from": -10, "to": -1, "label": "x" * 100}, 422, "label"),
+        ({}, 422, "from"),
+    ],
+)
+def test_a_cut_of_nothing_is_refused(
+    service: ServiceUnderTest, worker: FeedWorker, given: dict[str, Any], status: int, field: str
+) -> None:
+    feed_id = followed(service)
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    assert_problem(service.http.post(f"/feeds/{feed_id}/cut", json=given), status, field)
+    assert not service.spooled()
+
+
+def test_the_metrics_tell_of_feeds_without_their_labels(service: ServiceUnderTest, worker: FeedWorker) -> None:
+    feed_id = followed(service, options='{"label": "patient Smith"}')
+    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+    text = service.http.get("/metrics").text
+    for line in (
+        'intrasplat_feeds{state="live"} 1.0',
+        f'intrasplat_feed_used_fps{{feed="{feed_id[:8]}"}} 5.0',
+        f'intrasplat_feed_dropped_total{{feed="{feed_id[:8]}"}} 7.0',
+        'intrasplat_workers{device="cpu",trains="yes"} 1.0',
+    ):
+        assert line in text
+    assert "Smith" not in text
+    assert 'trains="no"' not in text
