@@ -129,6 +129,7 @@ def test_the_help_tells_every_key_and_gesture_in_both_languages(site: Site, page
 
 
 def test_keys_are_left_to_what_is_typed_into(site: Site, page: Page) -> None:
+    page.show("library")
     page.find("#search").send_keys("f?a ,")
     assert page.find("#search").get_attribute("value") == "f?a ,"
     assert not page.find("#help").is_displayed()

@@ -83,7 +83,7 @@ def test_a_scene_that_is_watched_from_its_first_picture_on_is_played_as_soon_as_
     )
     site.painter.cameras = CAMERAS
     site.painter.warnings = []
-    page.until_text("#badge", "TRAINING")
+    page.until_text("#badge", say("screen.training"))
     page.until_text("#time-value", f"1.00 s of 1.95 s, frame 21 of {FRAMES}")  # t is kept
     assert page.find("#eye").is_displayed()
     page.click("#step-on")
