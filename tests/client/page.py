@@ -338,7 +338,7 @@ class Page:
     def press(self, job_id: str, name: str) -> None:
         """Click one of a job's buttons; a job that the list lacks is asked for, for the page asks every two seconds."""
         if not self.script("return document.querySelector(arguments[0]) !== null", f'[data-job="{job_id}"]'):
-            self.script("import('/main.js').then(({ jobs }) => jobs.poll())")
+            self.script("import(document.scripts[0].src).then(({ jobs }) => jobs.poll())")
         self.click(f'[data-job="{job_id}"] button[aria-label^="{name}"]')
 
     @property

@@ -195,7 +195,7 @@ def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewh
 
 LOOK = """
 const [wish, done] = arguments;
-import("/main.js").then(({ viewer }) => {
+import(document.scripts[0].src).then(({ viewer }) => {
   viewer.look(wish);
   const take = ({ detail: { ...detail } }) => {
     const isOrbit = wish.pose?.startsWith("orbit");

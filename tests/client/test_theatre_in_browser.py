@@ -191,7 +191,8 @@ def test_the_warning_of_this_view_is_read_before_those_of_its_scene_and_all_are_
         page.press(site.scene(), "View")
         page.until_text("#picture-warning", say("notice.poses_unsure"))
         page.driver.execute_async_script(
-            "const [pose, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ pose })))",
+            "const [pose, done] = arguments; "
+            "import(document.scripts[0].src).then(({ viewer }) => done(viewer.look({ pose })))",
             "orbit:30,0,1",
         )
         page.until_text("#picture-warning", say("notice.pose_far"))
