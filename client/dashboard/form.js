@@ -46,6 +46,8 @@ export class ClipForm {
     Object.assign(this, parts, told);
     /** @type {import("./api.js").Job | null} the job whose clip is used again, in place of a file */
     this.earlier = null;
+    /** @type {"masks"|"calibration"} the file that is sent with it */
+    this.asked = "masks";
     /** @type {{sending: Sending, missing: import("./sending.js").PlannedFile[]} | null} what a reload interrupted */
     this.resumed = null;
     this.isSending = false;
@@ -77,19 +79,21 @@ export class ClipForm {
   }
 
   /**
-   * Use a job's clip again with better masks: its options are chosen, and masks are asked for.
+   * Use a job's clip again with another file: its options are chosen, and the file is asked for.
    * @param {import("./api.js").Job} job
+   * @param {"masks"|"calibration"} part
    */
-  sendMasks(job) {
+  sendAgain(job, part) {
     this.#startAnew();
     this.earlier = job;
+    this.asked = part;
     for (const name of OPTIONS) {
-      const value = name === "mask_source" ? "given" : job.options[name];
+      const value = part === "masks" && name === "mask_source" ? "given" : job.options[name];
       if (value != null) this.form.elements[name].value = value;
     }
     this.#showSource();
     this.form.scrollIntoView();
-    this.form.elements.masks.focus({ preventScroll: true });
+    this.form.elements[part].focus({ preventScroll: true });
   }
 
   /** Send the clip that comes with the page. @param {string} label its name */
@@ -118,7 +122,7 @@ export class ClipForm {
 
   /** The pickers of the parts that are asked for, and why it is not all of them. */
   #showSource() {
-    const { clip } = this.form.elements;
+    const { clip, calibration } = this.form.elements;
     const asked = this.#askedFor();
     for (const part of PARTS) {
       const label = this.form.elements[part].closest("label");
@@ -131,18 +135,19 @@ export class ClipForm {
     if (this.resumed && isAsked) group.open = true;
     this.form.classList.toggle("resumed", this.resumed !== null);
     clip.required = asked.includes("clip");
+    calibration.required = this.earlier !== null && this.asked === "calibration";
     this.again.hidden = this.earlier === null && this.resumed === null;
     const [text, leave] = this.again.children;
     leave.textContent = words(this.resumed ? "upload.give_up" : "upload.another");
     if (this.resumed) {
       const names = this.resumed.missing.map((planned) => planned.name).join(", ");
       text.textContent = words("upload.choose_again", { names });
-    } else if (this.earlier) text.textContent = words("upload.clip_again", { id: this.earlier.label ?? this.earlier.id.slice(0, 8) });
+    } else if (this.earlier) text.textContent = words(`upload.clip_again_${this.asked}`, { id: this.earlier.label ?? this.earlier.id.slice(0, 8) });
   }
 
   #askedFor() {
     if (this.resumed) return this.resumed.missing.map(({ part }) => pickerOf(part));
-    return this.earlier ? ["masks"] : PARTS;
+    return this.earlier ? [this.asked] : PARTS;
   }
 
   /** Files dropped anywhere on the page. */

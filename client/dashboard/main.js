@@ -129,7 +129,7 @@ async function report(id) {
     if (!isStill()) return;
     compare.know(id, found);
     verdict.know(found);
-    showReport(get("report"), id, found, sendMasks);
+    showReport(get("report"), id, found, sendAgain);
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
@@ -157,6 +157,7 @@ function expect(id) {
 /** A clip is being sent: its own first frame is the picture, until there is one of it. @param {File | undefined} clip */
 function send(clip) {
   waiting.begin(clip);
+  get("empty").hidden = true;
   if (drawers.isOpen === "drawer") drawers.close();
 }
 
@@ -169,11 +170,12 @@ function showProgress() {
   waiting.tell(isUnderWay ? shareOf(job) : null, isUnderWay ? progressOf(job, times) : "");
 }
 
-function sendMasks(id) {
+/** A job's clip is sent again. @param {string} id @param {"masks"|"calibration"} [part] the file that is asked for */
+function sendAgain(id, part = "masks") {
   const job = jobs.byId.get(id);
   if (!job) return;
   drawers.open("drawer", false);
-  form.sendMasks(job);
+  form.sendAgain(job, part);
 }
 
 function offerMasks() {
@@ -192,7 +194,7 @@ function openFirst() {
     return;
   }
   const isIdle = viewer.scene === null && awaited === null && !form.isSending && !waiting.isOn;
-  if (!isOpened && isIdle) {
+  if (!isOpened && isIdle && drawers.isOpen === null) {
     isOpened = true; // view() comes back here
     const newest = jobs.newest.map((id) => jobs.byId.get(id)).find(({ state }) => state === "done" || state === "running");
     if (newest) view(newest.id);
@@ -243,6 +245,7 @@ const list = new JobList(
   {
     onView: view,
     onChange: () => jobs.poll(),
+    onCalibrate: (id) => sendAgain(id, "calibration"),
     onRedraw: () => showJobs(),
     onLabelled: (job) => jobs.take(job),
     onDownload: (id, name) => downloads.open(id, name),
@@ -297,7 +300,7 @@ if (awaited) viewer.open(null, words("page.awaited"));
 get("empty-clip").addEventListener("click", () => drawers.open("drawer"));
 get("empty-example").addEventListener("click", () => form.sendExample(words("empty.name")));
 get("layer").addEventListener("change", offerMasks);
-get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
+get("better-masks").addEventListener("click", () => sendAgain(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 languageEvents.addEventListener("changed", () => {
   list.forget();
@@ -307,7 +310,7 @@ languageEvents.addEventListener("changed", () => {
 showWords(document);
 keyEvents.addEventListener("changed", () => {
   view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")); // another key may not see the same
-  if (currentKey()) address.follow();
+  if (currentKey()) if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so
 });
 prepareNews(get("news"));
 get("upload").addEventListener("submit", () => hush(get("jobs-message")));
@@ -324,4 +327,4 @@ onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
-address.follow();
+if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

@@ -282,6 +282,7 @@ export const DE = {
     "rename": "Umbenennen",
     "long": "{seconds} s lang",
     "retry": "Noch einmal",
+    "calibrate": "Kalibrierung nachreichen",
     "cancel": "Abbrechen",
     "delete": "Löschen",
     "ask_cancel": "Die Arbeit an {name} abbrechen? Der Clip wird entfernt.",
@@ -500,6 +501,7 @@ export const DE = {
   },
   "check": {
     "calibration_missing": "Ein Video beider Augen braucht die Kalibrierung seines Endoskops. Fügen Sie die Datei hinzu.",
+    "calibration_scaled": "Diese Kalibrierung gilt für eine andere Bildgröße und wird umgerechnet. Gehört sie nicht zu dieser Aufnahme, ist jeder Abstand falsch.",
     "calibration_size": "Diese Kalibrierung ist für eine andere Bildgröße als die des Clips. Wählen Sie die dieser Aufnahme.",
     "calibration_unreadable": "Diese Kalibrierung ist nicht lesbar oder passt zu keinem Endoskop. Wählen Sie eine andere Datei.",
     "empty": "Diese Datei ist leer. Wählen Sie eine andere.",
@@ -591,7 +593,8 @@ export const DE = {
     "other_file": "Das ist nicht die Datei, die gesendet wurde. Wählen Sie {name} oder geben Sie den Clip auf.",
     "give_up": "Aufgeben",
     "another": "Anderer Clip",
-    "clip_again": "Der Clip von {id} noch einmal, mit seiner Kalibrierung.",
+    "clip_again_masks": "Der Clip von {id} noch einmal, mit seiner Kalibrierung.",
+    "clip_again_calibration": "Der Clip von {id} noch einmal, mit der Kalibrierung, die Sie wählen.",
     "stopped": "Abgebrochen. Nichts davon wurde behalten.",
     "kept": "Was gesendet wurde, bleibt erhalten.",
     "sending": "Sendet, {share} %"

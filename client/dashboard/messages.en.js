@@ -199,7 +199,7 @@ export const EN = {
     "first_picture": "FIRST PICTURE, not yet a model",
     "training": "IMPROVING",
     "extrapolated": "EXTRAPOLATED",
-    "current": "MODEL UP TO DATE",
+    "current": "LATEST MODEL",
     "unconfirmed": "FROM MEMORY",
     "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile",
     "own_clip": "YOUR CLIP, not yet a model"
@@ -282,6 +282,7 @@ export const EN = {
     "rename": "Rename",
     "long": "{seconds} s long",
     "retry": "Try again",
+    "calibrate": "Add a calibration",
     "cancel": "Cancel",
     "delete": "Delete",
     "ask_cancel": "Cancel the work on {name}? Its clip is removed.",
@@ -500,6 +501,7 @@ export const EN = {
   },
   "check": {
     "calibration_missing": "A video of two eyes needs the calibration of its endoscope. Add the file.",
+    "calibration_scaled": "This calibration is for another picture size and is converted. If it is not of this recording, every distance is wrong.",
     "calibration_size": "This calibration is for another picture size than the clip has. Choose the one of this recording.",
     "calibration_unreadable": "This calibration cannot be read, or fits no endoscope. Choose another file.",
     "empty": "This file is empty. Choose another one.",
@@ -591,7 +593,8 @@ export const EN = {
     "other_file": "This is not the file that was being sent. Choose {name}, or give the clip up.",
     "give_up": "Give it up",
     "another": "Another clip",
-    "clip_again": "The clip of {id} again, with its calibration.",
+    "clip_again_masks": "The clip of {id} again, with its calibration.",
+    "clip_again_calibration": "The clip of {id} again, with the calibration that you choose.",
     "stopped": "Stopped. Nothing of it is kept.",
     "kept": "What was sent is kept.",
     "sending": "Sending, {share} %"

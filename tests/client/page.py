@@ -60,6 +60,7 @@ from worker.reply import Reply
 from worker.serve import RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+CALIBRATION = DASHBOARD / "example" / "calibration.json"
 WAIT_S = 15.0
 MAX_WAIT_S = 1.0
 LOOK_S = 0.05
@@ -337,7 +338,7 @@ class Page:
     def press(self, job_id: str, name: str) -> None:
         """Click one of a job's buttons; a job that the list lacks is asked for, for the page asks every two seconds."""
         if not self.script("return document.querySelector(arguments[0]) !== null", f'[data-job="{job_id}"]'):
-            self.script("import('/main.js').then(({ jobs }) => jobs.poll())")
+            self.script("import(document.scripts[0].src).then(({ jobs }) => jobs.poll())")
         self.click(f'[data-job="{job_id}"] button[aria-label^="{name}"]')
 
     @property
@@ -370,6 +371,12 @@ class Page:
         """Files in one of the form's pickers."""
         self.show("drawer")
         self.find(f'#upload [name="{name}"]').send_keys("\n".join(map(str, paths)))
+
+    def send(self, clip: Path) -> None:
+        """Send a video of two eyes by the form."""
+        self.choose("clip", clip)
+        self.choose("calibration", CALIBRATION)
+        self.click("#upload [type=submit]")
 
     def messages(self) -> dict[str, str]:
         return {css: self.text(css) for css in ("#stage-message", "#upload-message", "#jobs", "#connection")}

@@ -18,6 +18,7 @@ from intrasplat.errors import ErrorCode
 from intrasplat.picture import Highlights, Unseen
 from tests.client.local_service import CLIP
 from tests.client.page import (
+    CALIBRATION,
     CAMERA,
     REPORT_OF_THE_PAGE,
     Page,
@@ -43,8 +44,7 @@ def large_clip(tmp_path: Path) -> Path:
 
 
 def test_a_clip_is_sent_and_its_job_watched_to_the_scene(site: Site, page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until_text("#jobs", "waiting")
     page.until_text("#jobs", "next")
     claim = site.claim()
@@ -97,6 +97,7 @@ def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Pa
     assert eyes.first_selected_option.text == "both eyes"
     eyes.select_by_value("left")
     Select(page.find("#upload [name=poses]")).select_by_value("fixed")
+    page.choose("calibration", CALIBRATION)
     page.click("#upload [type=submit]")
     page.until(lambda: site.queue.records())
     options = site.queue.records()[0].options
@@ -106,8 +107,7 @@ def test_a_stereo_clip_may_be_trained_on_its_left_eye_alone(site: Site, page: Pa
 def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Path) -> None:
     path = tmp_path / "cut short.mp4"
     path.write_bytes(b"\0\0\0\x18ftypisom" + bytes(64))
-    page.choose("clip", path)
-    page.click("#upload [type=submit]")
+    page.send(path)
     page.until_text("#upload-message", say("problem.input:clip"))
     assert page.find("#upload [type=submit]").is_enabled()
 
@@ -115,8 +115,7 @@ def test_a_clip_that_cannot_be_used_is_refused_in_words(page: Page, tmp_path: Pa
 def test_an_upload_goes_on_where_it_was_when_the_connection_is_back(site: Site, page: Page, large_clip: Path) -> None:
     slow = {"latency": 0, "download_throughput": 10_000_000, "upload_throughput": 1_000_000}
     page.driver.set_network_conditions(offline=False, **slow)
-    page.choose("clip", large_clip)
-    page.click("#upload [type=submit]")
+    page.send(large_clip)
     page.until(lambda: page.script("return document.querySelector('#upload-progress').value") > 0.2)
     page.driver.set_network_conditions(offline=True, **slow)
     page.until_text("#upload-message", say("upload.kept"))
@@ -196,7 +195,7 @@ def test_a_view_that_is_shown_is_told_with_its_camera_and_others_can_look_elsewh
 
 LOOK = """
 const [wish, done] = arguments;
-import("/main.js").then(({ viewer }) => {
+import(document.scripts[0].src).then(({ viewer }) => {
   viewer.look(wish);
   const take = ({ detail: { ...detail } }) => {
     const isOrbit = wish.pose?.startsWith("orbit");
@@ -348,8 +347,7 @@ def test_a_scene_that_somebody_else_deletes_leaves_the_screen(site: Site, page: 
 
 
 def test_a_job_is_cancelled_and_a_failed_one_tried_again_by_keyboard(site: Site, page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until_text("#jobs", "waiting")
     claim = site.claim()
     assert site.queue.fail(claim, JobError(code=ErrorCode.FAULT, problem="Division by zero.", remedy="See the log."))

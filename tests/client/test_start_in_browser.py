@@ -61,3 +61,17 @@ def test_a_page_with_scenes_opens_the_newest(site: Site, page: Page) -> None:
     page.press(newest, "Delete")
     page.click("#confirm [value=yes]")
     page.until_text("#stage-message", say("page.deleted"))
+
+
+def test_a_second_visit_asks_for_ten_things_at_most(site: Site, page: Page) -> None:
+    site.scene()
+    page.open()
+    page.until_state("live")
+    page.open()
+    page.until_state("live")
+    sent = page.script(
+        "return performance.getEntriesByType('resource').filter((each) => each.transferSize > 0)"
+        ".map((each) => new URL(each.name).pathname)"
+    )
+    assert len([each for each in sent if each.endswith((".js", ".css", ".svg"))]) == 0
+    assert len(sent) <= 10

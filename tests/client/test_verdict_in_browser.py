@@ -23,7 +23,9 @@ def scene_with(site: Site, *codes: NoticeCode) -> str:
 
 def look(page: Page, pose: str) -> None:
     page.driver.execute_async_script(
-        "const [pose, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ pose })))", pose
+        "const [pose, done] = arguments; "
+        "import(document.scripts[0].src).then(({ viewer }) => done(viewer.look({ pose })))",
+        pose,
     )
 
 

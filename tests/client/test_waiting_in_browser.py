@@ -19,13 +19,8 @@ return [preview.width, preview.height, data[0] + data[1] + data[2] > 0];
 """Width, height, and whether it is not black."""
 
 
-def send(page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
-
-
 def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_picture(site: Site, page: Page) -> None:
-    send(page)
+    page.send(CLIP)
     page.until(lambda: not page.script(HIDDEN, "#preview"))
     assert page.script(PREVIEW) == [96, 80, True]  # the left eye of two
     assert page.text("#badge") == say("screen.own_clip")
@@ -41,7 +36,7 @@ def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_p
 
 
 def test_one_bar_and_the_title_of_the_tab_grow_with_every_stage(site: Site, page: Page) -> None:
-    send(page)
+    page.send(CLIP)
     claim = site.claim()
     shares = []
     for stage, fraction in (("decode", 0.2), ("decode", 0.9), ("stereo", 0.1), ("fusion", 0.0), ("train", 0.1)):
@@ -60,7 +55,7 @@ def test_a_scene_in_view_does_not_stand_under_the_word_of_the_clip_that_is_sent(
     scene = site.scene()
     page.press(scene, "View")
     page.until_state("live")
-    send(page)
+    page.send(CLIP)
     page.until(lambda: page.text("#badge") == say("screen.own_clip"))
     assert page.script(HIDDEN, "#picture")
     page.press(scene, "View")
@@ -69,7 +64,7 @@ def test_a_scene_in_view_does_not_stand_under_the_word_of_the_clip_that_is_sent(
 
 
 def test_a_clip_that_fails_before_its_first_picture_says_so_on_the_stage(site: Site, page: Page) -> None:
-    send(page)
+    page.send(CLIP)
     page.until(lambda: not page.script(HIDDEN, "#preview"))
     site.queue.fail(site.claim(), JobError(code=ErrorCode.TRAINING_DIVERGED, problem="NaN."))
     page.until_text("#stage-message", say("problem.training_diverged"))
@@ -83,7 +78,7 @@ def test_a_refused_clip_gives_form_and_scene_back(site: Site, page: Page) -> Non
     top = box_of(page, "#stage")
     site.stop()
     try:
-        send(page)
+        page.send(CLIP)
         page.until(lambda: not page.script(HIDDEN, "#preview"))
         page.click("#upload-stop")
         page.until_text("#upload-message", say("upload.stopped"))
