@@ -95,12 +95,20 @@ class Detail:
         self._lock = Lock()
 
     def added(
-        self, renderer: SceneRenderer, t: float, world_from_camera: Pose, lens: Intrinsics, depth_mm: Floats
+        self,
+        renderer: SceneRenderer,
+        t: float,
+        world_from_camera: Pose,
+        lens: Intrinsics,
+        depth_mm: Floats,
+        *,
+        highlights: bool = True,
     ) -> Parts[Added]:
         """What a view at model time t gets.
 
         Args:
             depth_mm: [H, W] camera z of the view; 0 where nothing is solid.
+            highlights: whether to add what one of two eyes misses alone.
 
         Raises:
             SceneError: the recorded pictures are missing or damaged.
@@ -114,6 +122,8 @@ class Detail:
         shared = np.exp(np.minimum.reduce(angles) / np.float32(-2 * np.deg2rad(SHARED_DEG) ** 2))
         nearest = int(np.argmax([float(each.mean()) for each in own]))
         is_own = float(own[nearest].min()) > 1 - NEGLIGIBLE
+        if not highlights and len(poses) > 1:
+            own, is_own = [np.zeros_like(each) for each in own], False
         used = [nearest] if is_own else range(len(own)) if float(shared.max()) > NEGLIGIBLE else ()
         totals = {eye: np.zeros((*depth_mm.shape, 4), np.float32) for eye in used}
         neighbours = self._neighbours(t) if used else []

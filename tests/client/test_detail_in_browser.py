@@ -56,13 +56,20 @@ def view_with_detail(
     page.until_way("memory", "")
 
 
+WISHES: tuple[dict[str, object], ...] = (
+    {"t": 0.3, "pose": None},
+    {"t": 0.5, "pose": "orbit:5,-3,1"},
+    {"t": 0.6, "pose": None, "highlights": "off"},
+)
+
+
 @pytest.mark.parametrize("is_masked", [True, False])
 def test_a_view_that_rests_gets_detail_from_the_page(
     site: Site, driver: webdriver.Chrome, tmp_path: Path, is_masked: bool
 ) -> None:
     with opened(site.url, driver) as page:
         view_with_detail(site, page, tmp_path / "made", is_masked=is_masked)
-        for wish in ({"t": 0.3, "pose": None}, {"t": 0.5, "pose": "orbit:5,-3,1"}):
+        for wish in WISHES:
             page.look(**wish)
             page.until(lambda: page.shown.get("t") == wish["t"] and page.shown["hasDetail"])  # noqa: B023
             beside_the_service(site, page)

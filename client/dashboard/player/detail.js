@@ -90,10 +90,17 @@ export class Detail {
     return RIGHT_COLOUR / (RIGHT_COLOUR + size);
   }
 
-  /** What a view may need. @param {number} t @param {Matrix} pose @returns {{residuals: Wanted[], flows: Pair[]}} */
-  wanted(t, pose) {
+  /**
+   * What a view may need.
+   * @param {number} t
+   * @param {Matrix} pose
+   * @param {boolean} highlights as in add()
+   * @returns {{residuals: Wanted[], flows: Pair[]}}
+   */
+  wanted(t, pose, highlights) {
     const poses = this.pictures.eyes.map((_, eye) => this.eyePose(eye, t));
-    const own = poses.findIndex((each) => each.every((row, i) => row.every((value, j) => Math.abs(value - pose[i][j]) < 1e-9)));
+    const isOf = (each) => each.every((row, i) => row.every((value, j) => Math.abs(value - pose[i][j]) < 1e-9));
+    const own = highlights ? poses.findIndex(isOf) : -1;
     const eyes = own < 0 ? poses.map((_, eye) => eye) : [own];
     const frames = this.neighbours(t).map(({ frame }) => frame);
     return {
@@ -220,14 +227,16 @@ export class Detail {
    * @param {number} t
    * @param {Matrix} pose
    * @param {import("./camera.js").Intrinsics} lens
+   * @param {boolean} highlights whether to add what one of two eyes misses alone
    * @returns {WebGLTexture | null} red, green and blue [H, W]; null: nothing
    */
-  add(t, pose, lens) {
+  add(t, pose, lens, highlights) {
     const { gl, programs } = this;
     const { points, totals, totalTargets, sums, sumTarget, added, addedTarget } = this.#sized(lens);
     const view = { pose, lens, known: this.drawing.blended[1], centres: this.drawing.states[0] };
     const poses = this.pictures.eyes.map((_, eye) => this.eyePose(eye, t));
-    const { eyes, nearest, isOwn, weights } = weightsOf(this.cameras, poses, view, points.depthInCells(view.known), points.cells);
+    const depth = points.depthInCells(view.known);
+    const { eyes, nearest, isOwn, weights } = weightsOf(this.cameras, poses, view, depth, points.cells, highlights);
     const neighbours = this.neighbours(t);
     if (eyes.length === 0 || neighbours.length === 0) return null;
     gl.bindTexture(gl.TEXTURE_2D, points.weights);

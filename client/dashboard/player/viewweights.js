@@ -12,7 +12,7 @@ const squaredRad = (degrees) => ((degrees * Math.PI) / 180) ** 2;
 const mean = (values) => values.reduce((sum, each) => sum + each, 0) / values.length;
 
 /**
- * eyes: those that count at all. nearest: the one whose residuals tell most. isOwn: the view is that eye's.
+ * eyes: those that count at all. nearest: the one whose residuals tell most. isOwn: that one alone is shown.
  * weights: of each cell, first row first: what the first and the last eye miss alone, what both miss, and depth.
  * @typedef {{eyes: number[], nearest: number, isOwn: boolean, weights: Float32Array}} Weights
  */
@@ -23,9 +23,10 @@ const mean = (values) => values.reduce((sum, each) => sum + each, 0) / values.le
  * @param {{pose: import("./camera.js").Matrix, lens: import("./camera.js").Intrinsics}} view
  * @param {Float32Array} depth in the middles of the view's cells; 0 where nothing is solid
  * @param {[number, number]} cells across and down
+ * @param {boolean} highlights whether to add what one of two eyes misses alone
  * @returns {Weights}
  */
-export function weightsOf(cameras, poses, { pose, lens }, depth, [across]) {
+export function weightsOf(cameras, poses, { pose, lens }, depth, [across], highlights) {
   const solid = depth.filter((each) => each > 0).sort();
   const median = solid.length === 0 ? 1 : (solid[(solid.length - 1) >> 1] + solid[solid.length >> 1]) / 2;
   const filled = depth.map((each) => (each > 0 ? each : median));
@@ -46,7 +47,9 @@ export function weightsOf(cameras, poses, { pose, lens }, depth, [across]) {
   });
   const means = own.map(mean);
   const nearest = means.indexOf(Math.max(...means));
-  const isOwn = own[nearest].every((each) => each > 1 - NEGLIGIBLE);
+  const isShared = !highlights && poses.length > 1;
+  const isOwn = !isShared && own[nearest].every((each) => each > 1 - NEGLIGIBLE);
+  if (isShared) own.forEach((each) => each.fill(0));
   const all = shared.some((each) => each > NEGLIGIBLE) ? poses.map((_, eye) => eye) : [];
   const weights = new Float32Array(4 * filled.length);
   filled.forEach((d, at) => weights.set([own[0][at], own.at(-1)[at], shared[at], d], 4 * at));

@@ -164,6 +164,47 @@ def test_what_one_eye_misses_alone_stays_near_that_eye() -> None:
     assert np.abs(only).max() < 1e-6
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class TwoEyed:
+    """A left eye that sees a highlight at SPOT in every frame, and a right one that sees what the model shows."""
+
+    clip: ClipPictures
+    frames: Sequence[int]
+    scene: TrainedScene
+
+    @property
+    def eyes(self) -> Sequence[RecordedEye]:
+        (left,) = self.clip.eyes
+        beside = np.eye(4)
+        beside[0, 3] = 4.0
+        return left, RecordedEye(left.lens, beside)
+
+    def picture(self, eye: int, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        rgb, tissue = self.clip.picture(0, frame)
+        if eye == 0:
+            rgb = rgb.copy()
+            rgb[SPOT] = 255
+            return rgb, tissue
+        pose = self.scene.world_from_camera[0] @ self.eyes[1].left_from_eye
+        return render_frame(self.scene, frame / FRAMES, pose).rgb, tissue
+
+
+SPOT = (slice(36, 44), slice(60, 68))
+
+
+def test_without_highlights_nothing_is_added_that_one_of_two_eyes_saw_alone(made: Made) -> None:
+    scene, clip, split = made
+    pictures = TwoEyed(ClipPictures(clip, 1, split.train), split.train, scene)
+    seen = dataclasses.replace(scene, pictures=pictures)
+    t = split.train[3] / FRAMES
+    alone, bright, dull = (
+        render_frame(each, t, highlights=highlights).rgb[SPOT].mean()
+        for each, highlights in ((scene, False), (seen, True), (seen, False))
+    )
+    assert bright > 240
+    assert abs(dull - alone) < 0.2 * (bright - alone)
+
+
 def test_a_residual_is_carried_along_the_motion_unless_something_hides_the_point() -> None:
     height, width, shift_px, depth_mm = 20, 30, 4, 50.0
     lens = np.array([100, 100, width / 2, height / 2], np.float32)
