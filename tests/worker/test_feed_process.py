@@ -225,6 +225,12 @@ def test_a_feed_that_cannot_be_followed_says_why(tmp_path: Path, source: str | N
         asker.close()
 
 
+def niceness_of(worker_id: int, command: bytes) -> int:
+    """The niceness of the child that runs this command."""
+    lines = {each: Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in children_of(worker_id)}
+    return os.getpriority(os.PRIO_PROCESS, next(each for each, line in lines.items() if command in line))
+
+
 class FeedWorkers(WorkerProcesses):
     """Workers that may follow feeds of this machine."""
 
@@ -249,6 +255,7 @@ def test_a_worker_that_is_killed_and_started_again_goes_on_with_its_feed(tmp_pat
         with bench.worker(command=command) as first:
             eventually(followed_by)
             owner = followed_by()
+            eventually(lambda: niceness_of(first.pid, b"feed") < niceness_of(first.pid, b"device"))
             first.kill()
             first.wait()
         began = bench.queue.feed(record.feed_id)
