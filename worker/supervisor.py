@@ -31,8 +31,8 @@ from worker.feeds import FeedHost, endpoints_of, following
 TIDY_PERIOD_S = 600.0
 """Time between two clean-ups of the store: so long a local copy may outlive a scene purged on another machine."""
 
-NICENESS = 10
-"""Of jobs and renders of scenes while a feed is followed."""
+NICENESS, MAX_NICENESS = 10, 19
+"""Added for jobs and renders of scenes while a feed is followed; the most that there is."""
 
 DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 
@@ -97,7 +97,7 @@ def set_priority(keeper: ChildKeeper, feed_ids: Sequence[str]) -> None:
     child = keeper.live
     if child is not None and (feed_ids or child.is_nice):
         child.is_nice = bool(feed_ids)
-        set_niceness(child.process.pid, max(os.nice(0), NICENESS if feed_ids else 0))
+        set_niceness(child.process.pid, min(MAX_NICENESS, os.nice(0) + (NICENESS if feed_ids else 0)))
 
 
 def keep_rendering(keeper: ChildKeeper, end: threading.Event) -> None:
