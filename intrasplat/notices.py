@@ -123,6 +123,7 @@ class NoticeCode(StrEnum):
     # notices about one render
     COARSE = "coarse"
     DETAIL_MISSING = "detail_missing"
+    ENLARGED = "enlarged"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
-from fastapi.staticfiles import StaticFiles
 
 from contract.queue.interface import Queue
 from contract.runtime.settings import LOOPBACK_NAMES, Settings
@@ -39,6 +38,7 @@ from service.guard import Guard
 from service.head import HeadAsGet
 from service.metrics import Measure
 from service.openapi import DescribedApp
+from service.page import page_files
 from service.problems import install_handlers
 from service.renderer import Renderer
 from service.request_log import RequestLog
@@ -89,7 +89,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, feed_cut, feed_push, system):
         app.include_router(part.router)
     if settings.dashboard_dir is not None:
-        app.mount("/", StaticFiles(directory=settings.dashboard_dir, html=True), name="dashboard")
+        app.mount("/", page_files(settings.dashboard_dir), name="dashboard")
     return app
 
 

@@ -145,20 +145,29 @@ def _of_calibration(described: DescribedClip) -> Iterator[Finding]:
 
 
 def _of_fit(calibration: StereoCalibration, described: DescribedClip) -> Iterator[Finding]:
-    """A finding if the calibration fits none of the sizes that the clip's eyes may have."""
+    """A finding if the calibration fits none of the sizes that the clip's eyes may have, or only after a conversion."""
     clip = described.clip or described.left
     if clip is None or clip.width is None or clip.height is None:
         return
     layout = str(described.options.get("layout", "auto"))
     packings = ((1, 1),) if described.left is not None else EYES_OF.get(layout, ())
-    errors = []
+    errors: list[InputError] = []
+    fits: list[StereoCalibration] = []
     for beside, below in packings:
         try:
-            fitted(calibration, clip.width // beside, clip.height // below)
+            fits.append(fitted(calibration, clip.width // beside, clip.height // below))
         except InputError as error:
             errors.append(error)
     if packings and len(errors) == len(packings):
         yield _of_error(FindingCode.CALIBRATION_SIZE, errors[0], refused=False)
+    elif fits and all(each.scaled_from is not None for each in fits):
+        problem = f"it is for {calibration.width}x{calibration.height} pixels an eye, and is scaled to {_sizes(fits)}."
+        remedy = "If it is not of this recording, give the one that is: else every distance is wrong."
+        yield _finding("calibration", FindingCode.CALIBRATION_SCALED, problem, remedy, refused=False)
+
+
+def _sizes(fits: list[StereoCalibration]) -> str:
+    return " or ".join(f"{each.width}x{each.height}" for each in fits)
 
 
 def _of_options(services: Deps, caller: Caller, described: DescribedClip) -> Iterator[Finding]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from contract.wire.feeds import LIVE, FeedTime, feed_time
+from contract.wire.feeds import LIVE, T_REMEDY, FeedTime, feed_time
 from intrasplat.errors import InputError
 
 MAX_T = 1e6
@@ -17,9 +17,23 @@ ABOUT_T = (
     "seconds before that (-12.5), seconds of the source (31.4), or a time of RFC 3339 with its zone"
 )
 
+
+def _checked(asked: float | str | None) -> float | str | None:
+    """Refuse a text that is a time of neither. Raises InputError, so that the answer has its remedy."""
+    if isinstance(asked, str):
+        try:
+            feed_time(asked)
+        except InputError:
+            raise InputError(
+                "t", f"{asked[:40]!r} is no time.", f"{SCENE_T_REMEDY} Of a live feed: {T_REMEDY}"
+            ) from None
+    return asked
+
+
 AskedTime = Annotated[
     Annotated[float, Field(allow_inf_nan=False)] | str | None,
     Field(union_mode="left_to_right", description=ABOUT_T, examples=[0.4, "live", "-12.5", "2026-05-04T10:20:30Z"]),
+    AfterValidator(_checked),
 ]
 
 

@@ -92,7 +92,7 @@ def test_video_pushed_over_http_is_shown_cut_and_deleted(tmp_path: Path, sender:
         assert client.export(feed.id, "live", format="splat")
         assert_follows(client, feed.id)
 
-        job = client.cut_feed(feed.id, -3, iterations=20, preset="instant")
+        job = client.cut_feed(feed.id, -3, iterations=20, preset="instant", poses="fixed", mask_source="none")
         assert job.cut.frames > 20
         assert client.pause_feed(feed.id).state is FeedState.PAUSED
         resumed = client.resume_feed(feed.id)

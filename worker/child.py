@@ -71,6 +71,7 @@ class DeviceChild:
         self.kill = kill
         self.ready: Ready | None = None
         self.scenes: tuple[str, ...] = ()
+        self.is_nice = False
         self._reports: queue.SimpleQueue[JobReport] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, name="reports", daemon=True)
         self._reader.start()

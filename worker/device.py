@@ -24,7 +24,7 @@ from intrasplat.files.disk_errors import StoreFullError
 from intrasplat.instruments import load_segmenter
 from intrasplat.intake.limits import ClipLimits
 from intrasplat.machine.hooks import Progress
-from intrasplat.machine.processes import die_with_parent, let_others_first
+from intrasplat.machine.processes import die_with_parent
 from intrasplat.names import POSES_UNUSED, REPORT
 from intrasplat.pipeline import Made, make, score_scene, score_stored_scene
 from intrasplat.report import Imported, Report
@@ -64,9 +64,6 @@ REPORT_PERIOD_S = 0.1
 MAX_GPU_REST_S = 0.5
 """Longest rest after a render beside training on a GPU (worker/pace.py)."""
 
-NICENESS = 10
-"""Of jobs and renders of scenes where feeds may be followed: these come first."""
-
 LAST_SNAPSHOT_S = 10.0
 """How long the last snapshot of a finished job is still rendered: until the service knows the scene."""
 
@@ -83,8 +80,6 @@ def run_device(settings: Settings) -> None:
         SystemExit: something that it needs is missing.
     """
     die_with_parent()
-    if settings.feeds > 0:
-        let_others_first(NICENESS)
     channel = Channel.instead_of_stdout()
     orders = Orders.from_stdin()
     try:

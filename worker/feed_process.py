@@ -44,6 +44,8 @@ LOOK_PERIOD_S = 0.1
 """How soon a change of the feed's state is reported."""
 SHARE = 0.4
 """Renders' share of the CPU time: the rest follows the feed."""
+MAX_DEBT_S = 0.25
+"""CPU seconds: what a render takes beyond them delays the next one no further."""
 MAX_CLOSE_S = 4.0
 """For the feed to end in order."""
 
@@ -69,7 +71,8 @@ def run_feed(settings: Settings) -> None:
     if device == CPU:
         compile_kernels()  # the feed connects meanwhile
     views = FeedViews(hosted, device)
-    pace = RenderPace(thread_count(), used_s=time.process_time, share=SHARE)
+    # The first render of a scene may compile kernels for seconds; the next one must not wait for as long.
+    pace = RenderPace(thread_count(), used_s=time.process_time, max_debt_s=MAX_DEBT_S, share=SHARE)
     scheduler = Scheduler(
         views.answer_in_parts,
         pace,

@@ -18,13 +18,14 @@ from contract.store.feed_files import FeedFiles
 from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
 from intrasplat.errors import UnavailableError
 from intrasplat.live.state import FeedState
+from intrasplat.machine.hooks import ignore
 from worker.announce import announced
 from worker.feed_child import FeedChild
 
 FEED_COMMAND = (sys.executable, "-m", "worker", "feed")
 LOOK_PERIOD_S = 0.1
 CLAIM_PERIOD_S = 0.5
-RETRY_S = 1.0
+RETRY_S = NOTICE_PERIOD_S = 1.0
 PORTS, MAX_PORT = 16, 65535
 """Over TCP the processes of feeds take the first free ones of so many ports after the worker's own."""
 TIDY_PERIOD_S = 30.0
@@ -51,6 +52,7 @@ class FeedHost:
     """Follows up to `places` feeds. One thread calls run().
 
     owner      the name of the worker, a dot, and a token that is new at each start of the supervisor
+    on_look    called about once a second with the ids of the feeds that are followed
     endpoints  where the process that is announced under a name may answer, the first choice first
     """
 
@@ -63,11 +65,13 @@ class FeedHost:
         endpoints: Callable[[str], tuple[str, ...]],
         environment: Mapping[str, str] | None = None,
         command: Sequence[str] = FEED_COMMAND,
+        on_look: Callable[[Sequence[str]], object] = ignore,
     ) -> None:
         self._queue, self._files, self._owner, self._places = queue, files, owner, places
         self._endpoints, self._environment, self._command = endpoints, environment, command
         self._followed: dict[str, _Followed] = {}
-        self._claim_at_s = self._tidy_at_s = 0.0
+        self._on_look = on_look
+        self._claim_at_s = self._look_at_s = self._tidy_at_s = 0.0
         self._away = False
 
     @property
@@ -94,6 +98,8 @@ class FeedHost:
                 each.child.look()
             with self._reaching():
                 self._beat(each)
+        if self._is_due("_look_at_s", NOTICE_PERIOD_S):
+            self._on_look(self.followed)
         if self._is_due("_tidy_at_s", TIDY_PERIOD_S):
             with self._reaching():
                 self._tidy()

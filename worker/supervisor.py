@@ -22,6 +22,7 @@ from contract.store.feed_files import FeedFiles
 from contract.store.store import Store, open_store
 from contract.wire.rendering import WorkerAddress
 from intrasplat.errors import UnavailableError
+from intrasplat.machine.processes import set_niceness
 from worker.announce import LOOK_PERIOD_S, announced
 from worker.child import ChildKeeper
 from worker.consume import Consumer
@@ -29,6 +30,9 @@ from worker.feeds import FeedHost, endpoints_of, following
 
 TIDY_PERIOD_S = 600.0
 """Time between two clean-ups of the store: so long a local copy may outlive a scene purged on another machine."""
+
+NICENESS, MAX_NICENESS = 10, 19
+"""Added for jobs and renders of scenes while a feed is followed; the most that there is."""
 
 DEVICE_COMMAND = (sys.executable, "-m", "worker", "device")
 
@@ -67,7 +71,9 @@ def run_supervisor(
     consumer = Consumer(queue, store, keeper, name, owner, end, settings.min_free_bytes)
     # A worker without a place for feeds ends those that it has followed before.
     endpoints = partial(endpoints_of, run_dir=store.run_dir, render_endpoint=settings.render_endpoint)
-    host = FeedHost(queue, FeedFiles(store.data_dir), owner, settings.feeds, endpoints, environment)
+    files, places = FeedFiles(store.data_dir), settings.feeds
+    let_feeds_first = partial(set_priority, keeper)
+    host = FeedHost(queue, files, owner, places, endpoints, environment, on_look=let_feeds_first)
     try:
         check_queue(queue)
         with (
@@ -84,6 +90,14 @@ def run_supervisor(
         keeper.stop()
         queue.close()
         lock.release()
+
+
+def set_priority(keeper: ChildKeeper, feed_ids: Sequence[str]) -> None:
+    """Let feeds that are followed come before the child's jobs and renders; its own niceness returns where it may."""
+    child = keeper.live
+    if child is not None and (feed_ids or child.is_nice):
+        child.is_nice = bool(feed_ids)
+        set_niceness(child.process.pid, min(MAX_NICENESS, os.nice(0) + (NICENESS if feed_ids else 0)))
 
 
 def keep_rendering(keeper: ChildKeeper, end: threading.Event) -> None:

@@ -6,7 +6,7 @@ import { button, element, setText } from "./element.js";
 import { keep, kept } from "./kept.js";
 import { words } from "./messages.js";
 import { failureOf } from "./problem.js";
-import { progressOf } from "./progress.js";
+import { progressOf, shareOf, shareOfSending } from "./progress.js";
 import { TimesLeft } from "./left.js";
 
 const KEPT_AS = "intrasplat-sent";
@@ -79,7 +79,7 @@ export class Announcer {
   }
 
   #showTitle(job) {
-    const share = this.share ?? (job ? job.fraction ?? 0 : null);
+    const share = this.share === null ? job && shareOf(job) : shareOfSending(this.share);
     if (share !== null) document.title = `${Math.round(share * 100)} % · ${NAME}`;
     else document.title = this.ended ? `${words(`state.${this.ended.state}`)} · ${NAME}` : NAME;
   }

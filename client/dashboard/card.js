@@ -25,7 +25,7 @@ function trustIn(summary) {
 function trustLine(summary) {
   if (!summary) return [];
   const trust = trustIn(summary);
-  const reason = reasonsOf(trust).find(Boolean);
+  const reason = reasonsOf(trust).find(({ text }) => text !== "")?.text;
   return [element("p", { class: "trust" }, lightMark(trust.light), reason ? element("span", { class: "quiet", text: ` ${reason}` }) : "")];
 }
 

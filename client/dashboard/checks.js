@@ -11,6 +11,7 @@ import { suffixOf } from "./upload.js";
 const HEAD_BYTES = 16;
 const MAX_CALIBRATION_BYTES = 250_000;
 const VIDEOS = [".mp4", ".mov", ".mkv", ".webm"];
+const MISSING = "calibration_missing";
 const PARTS_OF_FRAMES = ["clip", "left", "right"];
 /** A browser that cannot read a video may never say so. */
 const MEASURED_WITHIN_MS = 4000;
@@ -60,6 +61,16 @@ async function describe(part, file) {
 }
 
 /**
+ * What is no clip needs no calibration. A video of two eyes without one would only fail later, so it is not sent.
+ * @param {Finding[]} findings
+ */
+function toTell(findings) {
+  const isNoClip = findings.some(({ field, refused }) => refused && PARTS_OF_FRAMES.includes(field));
+  const told = findings.filter(({ code }) => code !== MISSING || !isNoClip);
+  return told.map((finding) => ({ ...finding, refused: finding.refused || finding.code === MISSING }));
+}
+
+/**
  * Ask the service what speaks against a clip.
  * @param {Map<string, File>} files by part
  * @param {Record<string, any>} submission options, and the job whose clip is used again
@@ -69,7 +80,7 @@ export async function findingsOf(files, { options, clip_of }) {
   const described = { options, clip_of };
   try {
     for (const [part, file] of files) described[part] = await describe(part, file);
-    return (await checkClip(described)).findings;
+    return toTell((await checkClip(described)).findings);
   } catch {
     return []; // it is judged when it is sent
   }

@@ -13,6 +13,8 @@ const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
 const POSES = /\.(tum|txt|csv)$|(^|[^a-z])poses?[^a-z].*json$/i;
 const PICTURE = /\.png$/i;
 const UNAUTHORISED = 401;
+/** tests/client/draw_example.py draws it. */
+const EXAMPLE = ["stereo.webm", "calibration.json", "masks.zip"];
 
 /**
  * Which part of a clip each dropped file is, by its name; the user sees the guess in the pickers.
@@ -36,13 +38,16 @@ export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
-   * @param {{onJob: (id: string) => void, onShare: (share: number | null) => void, onAsked: () => void}} told of the job
-   *   that was made; of the share that is sent, null at the end; that something is asked of the user
+   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined) => void, onShare: (share: number | null) => void,
+   *   onAsked: () => void}} told of the job that was made; that a clip is being sent; of the share that is sent, null at the
+   *   end; that something is asked of the user
    */
   constructor(parts, told) {
     Object.assign(this, parts, told);
     /** @type {import("./api.js").Job | null} the job whose clip is used again, in place of a file */
     this.earlier = null;
+    /** @type {"masks"|"calibration"} the file that is sent with it */
+    this.asked = "masks";
     /** @type {{sending: Sending, missing: import("./sending.js").PlannedFile[]} | null} what a reload interrupted */
     this.resumed = null;
     this.isSending = false;
@@ -74,19 +79,30 @@ export class ClipForm {
   }
 
   /**
-   * Use a job's clip again with better masks: its options are chosen, and masks are asked for.
+   * Use a job's clip again with another file: its options are chosen, and the file is asked for.
    * @param {import("./api.js").Job} job
+   * @param {"masks"|"calibration"} part
    */
-  sendMasks(job) {
+  sendAgain(job, part) {
     this.#startAnew();
     this.earlier = job;
+    this.asked = part;
     for (const name of OPTIONS) {
-      const value = name === "mask_source" ? "given" : job.options[name];
+      const value = part === "masks" && name === "mask_source" ? "given" : job.options[name];
       if (value != null) this.form.elements[name].value = value;
     }
     this.#showSource();
     this.form.scrollIntoView();
-    this.form.elements.masks.focus({ preventScroll: true });
+    this.form.elements[part].focus({ preventScroll: true });
+  }
+
+  /** Send the clip that comes with the page. @param {string} label its name */
+  async sendExample(label) {
+    this.#startAnew();
+    const files = EXAMPLE.map(async (name) => new File([await (await fetch(`example/${name}`)).blob()], name));
+    this.take(await Promise.all(files));
+    this.form.elements.label.value = label;
+    await this.#send();
   }
 
   #startAnew() {
@@ -106,7 +122,7 @@ export class ClipForm {
 
   /** The pickers of the parts that are asked for, and why it is not all of them. */
   #showSource() {
-    const { clip } = this.form.elements;
+    const { clip, calibration } = this.form.elements;
     const asked = this.#askedFor();
     for (const part of PARTS) {
       const label = this.form.elements[part].closest("label");
@@ -119,30 +135,35 @@ export class ClipForm {
     if (this.resumed && isAsked) group.open = true;
     this.form.classList.toggle("resumed", this.resumed !== null);
     clip.required = asked.includes("clip");
+    calibration.required = this.earlier !== null && this.asked === "calibration";
     this.again.hidden = this.earlier === null && this.resumed === null;
     const [text, leave] = this.again.children;
     leave.textContent = words(this.resumed ? "upload.give_up" : "upload.another");
     if (this.resumed) {
       const names = this.resumed.missing.map((planned) => planned.name).join(", ");
       text.textContent = words("upload.choose_again", { names });
-    } else if (this.earlier) text.textContent = words("upload.clip_again", { id: this.earlier.label ?? this.earlier.id.slice(0, 8) });
+    } else if (this.earlier) text.textContent = words(`upload.clip_again_${this.asked}`, { id: this.earlier.label ?? this.earlier.id.slice(0, 8) });
   }
 
   #askedFor() {
     if (this.resumed) return this.resumed.missing.map(({ part }) => pickerOf(part));
-    return this.earlier ? ["masks"] : PARTS;
+    return this.earlier ? [this.asked] : PARTS;
   }
 
+  /** Files dropped anywhere on the page. */
   #takeDrops() {
+    const theatre = this.form.closest("main");
     const hold = (event, isOver) => {
       event.preventDefault(); // else the browser opens the file
-      this.form.classList.toggle("over", isOver && this.form.contains(event.target));
+      theatre.classList.toggle("dropping", isOver && this.isAllowed);
     };
     document.addEventListener("dragover", (event) => hold(event, true));
     document.addEventListener("dragleave", (event) => hold(event, false));
     document.addEventListener("drop", (event) => {
       hold(event, false);
-      if (this.isAllowed && this.form.contains(event.target)) this.take([...event.dataTransfer.files]);
+      if (!this.isAllowed || event.dataTransfer.files.length === 0) return;
+      this.onAsked();
+      this.take([...event.dataTransfer.files]);
     });
   }
 
@@ -213,6 +234,7 @@ export class ClipForm {
   /** @param {Sending} sending @param {Map<string, File>} files */
   async #run(sending, files) {
     this.#show(true);
+    this.onSend(files.get("clip") ?? files.get("left"));
     try {
       this.onJob(await sending.run(files));
       this.#startAnew();
@@ -232,6 +254,7 @@ export class ClipForm {
     sending.discard();
     this.resumed = null;
     this.#showSource();
+    this.onAsked();
   }
 
   /** Take up what a reload interrupted: what has not come of its files is asked for again. */

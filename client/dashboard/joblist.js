@@ -7,7 +7,7 @@ import { TimesLeft } from "./left.js";
 import { words } from "./messages.js";
 import { hush } from "./news.js";
 import { details, showProblem } from "./problem.js";
-import { progressOf } from "./progress.js";
+import { progressOf, shareOf } from "./progress.js";
 import { Thumbnails } from "./thumbnails.js";
 
 /** @typedef {import("./api.js").Job} Job */
@@ -26,7 +26,7 @@ export class JobList {
   /**
    * @param {{list: HTMLElement, nothing: HTMLElement, message: HTMLElement, confirm: HTMLDialogElement}} parts
    * @param {import("./scopes.js").Scopes} scopes
-   * @param {{onView: (id: string) => void, onChange: () => void, onPurged: (id: string) => void,
+   * @param {{onView: (id: string) => void, onCalibrate: (id: string) => void, onChange: () => void, onPurged: (id: string) => void,
    *   onLabelled: (job: Job) => void, onRedraw: () => void, onDownload: (id: string, name: string) => void,
    *   summaryOf: (id: string) => import("./api.js").SceneSummary | null}} told
    */
@@ -87,14 +87,14 @@ export class JobList {
       this.rows.set(job.id, row);
     }
     row.words.textContent = progressOf(job, this.times);
-    row.bar.value = job.fraction ?? 0;
+    row.bar.value = shareOf(job);
     row.item.classList.toggle("chosen", job.id === chosen);
     if (job.id === chosen) row.item.setAttribute("aria-current", "true");
     else row.item.removeAttribute("aria-current");
     return row;
   }
 
-  /** @param {Job} job @returns {("watch"|"view"|"save"|"rename"|"retry"|"cancel"|"delete")[]} what may be done, and would not be refused */
+  /** @param {Job} job @returns {("watch"|"view"|"save"|"rename"|"retry"|"calibrate"|"cancel"|"delete")[]} what may be done, and would not be refused */
   #actions(job) {
     const isLive = job.state === "queued" || job.state === "running";
     const mayChange = this.scopes.has("reconstruct");
@@ -104,6 +104,7 @@ export class JobList {
       save: job.state === "done" && this.scopes.has("view"),
       rename: mayChange,
       retry: job.state === "failed" && mayChange && MAY_SUCCEED.includes(job.error?.code ?? "unclassified"),
+      calibrate: job.state === "failed" && mayChange && job.error?.field === "calibration",
       cancel: isLive && mayChange,
       delete: !isLive && this.scopes.has("purge"),
     };
@@ -117,6 +118,7 @@ export class JobList {
       save: () => this.onDownload(job.id, name),
       rename: () => this.#rename(job),
       retry: () => this.#do(() => retryJob(job.id)),
+      calibrate: () => this.onCalibrate(job.id),
       cancel: () => this.#ask("cancel", name, () => this.#do(() => cancelJob(job.id))),
       delete: () => this.#ask("delete", name, () => this.#purge(job.id, name)),
     };

@@ -70,6 +70,8 @@ export class Jobs {
     this.round = 0;
     keyEvents.addEventListener("changed", () => this.#startAnew());
     this.ticks = 0;
+    /** Whether the service has listed its jobs. */
+    this.isKnown = false;
     this.isWell = true;
     setInterval(() => this.#tick(), POLL_MS);
     this.poll();
@@ -132,6 +134,7 @@ export class Jobs {
   }
 
   #startAnew() {
+    this.isKnown = false;
     for (const events of this.followed.values()) events.stop();
     this.followed.clear();
     this.byId.clear();
@@ -147,6 +150,7 @@ export class Jobs {
 
   #replace(jobs, askedAt) {
     this.newest = jobs.map((job) => job.id);
+    this.isKnown = true;
     for (const job of jobs) {
       this.gone.delete(job.id);
       const known = this.byId.get(job.id);

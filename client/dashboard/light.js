@@ -12,9 +12,9 @@ const WEIGHTS = {
     "training_score_low"
   ],
   "care": [
-    "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "camera_or_tissue", "colour_changes",
+    "alignment_unknown", "blood", "blurred_frames", "brightness_changes", "calibration_scaled", "camera_or_tissue", "colour_changes",
     "damaged_frames", "depth_jumps", "depth_not_compared", "depth_out_of_range", "depth_unusual", "detail_lost",
-    "detail_missing", "eyes_out_of_step", "eyes_unlike", "few_frames", "first_picture", "frames_show_nothing",
+    "detail_missing", "enlarged", "eyes_out_of_step", "eyes_unlike", "few_frames", "first_picture", "frames_show_nothing",
     "frames_without_tissue",
     "generalisation_gap", "hardly_seen", "hidden_at_first", "holes", "light_flickers", "little_depth", "mask_gaps",
     "mask_levels", "masks_mark_nothing", "masks_unsure", "motion_guessed", "no_instrument_masked", "no_texture",
@@ -23,7 +23,7 @@ const WEIGHTS = {
     "training_goes_on", "unclassified", "unseen", "veiled"
   ],
   "fine": [
-    "calibration_scaled", "colours_unknown", "eyes_coloured_apart", "frame_count_unknown", "gpu_idle",
+    "colours_unknown", "eyes_coloured_apart", "frame_count_unknown", "gpu_idle",
     "held_out_repeated", "magnified", "rows_misaligned"
   ]
 };
@@ -55,11 +55,12 @@ export function trustOf({ scored, psnr_tissue_db: db, warnings }) {
 /**
  * @param {Trust} trust
  * @param {(notice: import("./wire.js").Notice) => string} wordsOf a reason
- * @returns {string[]} why, in plain words
+ * @returns {{code: string, text: string}[]} why, in plain words, each sentence once
  */
 export function reasonsOf({ light, reasons }, wordsOf = noticeWords) {
-  if (light === "bad" && reasons.length === 0) return [words("light.not_measured")];
-  return [...new Set(reasons.map(wordsOf))];
+  if (light === "bad" && reasons.length === 0) return [{ code: "not_measured", text: words("light.not_measured") }];
+  const said = reasons.map((notice) => ({ code: notice.code, text: wordsOf(notice) }));
+  return said.filter(({ text }, place) => said.findIndex((other) => other.text === text) === place);
 }
 
 /** @param {Light} light @returns {HTMLElement} shape and word */

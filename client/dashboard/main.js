@@ -19,21 +19,25 @@ import { JobList } from "./joblist.js";
 import { Jobs } from "./jobs.js";
 import { currentKey, keyEvents, showKeyForm } from "./key.js";
 import { listenToKeys, onKeys } from "./keys.js";
+import { TimesLeft } from "./left.js";
 import { Legend } from "./legend.js";
 import { drawStrip } from "./lightstrip.js";
 import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure.js";
-import { languageEvents, showWords, words } from "./messages.js";
+import { figure, languageEvents, showWords, words } from "./messages.js";
 import { hush, prepareNews } from "./news.js";
 import { pause } from "./pause.js";
 import { failureOf } from "./problem.js";
 import { Probe } from "./probe.js";
+import { progressOf, shareOf, shareOfSending } from "./progress.js";
 import { showReport } from "./report.js";
 import { Scale } from "./scale.js";
 import { Scopes } from "./scopes.js";
 import { Shelf } from "./shelf.js";
 import { steer } from "./steer.js";
+import { Verdict } from "./verdict.js";
 import { Viewer } from "./viewer.js";
+import { Waiting } from "./waiting.js";
 
 const get = (id) => document.getElementById(id);
 
@@ -45,7 +49,6 @@ export const viewer = new Viewer({
   badge: get("badge"),
   statusText: get("status-text"),
   message: get("stage-message"),
-  warning: get("picture-warning"),
   sceneId: get("scene-id"),
   readout: get("readout"),
   time: get("time"),
@@ -86,6 +89,10 @@ new Scale(viewer, { canvas: get("picture"), box: get("scale") });
 new Legend(viewer, get("legend"));
 const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") });
 const drawers = new Drawers(get("tools"));
+const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
+const times = new TimesLeft();
+viewer.addEventListener("shown", () => viewer.scene === waiting.job && waiting.end());
+const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
 let awaited = null;
@@ -101,6 +108,7 @@ function say(text) {
 function view(id, message) {
   awaited = null;
   reported = null;
+  if (id === null || id !== waiting.job) waiting.end();
   tell("");
   hush(get("jobs-message"));
   viewer.open(id, message);
@@ -121,7 +129,8 @@ async function report(id) {
     const found = await getReport(id);
     if (!isStill()) return;
     compare.know(id, found);
-    showReport(get("report"), id, found, sendMasks);
+    verdict.know(found);
+    showReport(get("report"), id, found, sendAgain);
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
@@ -140,15 +149,34 @@ async function report(id) {
 function expect(id) {
   awaited = id;
   announcer.await(id);
-  if (!viewer.scene) viewer.open(null, words("page.awaited"));
+  if (waiting.isOn) viewer.open(null, "");
+  else if (!viewer.scene) viewer.open(null, words("page.awaited"));
+  waiting.job = id;
   jobs.poll();
 }
 
-function sendMasks(id) {
+/** A clip is being sent: its own first frame is the picture, until there is one of it. @param {File | undefined} clip */
+function send(clip) {
+  waiting.begin(clip);
+  get("empty").hidden = true;
+  if (drawers.isOpen === "drawer") drawers.close();
+}
+
+/** The bar over the stage: of the job that was sent from here until it is in view, then of the one in view. */
+function showProgress() {
+  if (form.isSending) return;
+  const job = jobs.byId.get(awaited ?? viewer.scene);
+  const isUnderWay = job?.state === "queued" || job?.state === "running";
+  if (job?.id === waiting.job && (job?.state === "failed" || job?.state === "cancelled")) waiting.end();
+  waiting.tell(isUnderWay ? shareOf(job) : null, isUnderWay ? progressOf(job, times) : "");
+}
+
+/** A job's clip is sent again. @param {string} id @param {"masks"|"calibration"} [part] the file that is asked for */
+function sendAgain(id, part = "masks") {
   const job = jobs.byId.get(id);
   if (!job) return;
   drawers.open("drawer", false);
-  form.sendMasks(job);
+  form.sendAgain(job, part);
 }
 
 function offerMasks() {
@@ -157,14 +185,35 @@ function offerMasks() {
   get("home").hidden = isOffered; // recorded frames are the endoscope's
 }
 
+let isOpened = false;
+
+/** Once the jobs are known: open the newest scene, if nothing else is wanted; without any, say how to come by one. */
+function openFirst() {
+  if (!jobs.isKnown) {
+    isOpened = false;
+    get("empty").hidden = true;
+    return;
+  }
+  const isIdle = viewer.scene === null && awaited === null && !form.isSending && !waiting.isOn;
+  if (!isOpened && isIdle && drawers.isOpen === null) {
+    isOpened = true; // view() comes back here
+    const newest = jobs.newest.map((id) => jobs.byId.get(id)).find(({ state }) => state === "done" || state === "running");
+    if (newest) view(newest.id);
+    else if (jobs.newest.length > 0) drawers.open("library", false);
+  }
+  isOpened = true;
+  get("empty").hidden = !isIdle || viewer.scene !== null || jobs.byId.size > 0;
+}
+
 function showJobs() {
   scopes.refresh();
   form.allow(scopes);
   sceneImport.allow(scopes);
   jobs.awaited = announcer.pending;
-  announcer.refresh(jobs.byId, jobs.gone, viewer.scene);
+  announcer.refresh(jobs.byId, jobs.gone, awaited ?? viewer.scene);
   if (jobs.gone.has(awaited)) {
     awaited = null;
+    waiting.end();
     if (!viewer.scene) viewer.open(null, words("page.deleted"));
   }
   offerMasks();
@@ -172,7 +221,9 @@ function showJobs() {
   list.show(shelf.shown, viewer.scene);
   setText(get("no-jobs"), shelf.nothing);
   const expected = jobs.byId.get(awaited);
-  if (expected?.state === "running" || expected?.state === "done") view(expected.id);
+  if (expected && expected.state !== "queued") view(expected.id);
+  showProgress();
+  openFirst();
   const viewed = jobs.byId.get(viewer.scene);
   light.keep(viewer.timeline.isPlaying || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
@@ -184,6 +235,7 @@ function showJobs() {
 }
 
 function showConnection(text, kind) {
+  if (kind === "good" && jobs.byId.has(viewer.scene)) viewer.screen.keepAlive();
   get("connection").textContent = text;
   get("connection").className = `pill ${kind}`;
 }
@@ -194,6 +246,7 @@ const list = new JobList(
   {
     onView: view,
     onChange: () => jobs.poll(),
+    onCalibrate: (id) => sendAgain(id, "calibration"),
     onRedraw: () => showJobs(),
     onLabelled: (job) => jobs.take(job),
     onDownload: (id, name) => downloads.open(id, name),
@@ -204,7 +257,7 @@ const list = new JobList(
     },
   },
 );
-const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "";
+const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "" || viewer.isKeptWaiting;
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
 listOpenFeeds(get("open-feeds"), () => drawers.isOpen === "library");
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
@@ -234,14 +287,22 @@ const form = new ClipForm(
   },
   {
     onJob: expect,
-    onShare: (share) => announcer.send(share),
+    onSend: send,
+    onShare(share) {
+      announcer.send(share);
+      if (share !== null) waiting.tell(shareOfSending(share), words("upload.sending", { share: figure(100 * share) }));
+      else if (waiting.job === null) waiting.end(); // nothing came of it
+    },
     onAsked: () => drawers.open("drawer", false),
   },
 );
 const sceneImport = new SceneImport({ ask: get("import"), file: get("import-file"), message: get("jobs-message") }, expect);
 awaited = announcer.awaited; // of before a reload
+if (awaited) viewer.open(null, words("page.awaited"));
+get("empty-clip").addEventListener("click", () => drawers.open("drawer"));
+get("empty-example").addEventListener("click", () => form.sendExample(words("empty.name")));
 get("layer").addEventListener("change", offerMasks);
-get("better-masks").addEventListener("click", () => sendMasks(viewer.scene));
+get("better-masks").addEventListener("click", () => sendAgain(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 languageEvents.addEventListener("changed", () => {
   list.forget();
@@ -251,7 +312,7 @@ languageEvents.addEventListener("changed", () => {
 showWords(document);
 keyEvents.addEventListener("changed", () => {
   view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")); // another key may not see the same
-  if (currentKey()) address.follow();
+  if (currentKey()) if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so
 });
 prepareNews(get("news"));
 get("upload").addEventListener("submit", () => hush(get("jobs-message")));
@@ -268,4 +329,4 @@ onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
-if (!address.follow()) drawers.open("library", false);
+if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

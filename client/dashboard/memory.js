@@ -101,7 +101,6 @@ export class Memory extends EventTarget {
       t: drawn.t,
       iteration: null,
       unseen: drawn.unseen,
-      warning: "",
       codes: drawn.warnings.map(({ code }) => code),
       totalMs: NaN,
       camera: { ...cameras.resized(size.width, size.height), world_from_camera: pose.slice(0, 3).flat() },

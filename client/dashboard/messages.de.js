@@ -93,9 +93,10 @@ export const DE = {
     "time_too_short": "Die Zeit zum Trainieren war für diesen Clip zu kurz.",
     "training_score_low": "Das Modell sieht selbst in den gelernten Bildern deutlich anders aus.",
     "coarse": "Grob gezeichnet, um Zeit zu sparen.",
+    "enlarged": "So nah hat das Bild keine feineren Einzelheiten als der Clip.",
     "hardly_seen": "Das Endoskop hat diesen Teil kaum gesehen.",
     "highlights_unknown": "Glanzlichter lassen sich nicht ausblenden: Diese Szene wurde nur aus einem Auge gelernt.",
-    "pose_far": "Diese Ansicht liegt weit vom Endoskop entfernt: Das meiste ist geraten.",
+    "pose_far": "Diese Ansicht blickt weit neben dem Endoskop herein: Das meiste ist geraten.",
     "time_in_gap": "Von diesem Moment der Übertragung ist nichts bekannt; der nächste wird gezeigt.",
     "time_outside_clip": "Dieser Moment liegt außerhalb des Clips; der nächste wird gezeigt.",
     "first_picture": "Ein Moment des Clips, noch kein Modell.",
@@ -172,10 +173,10 @@ export const DE = {
     "masks": "sucht Instrumente",
     "poses": "verfolgt das Endoskop",
     "motion": "verfolgt das Gewebe",
-    "fusion": "sammelt Punkte",
-    "start": "beginnt das Modell",
-    "calibrate": "probiert aus",
-    "compile": "bereitet das Programm vor",
+    "fusion": "wird vorbereitet",
+    "start": "wird vorbereitet",
+    "calibrate": "wird vorbereitet",
+    "compile": "wird vorbereitet",
     "train": "trainiert",
     "finish": "schließt ab",
     "score": "misst die Qualität",
@@ -189,18 +190,31 @@ export const DE = {
   },
   "screen": {
     "rendering": "Das Bild wird gezeichnet.",
-    "not_yet": "Das erste Bild kommt, wenn das Training beginnt.",
-    "nothing": "KEIN BILD",
+    "not_yet": "Das erste Bild kommt, während der Clip vorbereitet wird.",
+    "nothing": "NOCH KEIN BILD",
     "stale": "VERALTET",
     "stale_why": "Letztes Bild {time}. {reason} Verbindung wird gesucht.",
     "silent": "Der Dienst antwortet nicht.",
     "recorded": "AUFGEZEICHNET, Gefärbtes ist maskiert",
     "first_picture": "ERSTES BILD, noch kein Modell",
-    "training": "TRAINING, Schritt {iteration}",
+    "training": "WIRD BESSER",
     "extrapolated": "EXTRAPOLIERT",
-    "current": "AKTUELL",
+    "current": "MODELL AKTUELL",
     "unconfirmed": "AUS DEM SPEICHER",
-    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein"
+    "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein",
+    "own_clip": "IHR CLIP, noch kein Modell"
+  },
+  "waiting": {
+    "preview": "Das erste Bild Ihres Clips",
+    "share": "Wie viel getan ist",
+    "sending": "Wird gesendet"
+  },
+  "empty": {
+    "what": "Aus dem Clip eines Stereo-Endoskops wird ein Modell des bewegten Gewebes, das Sie drehen, anhalten und messen können.",
+    "clip": "Clip wählen",
+    "example": "Beispiel ausprobieren",
+    "drop": "Oder ziehen Sie einen Clip und seine Kalibrierung irgendwo auf diese Seite.",
+    "name": "Beispiel, künstliches Gewebe"
   },
   "readout": {
     "service": "Dienst {ms} ms",
@@ -208,7 +222,8 @@ export const DE = {
     "unseen": "{share} % nie gesehen",
     "stream": "Datenstrom",
     "single": "einzelne Bilder",
-    "memory": "hier gezeichnet"
+    "memory": "hier gezeichnet",
+    "iteration": "Schritt {iteration}"
   },
   "way": {
     "here": "In diesem Browser gezeichnet",
@@ -239,6 +254,7 @@ export const DE = {
     "figures": "{width} × {height}; Millisekunden: Entpacken {decode}, Bewegung {deform}, Sortieren {sort}, Zeichnen {draw}. {gpu}"
   },
   "light": {
+    "why": "Warum: Bericht öffnen",
     "good": "Gut",
     "care": "Mit Vorsicht",
     "bad": "Nicht verlässlich",
@@ -266,6 +282,7 @@ export const DE = {
     "rename": "Umbenennen",
     "long": "{seconds} s lang",
     "retry": "Noch einmal",
+    "calibrate": "Kalibrierung nachreichen",
     "cancel": "Abbrechen",
     "delete": "Löschen",
     "ask_cancel": "Die Arbeit an {name} abbrechen? Der Clip wird entfernt.",
@@ -484,6 +501,7 @@ export const DE = {
   },
   "check": {
     "calibration_missing": "Ein Video beider Augen braucht die Kalibrierung seines Endoskops. Fügen Sie die Datei hinzu.",
+    "calibration_scaled": "Diese Kalibrierung gilt für eine andere Bildgröße und wird umgerechnet. Gehört sie nicht zu dieser Aufnahme, ist jeder Abstand falsch.",
     "calibration_size": "Diese Kalibrierung ist für eine andere Bildgröße als die des Clips. Wählen Sie die dieser Aufnahme.",
     "calibration_unreadable": "Diese Kalibrierung ist nicht lesbar oder passt zu keinem Endoskop. Wählen Sie eine andere Datei.",
     "empty": "Diese Datei ist leer. Wählen Sie eine andere.",
@@ -697,7 +715,8 @@ export const DE = {
     "other_file": "Das ist nicht die Datei, die gesendet wurde. Wählen Sie {name} oder geben Sie den Clip auf.",
     "give_up": "Aufgeben",
     "another": "Anderer Clip",
-    "clip_again": "Der Clip von {id} noch einmal, mit seiner Kalibrierung.",
+    "clip_again_masks": "Der Clip von {id} noch einmal, mit seiner Kalibrierung.",
+    "clip_again_calibration": "Der Clip von {id} noch einmal, mit der Kalibrierung, die Sie wählen.",
     "stopped": "Abgebrochen. Nichts davon wurde behalten.",
     "kept": "Was gesendet wurde, bleibt erhalten.",
     "sending": "Sendet, {share} %"

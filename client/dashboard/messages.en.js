@@ -93,9 +93,10 @@ export const EN = {
     "time_too_short": "The time for training was too short for this clip.",
     "training_score_low": "The model looks clearly different even from the frames that it learned from.",
     "coarse": "Drawn coarsely, to save time.",
+    "enlarged": "So near, the picture holds no finer detail than the clip.",
     "hardly_seen": "The endoscope hardly saw this part.",
     "highlights_unknown": "Highlights cannot be hidden: one eye alone taught this scene.",
-    "pose_far": "This view lies far from where the endoscope was: most of it is a guess.",
+    "pose_far": "This view looks from far beside the endoscope: most of it is a guess.",
     "time_in_gap": "Nothing is known of this moment of the feed; the nearest one is shown.",
     "time_outside_clip": "This moment lies outside the clip; the nearest one is shown.",
     "first_picture": "One moment of the clip, not yet a model.",
@@ -172,10 +173,10 @@ export const EN = {
     "masks": "finding instruments",
     "poses": "following the endoscope",
     "motion": "following the tissue",
-    "fusion": "collecting points",
-    "start": "starting the model",
-    "calibrate": "trying out",
-    "compile": "preparing the program",
+    "fusion": "preparing",
+    "start": "preparing",
+    "calibrate": "preparing",
+    "compile": "preparing",
     "train": "training",
     "finish": "finishing",
     "score": "measuring the quality",
@@ -189,18 +190,31 @@ export const EN = {
   },
   "screen": {
     "rendering": "The picture is being drawn.",
-    "not_yet": "Its first picture comes when training begins.",
-    "nothing": "NO PICTURE",
+    "not_yet": "The first picture comes while the clip is being prepared.",
+    "nothing": "NO PICTURE YET",
     "stale": "STALE",
     "stale_why": "Last picture {time}. {reason} Reconnecting.",
     "silent": "The service does not answer.",
     "recorded": "RECORDED, what is coloured is masked",
     "first_picture": "FIRST PICTURE, not yet a model",
-    "training": "TRAINING, iteration {iteration}",
+    "training": "IMPROVING",
     "extrapolated": "EXTRAPOLATED",
-    "current": "CURRENT",
+    "current": "LATEST MODEL",
     "unconfirmed": "FROM MEMORY",
-    "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile"
+    "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile",
+    "own_clip": "YOUR CLIP, not yet a model"
+  },
+  "waiting": {
+    "preview": "The first frame of your clip",
+    "share": "How much is done",
+    "sending": "Sending"
+  },
+  "empty": {
+    "what": "A clip of a stereo endoscope becomes a model of the moving tissue that you can turn, stop and measure.",
+    "clip": "Choose a clip",
+    "example": "Try an example",
+    "drop": "Or drop a clip and its calibration anywhere on this page.",
+    "name": "Example, synthetic tissue"
   },
   "readout": {
     "service": "service {ms} ms",
@@ -208,7 +222,8 @@ export const EN = {
     "unseen": "{share} % unseen",
     "stream": "stream",
     "single": "single pictures",
-    "memory": "drawn here"
+    "memory": "drawn here",
+    "iteration": "iteration {iteration}"
   },
   "way": {
     "here": "Drawn in this browser",
@@ -239,6 +254,7 @@ export const EN = {
     "figures": "{width} × {height}; milliseconds: decoding {decode}, motion {deform}, sorting {sort}, drawing {draw}. {gpu}"
   },
   "light": {
+    "why": "Why: open the report",
     "good": "Good",
     "care": "With care",
     "bad": "Do not rely on it",
@@ -266,6 +282,7 @@ export const EN = {
     "rename": "Rename",
     "long": "{seconds} s long",
     "retry": "Try again",
+    "calibrate": "Add a calibration",
     "cancel": "Cancel",
     "delete": "Delete",
     "ask_cancel": "Cancel the work on {name}? Its clip is removed.",
@@ -484,6 +501,7 @@ export const EN = {
   },
   "check": {
     "calibration_missing": "A video of two eyes needs the calibration of its endoscope. Add the file.",
+    "calibration_scaled": "This calibration is for another picture size and is converted. If it is not of this recording, every distance is wrong.",
     "calibration_size": "This calibration is for another picture size than the clip has. Choose the one of this recording.",
     "calibration_unreadable": "This calibration cannot be read, or fits no endoscope. Choose another file.",
     "empty": "This file is empty. Choose another one.",
@@ -697,7 +715,8 @@ export const EN = {
     "other_file": "This is not the file that was being sent. Choose {name}, or give the clip up.",
     "give_up": "Give it up",
     "another": "Another clip",
-    "clip_again": "The clip of {id} again, with its calibration.",
+    "clip_again_masks": "The clip of {id} again, with its calibration.",
+    "clip_again_calibration": "The clip of {id} again, with the calibration that you choose.",
     "stopped": "Stopped. Nothing of it is kept.",
     "kept": "What was sent is kept.",
     "sending": "Sending, {share} %"

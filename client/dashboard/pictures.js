@@ -8,7 +8,8 @@ import { Stream } from "./stream.js";
 /** @typedef {import("./stream.js").View} View */
 /** @typedef {import("./stream.js").Picture} Picture */
 
-const ANSWER_MS = 15000;
+/** Longer than the service waits for a worker (render_timeout_s). */
+const ANSWER_MS = 25000;
 const FIRST_RETRY_MS = 1000;
 const MAX_RETRY_MS = 15000;
 
@@ -17,7 +18,7 @@ const RECORDED = "recorded";
 
 const GUESSES = ["pose_far", "time_outside_clip"];
 /** What a view itself says; all other notices are of its scene. */
-const OF_VIEW = [...GUESSES, "unseen", "hardly_seen"];
+const OF_VIEW = [...GUESSES, "unseen", "hardly_seen", "enlarged"];
 
 /** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
 async function askOnce(path, signal) {
@@ -31,7 +32,6 @@ async function askOnce(path, signal) {
     t: Number(header("T")),
     iteration: header("Iteration") === null ? null : Number(header("Iteration")),
     unseen: Number(header("Unseen")),
-    warning: "",
     codes: header("Warning-Codes")?.split(", ") ?? [],
     totalMs: total ? Number(total[1]) : NaN,
     camera: JSON.parse(header("Camera") ?? "null"),
@@ -53,16 +53,24 @@ function isGuess(code, view) {
 
 const withViewFirst = (codes) => [true, false].flatMap((isOfView) => codes.filter((code) => OF_VIEW.includes(code) === isOfView));
 
-/** What to know of a picture, in the page's words, and of this view first. @param {string[]} codes @param {View} view */
-const warningOf = (codes, view) =>
-  withViewFirst(codes)
-    .map((code) => (code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" })))
-    .filter(Boolean)
-    .join(" ");
+/** What to know of a view, in the page's words. @param {string} code @param {View} view */
+const wordsOf = (code, view) =>
+  code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" });
+
+/**
+ * What to know of a picture: of this view first, then of its scene.
+ * @param {string[]} codes of the picture @param {View} view
+ * @param {{code: string, text: string}[]} reasons for care with the scene, in words
+ * @returns {string}
+ */
+export function warningOf(codes, view, reasons) {
+  const own = codes.filter((code) => !reasons.some((reason) => reason.code === code));
+  const sentences = [...withViewFirst(own).map((code) => wordsOf(code, view)), ...reasons.map(({ text }) => text)];
+  return [...new Set(sentences)].filter(Boolean).join(" ");
+}
 
 /** Note of a picture of a view what its codes mean. @param {Picture} picture @param {View} view @returns {Picture} */
 export function judged(picture, view) {
-  picture.warning = warningOf(picture.codes, view);
   picture.isRecorded = view.layer === RECORDED;
   picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
   return picture;

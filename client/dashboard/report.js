@@ -40,10 +40,20 @@ function trusted(report) {
   return sentences;
 }
 
-/** Why to be careful, the worst first. @param {Report} report @param {import("./light.js").Trust} trust @returns {Node[]} */
-function careful(report, trust) {
+/**
+ * Why to be careful, the worst first.
+ * @param {Report} report
+ * @param {import("./light.js").Trust} trust
+ * @returns {{code: string, text: string}[]}
+ */
+export function reasonsIn(report, trust) {
   const isDoubt = doubtsCamera(report);
-  const reasons = reasonsOf(trust, (notice) => (report.poses && isDoubt(notice) ? cameraWords(report.poses, true) : noticeWords(notice)));
+  return reasonsOf(trust, (notice) => (report.poses && isDoubt(notice) ? cameraWords(report.poses, true) : noticeWords(notice)));
+}
+
+/** @param {Report} report @param {import("./light.js").Trust} trust @returns {Node[]} */
+function careful(report, trust) {
+  const reasons = reasonsIn(report, trust).map(({ text }) => text);
   const more = reasons.length - MAX_REASONS;
   const shown = reasons.length > 0 ? [listOf(reasons.slice(0, MAX_REASONS), "reasons")] : [];
   if (more > 0) shown.push(element("p", { class: "quiet", text: words("report.more_reasons", { count: more }) }));

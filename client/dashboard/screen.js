@@ -1,4 +1,4 @@
-// The picture and what it is worth. A picture is live only while the service keeps confirming it: whatever goes wrong, the
+// The picture and what it is worth. A picture is live only while the service keeps answering: whatever goes wrong, the
 // badge says so by itself after STALE_AFTER_MS, because it depends on what comes, not on somebody noticing. What this
 // browser draws from memory goes on without the service, and then says that nobody confirms it.
 
@@ -16,7 +16,7 @@ const FIRST_PICTURE = "first_picture";
 export class Screen {
   /**
    * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, status: HTMLElement, badge: HTMLElement,
-   *   statusText: HTMLElement, message: HTMLElement, warning: HTMLElement, sceneId: HTMLElement}} parts
+   *   statusText: HTMLElement, message: HTMLElement, sceneId: HTMLElement}} parts
    */
   constructor(parts) {
     Object.assign(this, parts);
@@ -37,7 +37,7 @@ export class Screen {
   clear(scene, words) {
     this.scene = scene;
     this.shown = null;
-    this.confirmedAt = 0;
+    this.confirmedAt = this.aliveAt = 0;
     this.awaitedUntil = 0;
     this.trouble = "";
     this.words = words;
@@ -67,10 +67,22 @@ export class Screen {
     else this.confirm();
   }
 
+  /** @param {boolean} isCovered the user's own clip lies over whatever picture there is */
+  cover(isCovered) {
+    this.isCovered = isCovered;
+    this.#look();
+  }
+
   /** The service has just said that what is shown is there. */
   confirm() {
     this.confirmedAt = Date.now();
     this.trouble = "";
+    this.#look();
+  }
+
+  /** The service has just said that it is well and knows what is shown: a picture that takes long is no silence. */
+  keepAlive() {
+    this.aliveAt = Date.now();
     this.#look();
   }
 
@@ -90,22 +102,23 @@ export class Screen {
   #look() {
     const [state, badge, message] = this.#state();
     this.stage.dataset.state = this.status.dataset.state = state;
-    this.canvas.hidden = this.shown === null;
+    this.stage.toggleAttribute("data-empty", this.scene === null);
+    this.status.toggleAttribute("data-recorded", this.shown?.isRecorded === true);
+    this.canvas.hidden = this.shown === null || this.isCovered === true;
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
     setText(this.statusText, this.#text(state));
     setText(this.message, message);
     this.message.hidden = message === "";
-    setText(this.warning, state === "stale" ? "" : (this.shown?.warning ?? ""));
-    this.warning.title = this.warning.textContent;
   }
 
   /** @returns {[string, string, string]} state, badge, message over the picture */
   #state() {
+    if (this.isCovered) return ["waiting", words("screen.own_clip"), ""];
     if (this.scene === null) return ["none", "", this.words];
     if (this.shown === null) return ["waiting", words("screen.nothing"), this.words];
     const isOfMemory = this.shown.way === "memory";
-    const limit = this.confirmedAt + (isOfMemory ? UNCONFIRMED_AFTER_MS : STALE_AFTER_MS);
+    const limit = isOfMemory ? this.confirmedAt + UNCONFIRMED_AFTER_MS : Math.max(this.confirmedAt, this.aliveAt) + STALE_AFTER_MS;
     if (this.trouble || Date.now() > Math.max(limit, this.awaitedUntil)) {
       if (isOfMemory) return ["unconfirmed", words("screen.unconfirmed"), ""];
       const reason = this.trouble || words("screen.silent");
@@ -113,7 +126,7 @@ export class Screen {
     }
     if (this.shown.isRecorded) return ["live", words("screen.recorded"), ""];
     if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", words("screen.first_picture"), ""];
-    if (this.shown.state === "running") return ["training", words("screen.training", { iteration: this.shown.iteration }), ""];
+    if (this.shown.state === "running") return ["training", words("screen.training"), ""];
     return this.shown.isExtrapolated ? ["extrapolated", words("screen.extrapolated"), ""] : ["live", words("screen.current"), ""];
   }
 

@@ -13,7 +13,7 @@ import { connectionLost, Problem, wrongKeyWords } from "./problem.js";
  * from the clip's. isRecorded: it is a frame of the clip, no render. Both are set by judged() of pictures.js.
  * depthRangeMm: of depth in false colours, of the brightest and of the darkest. isMoving: as of Shown in viewer.js.
  * @typedef {{blob?: Blob, image?: HTMLCanvasElement, scene: string, state: "running"|"done", t: number, iteration: number | null,
- *   unseen: number, warning: string, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
+ *   unseen: number, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
  *   camera: Camera | null, depthRangeMm?: [number, number] | null, isExtrapolated?: boolean, isRecorded?: boolean,
  *   isMoving?: boolean}} Picture
  */
@@ -94,7 +94,7 @@ export class Stream {
     this.pending = null;
     const { scene, state, t, iteration, unseen, camera, depth_range_mm: depthRangeMm, warnings, total_ms: totalMs } = head;
     const codes = warnings.map(({ code }) => code);
-    resolve({ blob, scene, state, t, iteration, unseen, warning: "", codes, totalMs, camera, depthRangeMm, way: "stream" });
+    resolve({ blob, scene, state, t, iteration, unseen, codes, totalMs, camera, depthRangeMm, way: "stream" });
   }
 
   #fail(problem) {

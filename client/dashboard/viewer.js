@@ -1,6 +1,6 @@
 // The view of one scene: at most one picture is under way; the newest wish comes next. The service draws, or this browser
 // once it has the scene. Now and then the service is asked: for the newest picture of a job that trains, else only whether
-// the scene is still there, which notices a purge and keeps CURRENT true.
+// the scene is still there, which notices a purge and keeps the status true.
 
 import { stillThere } from "./api.js";
 import { Clip } from "./clip.js";
@@ -116,6 +116,11 @@ export class Viewer extends EventTarget {
     if (t !== undefined) this.timeline.set(t); // asks for the picture: all of the wish is set before
     if (layer !== undefined) parts.layer.dispatchEvent(new Event("change"));
     this.refresh();
+  }
+
+  /** Whether a picture takes so long that only other answers can tell whether the service is there. */
+  get isKeptWaiting() {
+    return this.isBusy && performance.now() - this.askedAt > AGAIN_MS;
   }
 
   refresh() {
@@ -285,9 +290,10 @@ export class Viewer extends EventTarget {
     const server = Number.isFinite(picture.totalMs) ? ` (${words("readout.service", { ms: figure(picture.totalMs) })})` : "";
     const { rate } = this.pace;
     const pace = rate >= 1 && this.timeline.isPlaying ? [words("readout.rate", { rate: figure(rate) })] : [];
+    const iteration = picture.iteration === null ? [] : [words("readout.iteration", { iteration: picture.iteration })];
     const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
     const took = `${figure(tookMs)} ms${server}`;
-    this.parts.readout.textContent = [name, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
+    this.parts.readout.textContent = [name, ...iteration, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
     this.#tellWay();
     this.way.tellFigures(pace, picture.camera);
   }

@@ -27,6 +27,14 @@
  */
 /**
  * @typedef {{
+ *   from_s: number,
+ *   to_s: number,
+ *   frames: number,
+ *   is_whole?: boolean,
+ * }} CutRange
+ */
+/**
+ * @typedef {{
  *   event_id: string,
  *   state: JobState,
  *   error_code?: string | null,
@@ -54,6 +62,58 @@
  * }} DetailScores
  */
 /** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"feeds_full"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
+/**
+ * @typedef {{
+ *   source?: string | null,
+ *   layout?: "auto"|"sbs"|"tb"|"two",
+ *   label?: string | null,
+ *   keep_s?: number,
+ *   width?: number | null,
+ *   camera?: "fixed"|"moving",
+ * }} FeedOptions
+ */
+/** @typedef {"unreachable"|"host_refused"|"redirected"|"refused"|"closed"|"silent"|"undecodable"|"no_video"|"times_jumped"|"size_changed"|"packing_changed"|"packing_unknown"|"picture_limit"|"decoder_ended"|"decoder_memory"|"too_slow"|"fault"|"no_worker"|"unclassified"|"by_hand"|"end_of_file"|"no_scene"|"calibration"|"disk_full"|"disk_fails"|"disk_slow"|"not_recordable"} FeedReason */
+/**
+ * @typedef {{
+ *   feed_id: string,
+ *   ended_at: string,
+ *   bytes: number,
+ *   record: boolean,
+ *   verified: boolean,
+ * }} FeedReceipt
+ */
+/** @typedef {"connecting"|"live"|"behind"|"stalled"|"paused"|"no_tissue"|"ended"} FeedState */
+/**
+ * @typedef {{
+ *   state: FeedState,
+ *   reason?: FeedReason | null,
+ *   text?: string,
+ *   since_s: number,
+ *   recording?: FeedReason | null,
+ *   received_fps?: number,
+ *   used_fps?: number,
+ *   dropped?: number,
+ *   model_age_s?: number | null,
+ *   decode_lag_s?: number | null,
+ *   reconnects?: number,
+ *   last_frame_at_s?: number | null,
+ *   kept_bytes?: number,
+ *   begins_s?: number | null,
+ *   ends_s?: number | null,
+ *   source_begins_s?: number | null,
+ *   source_ends_s?: number | null,
+ *   width?: number | null,
+ *   height?: number | null,
+ *   gaussians?: number,
+ *   id: string,
+ *   label?: string | null,
+ *   wish: FeedWish,
+ *   options: FeedOptions,
+ *   created_at_s: number,
+ *   links: Record<string, string>,
+ * }} FeedView
+ */
+/** @typedef {"run"|"pause"|"end"} FeedWish */
 /**
  * @typedef {{
  *   source: "found"|"given"|"all",
@@ -201,7 +261,7 @@
  *   text: string,
  * }} Notice
  */
-/** @typedef {"baseline"|"bit_depth"|"calibration"|"decoding"|"depth_unit"|"field_of_view"|"frame_times"|"imported"|"interlaced"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"pixel_aspect"|"poses"|"rectification"|"rotation"|"splashes"|"synthetic"|"bases"|"early_stopping"|"exposure"|"smoke"|"spacing"|"stored_precision"|"vignetting"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"damaged_frames"|"depth_inverted"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"detail_lost"|"eyes_coloured_apart"|"eyes_disagree"|"eyes_out_of_step"|"eyes_unlike"|"few_frames"|"field_of_view_unusual"|"frames_show_nothing"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"light_flickers"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"mask_levels"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_contradict"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"sharpness_changes"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"motion_guessed"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"detail_missing"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_in_gap"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
+/** @typedef {"baseline"|"bit_depth"|"calibration"|"decoding"|"depth_unit"|"field_of_view"|"frame_times"|"imported"|"interlaced"|"intrinsics"|"layout"|"masks"|"middle_line_unused"|"pixel_aspect"|"poses"|"rectification"|"rotation"|"splashes"|"synthetic"|"bases"|"early_stopping"|"exposure"|"smoke"|"spacing"|"stored_precision"|"vignetting"|"alignment_unknown"|"blood"|"blurred_frames"|"brightness_changes"|"camera_or_tissue"|"calibration_scaled"|"colours_unknown"|"colour_changes"|"damaged_frames"|"depth_inverted"|"depth_jumps"|"depth_out_of_range"|"depth_unusual"|"detail_lost"|"eyes_coloured_apart"|"eyes_disagree"|"eyes_out_of_step"|"eyes_unlike"|"few_frames"|"field_of_view_unusual"|"frames_show_nothing"|"frames_without_tissue"|"frame_count_unknown"|"hidden_at_first"|"light_flickers"|"little_depth"|"little_stereo_depth"|"little_tissue"|"magnified"|"masks_mark_nothing"|"masks_unsure"|"mask_gaps"|"mask_levels"|"no_instrument_masked"|"no_texture"|"no_time"|"nothing_new"|"out_of_focus"|"poses_contradict"|"poses_unsure"|"pose_jitter"|"repeated_frames"|"rows_misaligned"|"sharpness_changes"|"stereo_unsure"|"veiled"|"scores_failed"|"scores_pending"|"copying_scores_more"|"depth_disagrees"|"depth_not_compared"|"generalisation_gap"|"right_eye_low"|"gpu_idle"|"held_out_repeated"|"held_out_score_low"|"held_out_without_tissue"|"holes"|"motion_guessed"|"nothing_held_out"|"outlier_frames"|"time_too_short"|"training_score_low"|"coarse"|"detail_missing"|"enlarged"|"hardly_seen"|"highlights_unknown"|"pose_far"|"time_in_gap"|"time_outside_clip"|"first_picture"|"training_goes_on"|"unseen"|"unclassified"} NoticeCode */
 /**
  * @typedef {{
  *   frames: number[],

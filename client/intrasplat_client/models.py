@@ -203,6 +203,7 @@ class NoticeCode(StrEnum):
     TRAINING_SCORE_LOW = "training_score_low"
     COARSE = "coarse"
     DETAIL_MISSING = "detail_missing"
+    ENLARGED = "enlarged"
     HARDLY_SEEN = "hardly_seen"
     HIGHLIGHTS_UNKNOWN = "highlights_unknown"
     POSE_FAR = "pose_far"

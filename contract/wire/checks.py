@@ -15,6 +15,7 @@ class FindingCode(StrEnum):
     """What was found, for programs; docs/codes.md explains each."""
 
     CALIBRATION_MISSING = "calibration_missing"
+    CALIBRATION_SCALED = "calibration_scaled"
     CALIBRATION_SIZE = "calibration_size"
     CALIBRATION_UNREADABLE = "calibration_unreadable"
     EMPTY = "empty"

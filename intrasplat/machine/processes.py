@@ -55,9 +55,14 @@ def die_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def let_others_first(niceness: int) -> None:
-    """From now on other processes get the cores before this one and its children do, as of a niceness in [0, 19]."""
-    os.nice(max(0, niceness - os.nice(0)))
-    # Linux may compare whole sessions, and the supervisor gives each of its children one.
+def set_niceness(process_id: int, niceness: int) -> None:
+    """Let a process, all its threads and later children run at a niceness in [0, 19], as far as the system allows:
+    without privileges none becomes less nice again."""
+    tasks = Path(f"/proc/{process_id}/task")
+    threads = [int(each.name) for each in tasks.iterdir()] if tasks.is_dir() else [process_id]
+    for thread in threads:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, niceness)
+    # Linux may compare whole sessions. A supervised process has one of its own.
     with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(niceness))
+        Path(f"/proc/{process_id}/autogroup").write_text(str(niceness))

@@ -26,7 +26,8 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.splat.cpu.threads import run
 from intrasplat.splat.metrics import COVERED_ALPHA
 from intrasplat.splat.model import ProjectedPicture
-from intrasplat.train.targets import MEDIAN_DEPTH_UNITS, solid_depth_mm
+from intrasplat.train.targets import solid_depth_mm
+from intrasplat.view.aside import aside
 from intrasplat.view.camera import endoscope_pose
 from intrasplat.view.confidence import confidence, evidence, followed, seen_from_endoscope
 from intrasplat.view.detail import Added
@@ -38,9 +39,11 @@ from intrasplat.view.smoky import smoke_share, with_smoke
 from intrasplat.view.transfer import in_levels
 from intrasplat.view.unseen import missing_pixels, unseen_pixels
 
-FAR_POSE = 0.35
-"""Distance from the nearest trained pose, in median depths, beyond which the frame carries a warning, because it shows
-sides that the clip never saw."""
+FAR_DEG = 20.0
+"""A frame warns when the median ray meets the surface at more than this angle to every recording eye's: it shows sides
+that the clip never saw."""
+MAX_ENLARGEMENT = 4.0
+"""A frame warns when it is nearer to the surface than the clip by more than this factor."""
 LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
 """A frame warns when more than MAX_LOW_SHARE of its pixels show Gaussians of less trust than LOW_TRUST."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
@@ -307,9 +310,13 @@ def clamped_to_clip(scene: TrainedScene, t: float) -> tuple[float, tuple[Notice,
 
 
 def _warnings_of_pose(view: ViewRequest, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
-    if (distance := _distance_from_trained(view.scene, view.pose)) > FAR_POSE:
-        text = f"This pose is {distance:.1f} viewing distances from the endoscope's: most of it is a guess."
+    angle_deg, enlargement = aside(view.scene, view.pose, view.lenses.drawn)
+    if angle_deg > FAR_DEG:
+        text = f"This view looks from {angle_deg:.0f} degrees beside the endoscope: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
+    if enlargement > MAX_ENLARGEMENT:
+        text = f"This view is enlarged {enlargement:.1f} times: it holds no finer detail than the clip."
+        yield Notice.warning(NoticeCode.ENLARGED, text)
     if (share := _share(unseen)) > MAX_UNSEEN_SHARE:
         text = f"No frame saw {share:.0%} of this view. unseen=mark hatches it, unseen=guess shows a guess."
         yield Notice.warning(NoticeCode.UNSEEN, text)
@@ -320,10 +327,3 @@ def _warnings_of_pose(view: ViewRequest, trust: NDArray[np.float32], unseen: NDA
 def _share(pixels: NDArray[np.bool_]) -> float:
     """The share of pixels that are true. mean() would take ten times as long."""
     return float(np.count_nonzero(pixels) / pixels.size)
-
-
-def _distance_from_trained(scene: TrainedScene, pose: NDArray[np.float64]) -> float:
-    """Distance of the camera's centre from the nearest trained one, in median depths of the clip."""
-    centres = scene.world_from_camera[scene.trained_frames][:, :3, 3]
-    nearest_mm = float(np.linalg.norm(centres - pose[:3, 3], axis=1).min())
-    return nearest_mm * scene.units_per_mm / MEDIAN_DEPTH_UNITS

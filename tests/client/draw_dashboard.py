@@ -59,7 +59,8 @@ def draw(page: Page, clip: Path, out: Path, training: Path | None) -> None:
         save(page, training)
     wait.until(lambda _: page.script(JUDGED))
     page.script(
-        "const frame = arguments[0]; import('/main.js').then(({ viewer }) => viewer.timeline.goTo(frame))", SHOWN_FRAME
+        "const frame = arguments[0]; import(document.scripts[0].src).then(({ viewer }) => viewer.timeline.goTo(frame))",
+        SHOWN_FRAME,
     )
     wait.until(lambda _: page.state == "live" and f"frame {SHOWN_FRAME + 1} " in page.text("#time-value"))
     save(page, out)

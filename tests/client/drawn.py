@@ -24,7 +24,7 @@ let text = "";
 for (let i = 0; i < pixels.length; i += 8192) text += String.fromCharCode(...pixels.subarray(i, i + 8192));
 return [width, height, btoa(text)];
 """
-VIEWER = "const done = arguments[arguments.length - 1]; import('/main.js').then(({ viewer }) => { %s })"
+VIEWER = "const done = arguments[arguments.length - 1]; import(document.scripts[0].src).then(({ viewer }) => { %s })"
 LOOK = VIEWER % "viewer.look(arguments[0]); done()"
 SHOWN = VIEWER % "done(viewer.shown)"
 

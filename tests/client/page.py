@@ -60,6 +60,7 @@ from worker.reply import Reply
 from worker.serve import RequestServer
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+CALIBRATION = DASHBOARD / "example" / "calibration.json"
 WAIT_S = 15.0
 MAX_WAIT_S = 1.0
 LOOK_S = 0.05
@@ -182,13 +183,14 @@ class Site:
             probe.bind(("127.0.0.1", 0))
             port: int = probe.getsockname()[1]
         settings = Settings(data_dir=data_dir, port=port, dashboard_dir=DASHBOARD, min_free_bytes=0)
-        self._settings = settings.model_copy(update=changes)
+        self._settings = settings.model_copy(update={"render_timeout_s": 5.0, **changes})
         self.url = f"http://127.0.0.1:{port}"
         self.announce()
         self.start()
 
     def start(self) -> None:
-        app = create_app(self._settings, self.queue, self.store, ZmqRenderer(self.queue, 5.0))
+        renderer = ZmqRenderer(self.queue, self._settings.render_timeout_s)
+        app = create_app(self._settings, self.queue, self.store, renderer)
         self._server = Server(app, self._settings)
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
@@ -238,6 +240,7 @@ class Site:
         scored: bool = True,
         model: TrainedScene | None = None,
         beside: Mapping[str, bytes] | None = None,
+        report: Report = REPORT_OF_THE_PAGE,
     ) -> str:
         """The job's scene; model and the files beside it: as they are stored, for those who read them."""
         folder = self.store.work_folder(claim.job_id, claim.attempt)
@@ -245,8 +248,7 @@ class Site:
             (folder / MANIFEST).write_text('{"files": {}}')
         else:
             save_scene(folder, model, beside)
-        report = REPORT_OF_THE_PAGE if scored else first_report_of_the_page()
-        (folder / REPORT).write_text(report.model_dump_json())
+        (folder / REPORT).write_text((report if scored else first_report_of_the_page()).model_dump_json())
         (folder / CURVE).write_text(CURVE_OF_THE_PAGE)
         self.store.publish_scene(claim.job_id, claim.attempt)
         assert self.queue.finish(claim)
@@ -336,7 +338,7 @@ class Page:
     def press(self, job_id: str, name: str) -> None:
         """Click one of a job's buttons; a job that the list lacks is asked for, for the page asks every two seconds."""
         if not self.script("return document.querySelector(arguments[0]) !== null", f'[data-job="{job_id}"]'):
-            self.script("import('/main.js').then(({ jobs }) => jobs.poll())")
+            self.script("import(document.scripts[0].src).then(({ jobs }) => jobs.poll())")
         self.click(f'[data-job="{job_id}"] button[aria-label^="{name}"]')
 
     @property
@@ -369,6 +371,12 @@ class Page:
         """Files in one of the form's pickers."""
         self.show("drawer")
         self.find(f'#upload [name="{name}"]').send_keys("\n".join(map(str, paths)))
+
+    def send(self, clip: Path) -> None:
+        """Send a video of two eyes by the form."""
+        self.choose("clip", clip)
+        self.choose("calibration", CALIBRATION)
+        self.click("#upload [type=submit]")
 
     def messages(self) -> dict[str, str]:
         return {css: self.text(css) for css in ("#stage-message", "#upload-message", "#jobs", "#connection")}

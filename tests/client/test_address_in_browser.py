@@ -103,7 +103,8 @@ def test_the_link_is_copied(page: Page, scene: str) -> None:
 
 KEYS = """
 const done = arguments[0];
-import("/keys.js").then(({ keyRows }) => done(keyRows().flatMap(({ keys }) => Object.keys(keys))));
+const address = new URL("keys.js", document.scripts[0].src);
+import(address).then(({ keyRows }) => done(keyRows().flatMap(({ keys }) => Object.keys(keys))));
 """
 
 
@@ -129,6 +130,7 @@ def test_the_help_tells_every_key_and_gesture_in_both_languages(site: Site, page
 
 
 def test_keys_are_left_to_what_is_typed_into(site: Site, page: Page) -> None:
+    page.show("library")
     page.find("#search").send_keys("f?a ,")
     assert page.find("#search").get_attribute("value") == "f?a ,"
     assert not page.find("#help").is_displayed()

@@ -14,7 +14,7 @@ from tests.cameras import CAMERAS, FIRST_CAMERAS, FRAMES
 from tests.client.page import CAMERA, DEPTH_MM, Page, Site
 from tests.client.words import say
 
-SHOWN = "const done = arguments[0]; import('/main.js').then(({ viewer }) => done(viewer.shown));"
+SHOWN = "const done = arguments[0]; import(document.scripts[0].src).then(({ viewer }) => done(viewer.shown));"
 SHORTER_FRAMES = 30
 SHORTER_CAMERAS = CAMERAS.model_copy(
     update={
@@ -79,11 +79,12 @@ def test_a_scene_that_is_watched_from_its_first_picture_on_is_played_as_soon_as_
     page.until_text("#badge", say("screen.first_picture"))
     page.until_text("#time-value", "frame 1 of 1")
     page.driver.execute_async_script(
-        "const [t, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ t })))", 0.5
+        "const [t, done] = arguments; import(document.scripts[0].src).then(({ viewer }) => done(viewer.look({ t })))",
+        0.5,
     )
     site.painter.cameras = CAMERAS
     site.painter.warnings = []
-    page.until_text("#badge", "TRAINING")
+    page.until_text("#badge", say("screen.training"))
     page.until_text("#time-value", f"1.00 s of 1.95 s, frame 21 of {FRAMES}")  # t is kept
     assert page.find("#eye").is_displayed()
     page.click("#step-on")
@@ -95,8 +96,8 @@ def test_a_scene_that_is_watched_from_its_first_picture_on_is_played_as_soon_as_
 
 PLAYED = """
 const [speed, ms, done] = arguments;
-import("/timeline.js").then(async ({ Timeline }) => {
-  const { viewer } = await import("/main.js");
+import(new URL("timeline.js", document.scripts[0].src)).then(async ({ Timeline }) => {
+  const { viewer } = await import(document.scripts[0].src);
   const parts = Object.fromEntries(["play", "loop", "loopStart", "loopEnd", "loopAll", "timeValue"].map((name) =>
     [name, document.createElement("button")]));
   parts.time = Object.assign(document.createElement("input"), { type: "range" });

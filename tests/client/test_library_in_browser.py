@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
@@ -51,6 +52,11 @@ def many_done(site: Site, count: int, began_s: float = -10_000) -> None:
         )
         site.queue.submit(record)
         assert site.queue.finish(site.claim())
+
+
+@pytest.fixture(autouse=True)
+def _library(page: Page) -> None:
+    page.show("library")
 
 
 def test_each_scene_has_its_picture_its_name_its_length_and_its_light(site: Site, page: Page) -> None:
@@ -109,6 +115,7 @@ def test_a_thousand_scenes_are_listed_page_by_page_and_only_those_in_sight_have_
 ) -> None:
     many_done(site, 1000)
     page.open()
+    page.show("library")
     page.until(lambda: len(page.script(NAMES)) == 30)
     assert page.script(NAMES)[0] == "case 999"
     page.click("#more-jobs")
@@ -129,6 +136,7 @@ def test_a_scene_that_is_found_has_its_light_however_many_are_newer(site: Site, 
     many_done(site, 120, 1)
     labelled(site, f"{119:032x}", "liver new")
     page.open()
+    page.show("library")
     page.find("#search").send_keys("liver")
     page.until(lambda: page.script(NAMES) == ["liver new", "liver old"])
     page.until(lambda: page.text(card(old, ".trust")))

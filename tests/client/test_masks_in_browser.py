@@ -11,7 +11,7 @@ from selenium.webdriver.support.select import Select
 from intrasplat.names import MASKS
 from intrasplat.report import Masks
 from tests.client.local_service import CLIP
-from tests.client.page import RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
+from tests.client.page import CALIBRATION, RECORDED_SHADE, REPORT_OF_THE_PAGE, Page, Site
 from tests.client.words import say
 
 
@@ -41,7 +41,7 @@ def test_recorded_frames_show_the_masks_while_a_job_trains_and_afterwards(site: 
         page.until(lambda: page.text("#badge").startswith("RECORDED") and page.shade == RECORDED_SHADE)
         assert page.view == "recorded, masks marked, 0.00 s"
     Select(page.find("#layer")).select_by_value("rgb")
-    page.until(lambda: page.text("#badge") == "CURRENT" and page.shade > RECORDED_SHADE)
+    page.until(lambda: page.text("#badge") == say("screen.current") and page.shade > RECORDED_SHADE)
 
 
 def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path: Path) -> None:
@@ -49,6 +49,7 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
     page.click("#upload > details > summary")
     Select(page.find("#upload [name=mask_source]")).select_by_value("auto")
     Select(page.find("#upload [name=poses]")).select_by_value("fixed")
+    page.choose("calibration", CALIBRATION)
     page.click("#upload [type=submit]")
     page.until_text("#jobs", "waiting")
     claim = site.claim()
@@ -89,8 +90,7 @@ def test_better_masks_are_sent_without_the_clip(site: Site, page: Page, tmp_path
 
 
 def test_a_clip_is_sent_again_without_any_file(site: Site, page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until_text("#jobs", "waiting")
     scene = site.finish(site.claim())
     report = REPORT_OF_THE_PAGE.model_copy(update={"masks": Masks(source="none")})

@@ -16,8 +16,8 @@ from tests.measurements import DEPTH_MM, RANGE_MM, UNCERTAINTY_MM, stretch
 
 MM_A_PIXEL = DEPTH_MM / CAMERA.fx
 PLACES = """
-const { placeInPicture } = await import("/pointer.js");
-const { viewer } = await import("/main.js");
+const { placeInPicture } = await import(new URL("pointer.js", document.scripts[0].src));
+const { viewer } = await import(document.scripts[0].src);
 const { u, v, scale } = placeInPicture(document.querySelector("#picture"), viewer.shown.camera, 0, 0);
 return [u, v, scale, viewer.shown.camera.width, viewer.shown.camera.height];
 """
@@ -88,11 +88,11 @@ def test_two_clicks_measure_and_the_distance_follows_the_time(site: Site, page: 
     assert f"{began * 0.9:.1f}" in label
     ends = "return ['x1', 'x2'].map((each) => +document.querySelector('.measured .line').getAttribute(each))"
     left, right = page.script(ends)
-    page.script("import('/main.js').then(({ viewer }) => viewer.look({ t: 0.25 }))")
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.look({ t: 0.25 }))")
     page.until(lambda: distance_of(page) == pytest.approx(began * stretch(0.25), abs=0.15))
     wider = page.script(ends)
     assert (wider[1] - wider[0]) / (right - left) == pytest.approx(stretch(0.25), rel=0.02)
-    page.script("import('/main.js').then(({ viewer }) => viewer.timeline.play(true))")
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.timeline.play(true))")
     page.until(lambda: not math.isclose(distance_of(page), began * stretch(0.25), abs_tol=0.3))
 
 
@@ -103,7 +103,7 @@ def test_a_distance_follows_the_tissue_when_the_view_turns(site: Site, page: Pag
     click_at(page, 0.5, 0.5)
     page.until(lambda: page.text("#measuring .distance"))
     before = page.text("#measuring .distance")
-    page.script("import('/main.js').then(({ viewer }) => viewer.look({ pose: 'orbit:5,0,1' }))")
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.look({ pose: 'orbit:5,0,1' }))")
     page.until(lambda: "+5" in page.view)
     assert page.text("#measuring .distance") == before
 
@@ -125,7 +125,7 @@ def test_a_first_point_does_not_outlive_the_view_in_which_it_was_chosen(site: Si
     start(site, page)
     click_at(page, 0.25, 0.5)
     page.until(lambda: "±" in page.text("#measuring .told"))
-    page.script("import('/main.js').then(({ viewer }) => viewer.look({ t: 0.5 }))")
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.look({ t: 0.5 }))")
     page.until_text("#measuring .told", say("measure.moved"))
 
 
@@ -150,9 +150,10 @@ def test_a_click_that_measures_turns_nothing_and_a_drag_still_turns(site: Site, 
     start(site, page)
     point(page, 0.3, 0.3).click_and_hold().move_by_offset(2, 1).release().perform()
     page.until(lambda: "±" in page.text("#measuring .told"))
-    assert page.script("return import('/main.js').then(({ viewer }) => viewer.orbit.isHome)")
+    assert page.script("return import(document.scripts[0].src).then(({ viewer }) => viewer.orbit.isHome)")
     point(page, 0.3, 0.3).click_and_hold().move_by_offset(60, 0).move_by_offset(40, 0).release().perform()
-    page.until(lambda: not page.script("return import('/main.js').then(({ viewer }) => viewer.orbit.isHome)"))
+    is_home = "return import(document.scripts[0].src).then(({ viewer }) => viewer.orbit.isHome)"
+    page.until(lambda: not page.script(is_home))
 
 
 def test_a_job_that_trains_is_not_measured(site: Site, page: Page) -> None:
@@ -182,7 +183,7 @@ def test_nothing_of_a_scene_that_leaves_the_screen_stays_on_it(site: Site, page:
     page.until(lambda: "±" in page.text("#measuring .told"))
     click_at(page, 0.6, 0.4)
     page.until(lambda: page.text("#measuring .distance") and page.find("#scale").is_displayed())
-    page.script("return import('/main.js').then(({ viewer }) => viewer.open(null))")
+    page.script("return import(document.scripts[0].src).then(({ viewer }) => viewer.open(null))")
     assert page.shade == -1
     assert not page.find("#measuring").is_displayed()
     assert not page.find("#scale").is_displayed()

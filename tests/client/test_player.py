@@ -73,6 +73,8 @@ def test_the_player_reads_and_draws_what_a_worker_does(
         Seen(0.31, is_marked=False),
         Seen(2 / 3, orbit=(12.0, -7.0, 1.6)),
         Seen(0.2, orbit=(-9.0, 4.0, 2.0, 6.0, -3.0, 50.0)),
+        Seen(0.4, orbit=(0.0, 0.0, 2.12)),
+        Seen(0.4, orbit=(0.0, 0.0, 6.0)),
         Seen(0.5, orbit=(-70.0, 20.0, 0.7), highlights=False),
         Seen(0.9, eye="right"),
     ]

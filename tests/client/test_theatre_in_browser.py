@@ -12,7 +12,7 @@ from selenium.webdriver.common.keys import Keys
 from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode
 from intrasplat.notices import NoticeCode
-from tests.client.page import Page, Site
+from tests.client.page import CALIBRATION, Page, Site
 from tests.client.words import LANGUAGES, say
 from tests.reports import a_warning
 
@@ -87,6 +87,7 @@ def test_the_picture_fills_the_screen_and_a_refusal_is_seen_whatever_is_open(
         assert (right - left) * (bottom - top) > 0.85 * width * height
         page.choose("clip", broken)
         page.script("document.querySelector('#upload details').open = true")
+        page.choose("calibration", CALIBRATION)
         page.click("#upload [type=submit]")
         page.until_text("#upload-message", say("problem.input:clip"))
         assert is_on_screen(page, "#upload-message")
@@ -140,8 +141,7 @@ def test_on_a_phone_an_open_drawer_has_the_screen_also_below_a_message(site: Sit
     with screen_of(page, width, height):
         page.press(site.scene(), "View")
         page.until_state("live")
-        page.choose("clip", broken)
-        page.click("#upload [type=submit]")
+        page.send(broken)
         page.until_text("#upload-message", say("problem.input:clip"))
         _, top, _, bottom = box_of(page, "#drawer")
         assert bottom - top >= 0.6 * height
@@ -191,11 +191,12 @@ def test_the_warning_of_this_view_is_read_before_those_of_its_scene_and_all_are_
         page.press(site.scene(), "View")
         page.until_text("#picture-warning", say("notice.poses_unsure"))
         page.driver.execute_async_script(
-            "const [pose, done] = arguments; import('/main.js').then(({ viewer }) => done(viewer.look({ pose })))",
+            "const [pose, done] = arguments; "
+            "import(document.scripts[0].src).then(({ viewer }) => done(viewer.look({ pose })))",
             "orbit:30,0,1",
         )
         page.until_text("#picture-warning", say("notice.pose_far"))
-        whole = " ".join(say(f"notice.{code}") for code in (NoticeCode.POSE_FAR, *of_scene))
+        whole = " ".join(say(f"notice.{code}") for code in (NoticeCode.POSE_FAR, *of_scene, NoticeCode.UNCLASSIFIED))
         assert page.script("return document.querySelector('#picture-warning').textContent") == whole
         assert page.find("#picture-warning").get_attribute("title") == whole
         hidden = "const { scrollHeight, clientHeight } = document.querySelector('#picture-warning'); "

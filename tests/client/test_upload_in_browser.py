@@ -17,8 +17,9 @@ from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
-from tests.client.page import Page, Site, site_at
+from tests.client.page import CALIBRATION, Page, Site, site_at
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of
+from tests.client.test_waiting_in_browser import BAR
 from tests.client.words import say
 from tests.service.test_check import RECTIFIED
 
@@ -55,8 +56,7 @@ def slow_line(page: Page) -> Iterator[None]:
 
 
 def until_half_is_sent(page: Page, clip: Path) -> None:
-    page.choose("clip", clip)
-    page.click("#upload [type=submit]")
+    page.send(clip)
     page.until(lambda: page.script(SHARE) > 0.3)
 
 
@@ -67,12 +67,19 @@ def test_wrong_files_are_told_beside_their_fields_before_anything_is_sent(
     notes.write_text("no film at all")
     page.choose("clip", notes)
     page.until(lambda: ["clip", "kind"] in page.script(FINDINGS))
-    assert ["calibration", "calibration_missing"] in page.script(FINDINGS)
+    assert page.script(FINDINGS) == [["clip", "kind"]]  # what is no clip needs no calibration
     assert say("check.kind") in page.text("#upload")
     page.click("#upload [type=submit]")
     page.until_text("#upload-message", say("upload.look"))
     page.choose("clip", CLIP)
     page.until(lambda: page.script(FINDINGS) == [["calibration", "calibration_missing"]])
+    page.script("document.querySelector('#upload-message').textContent = ''")
+    page.click("#upload [type=submit]")
+    page.until_text("#upload-message", say("upload.look"))
+    assert page.script("return document.activeElement.name") == "calibration"
+    page.choose("calibration", calibration_at(tmp_path / "double.json", width=192, height=160))
+    page.until(lambda: page.script(FINDINGS) == [["calibration", "calibration_scaled"]])
+    assert page.find(".finding").get_attribute("class") == "finding care"
     page.choose("calibration", calibration_at(tmp_path / "other.json", width=100, height=700))
     page.until(
         lambda: page.script(FINDINGS) == [["calibration", "calibration_size"]]
@@ -85,6 +92,24 @@ def test_wrong_files_are_told_beside_their_fields_before_anything_is_sent(
     names = page.script("return performance.getEntriesByType('resource').map((entry) => new URL(entry.name).pathname)")
     assert "/uploads" not in names
     assert site.queue.records() == []
+
+
+def test_a_clip_that_failed_for_its_calibration_gets_another_without_being_sent_again(site: Site, page: Page) -> None:
+    page.send(CLIP)
+    page.until(lambda: site.queue.records())
+    claim = site.claim()
+    error = JobError(code=ErrorCode.INPUT, problem="No depth within 10 to 300 mm.", field="calibration")
+    site.queue.fail(claim, error)
+    page.press(claim.job_id, say("job.calibrate"))
+    page.until_text("#upload-again", "calibration")
+    assert not page.find("#upload [name=clip]").is_displayed()
+    page.choose("calibration", CALIBRATION)
+    page.click("#upload [type=submit]")
+    page.until(lambda: len(site.queue.records()) == 2)
+    assert site.queue.get(claim.job_id) is not None
+    again = next(each for each in site.queue.records() if each.job_id != claim.job_id)
+    assert again.clip_of == claim.job_id
+    assert (site.store.spool_folder(again.job_id) / again.files.calibration).read_bytes() == CALIBRATION.read_bytes()
 
 
 def test_two_eyes_that_differ_are_told_and_doubts_do_not_stop_a_clip(site: Site, page: Page, tmp_path: Path) -> None:
@@ -125,6 +150,7 @@ def test_poses_and_a_field_of_view_are_sent_with_the_clip(site: Site, page: Page
 def test_a_file_that_changes_after_it_was_chosen_is_told(site: Site, page: Page, large_clip: Path) -> None:
     page.choose("clip", large_clip)
     large_clip.write_bytes(CLIP.read_bytes())
+    page.choose("calibration", CALIBRATION)
     page.click("#upload [type=submit]")
     page.until_text("#upload-message", say("upload.changed"))
     page.until(lambda: page.find("#upload [type=submit]").is_enabled())
@@ -137,8 +163,7 @@ def test_row_2_what_is_wrong_is_in_view_with_the_options_open(site: Site, page: 
         page.show("drawer")
         assert is_on_screen(page, "#upload [name=masks]")  # masks need no options
         page.script("document.querySelector('#upload details').open = true")
-        page.choose("clip", notes)
-        page.click("#upload [type=submit]")
+        page.send(notes)
         page.until_text("#upload-message", say("upload.look"))
         assert is_on_screen(page, "#upload-message")
         page.until(lambda: is_on_screen(page, "#upload [name=clip]"))  # it has the focus
@@ -155,12 +180,13 @@ def test_row_10_an_upload_goes_on_after_a_reload_at_half(site: Site, page: Page,
     page.until(lambda: is_on_screen(page, "#upload-message"))
     page.until_text("#upload-again", large_clip.name)
     assert not page.find("#upload [type=submit]").is_displayed()
-    assert not page.find("#upload [name=calibration]").is_displayed()
+    assert not page.find("#upload [name=masks]").is_displayed()
     other = large_clip.with_name("other.mp4")
     other.write_bytes(CLIP.read_bytes())
     page.choose("clip", other)
     page.until_text("#upload", say("upload.other_file", name=large_clip.name))
     page.choose("clip", large_clip)
+    page.choose("calibration", CALIBRATION)
     page.until(lambda: site.queue.records())
     (record,) = site.queue.records()
     assert record.labels.label == "kidney"
@@ -170,8 +196,9 @@ def test_row_10_an_upload_goes_on_after_a_reload_at_half(site: Site, page: Page,
         "entry.requestStart])"
     )
     names = [name for name, _ in entries]
-    assert "/uploads" not in names  # it went on with the upload that there was
+    assert names.count("/uploads") == 1  # the calibration: the clip went on with the upload that there was
     assert not any("patient" in name for name in names)
+    page.show("drawer")
     page.until(lambda: page.find("#upload [type=submit]").is_displayed())
 
 
@@ -185,6 +212,7 @@ def test_an_upload_survives_a_restart_of_the_service_during_the_reload(
     site.stop()
     site.start()
     page.choose("clip", large_clip)
+    page.choose("calibration", CALIBRATION)
     page.until(lambda: site.queue.records())
     (record,) = site.queue.records()
     assert (site.store.spool_folder(record.job_id) / record.files.clip).read_bytes() == large_clip.read_bytes()
@@ -213,8 +241,7 @@ def test_two_tabs_send_two_clips_and_know_nothing_of_each_other(site: Site, page
             page.open()
             page.until_text("#connection", "ready")
             assert page.text("#upload-message") == ""
-            page.choose("clip", CLIP)
-            page.click("#upload [type=submit]")
+            page.send(CLIP)
             page.until(lambda: page.script("return sessionStorage.getItem('intrasplat-sent')"))
             driver.get("about:blank")
             driver.close()
@@ -224,23 +251,21 @@ def test_two_tabs_send_two_clips_and_know_nothing_of_each_other(site: Site, page
 
 
 def test_a_job_that_was_watched_is_found_again_after_a_reload(site: Site, page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until_text("#jobs", "waiting")
     page.driver.refresh()
     page.until_text("#sent", "waiting")
     claim = site.claim()
     site.train(claim, 20, 24.0)
     page.until_state("training")  # it opened by itself
-    page.until(lambda: page.script("return document.title") == "20 % · intrasplat")
+    page.until(lambda: page.script("return document.title") == f"{round(100 * page.script(BAR))} % · intrasplat")
     site.finish(claim)
     page.until_state("live")
     page.until(lambda: page.script("return document.title") == "intrasplat")
 
 
 def test_a_job_that_somebody_else_deletes_is_forgotten(site: Site, page: Page) -> None:
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until(lambda: page.script("return sessionStorage.getItem('intrasplat-sent')"))
     page.driver.get("about:blank")
     claim = site.claim()
@@ -254,8 +279,7 @@ def test_a_job_that_somebody_else_deletes_is_forgotten(site: Site, page: Page) -
 
 def test_progress_and_failure_are_in_view_while_another_scene_is_looked_at(site: Site, page: Page) -> None:
     scene = site.scene()
-    page.choose("clip", CLIP)
-    page.click("#upload [type=submit]")
+    page.send(CLIP)
     page.until_text("#jobs", "waiting")
     page.press(scene, "View")
     page.until_state("live")
@@ -289,8 +313,7 @@ def test_the_browser_tells_when_a_scene_is_ready_if_the_user_has_clicked_for_it(
                 page.show("drawer")
                 page.click("#notify")
                 page.until(lambda: page.find("#notify").get_attribute("aria-pressed") == "true")
-            page.choose("clip", CLIP)
-            page.click("#upload [type=submit]")
+            page.send(CLIP)
             page.until(lambda: page.text("#sent") or page.state != "none")
             site.finish(site.claim())
             page.until_state("live")

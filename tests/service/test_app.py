@@ -168,6 +168,32 @@ def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:
         assert_problem(service.http.get("/nothing.js"), 404)
 
 
+def script_of_page(service: ServiceUnderTest) -> str:
+    index = service.http.get("/")
+    assert index.headers["Cache-Control"] == "no-cache"
+    return "/" + index.text.split('src="')[1].split('"')[0]
+
+
+def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_changes_with_them(tmp_path: Path) -> None:
+    folder = tmp_path / "page"
+    folder.mkdir()
+    (folder / "index.html").write_text('<script type="module" src="main.js"></script>')
+    script = folder / "main.js"
+    script.write_text("// first" + " " * 2000)
+    for service in running_service(tmp_path / "data", dashboard_dir=folder):
+        address = script_of_page(service)
+        answer = service.http.get(address)
+        assert answer.text == script.read_text()
+        assert "immutable" in answer.headers["Cache-Control"]
+        assert answer.headers["Content-Encoding"] == "gzip"
+        script.write_text("// second")
+        assert script_of_page(service) != address
+        late = service.http.get(address)  # of a page that was loaded before
+        assert (late.text, late.headers["Cache-Control"]) == ("// second", "no-store")
+        assert service.http.get("/main.js").headers["Cache-Control"] == "no-store"
+        assert_problem(service.http.get("/v/0/../../data"), 404)
+
+
 @pytest.mark.parametrize(
     ("path", "field", "remedy"),
     [

@@ -46,6 +46,12 @@ def children_of(process_id: int) -> list[int]:
     return [int(each) for task in tasks for each in (task / "children").read_text().split()]
 
 
+def running(process_id: int, command: str) -> list[int]:
+    """Children that run `python -m worker <command>`."""
+    lines = {each: Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in children_of(process_id)}
+    return [each for each, line in lines.items() if line[-3:-1] == [b"worker", command.encode()]]
+
+
 def asker_of(hosted: Hosted, record: FeedRecord) -> Asker:
     eventually(lambda: hosted.state(record.feed_id) == "live", lambda: hosted.report(record.feed_id))
     return Asker(hosted.endpoint(record.feed_id))
@@ -89,7 +95,7 @@ def test_a_feed_is_shown_cut_paused_killed_and_ended(tmp_path: Path, sender: Pha
         assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (96, 128, 3)
         assert len(exported(asker, feed_id)) > 10_000
 
-        (process_id,) = children_of(os.getpid())
+        (process_id,) = running(os.getpid(), "feed")
         assert check_cut(asker, hosted, feed_id) > 100
         hosted.queue.wish_feed(feed_id, FeedWish.PAUSE)
         eventually(lambda: hosted.state(feed_id) == "paused")
@@ -113,7 +119,7 @@ def test_a_feed_is_shown_cut_paused_killed_and_ended(tmp_path: Path, sender: Pha
 
         hosted.queue.wish_feed(feed_id, FeedWish.END)
         eventually(lambda: hosted.queue.feed(feed_id) is None)
-        assert children_of(os.getpid()) == []
+        assert running(os.getpid(), "feed") == []
         assert not hosted.files.folder(feed_id).exists()
         assert list(hosted.run_dir.iterdir()) == []
 
@@ -232,6 +238,11 @@ def test_a_feed_that_cannot_be_followed_says_why(tmp_path: Path, source: str | N
         asker.close()
 
 
+def niceness_of(worker_id: int, command: str) -> int:
+    """The niceness of the child that runs `python -m worker <command>`."""
+    return os.getpriority(os.PRIO_PROCESS, running(worker_id, command)[0])
+
+
 class FeedWorkers(WorkerProcesses):
     """Workers that may follow feeds of this machine."""
 
@@ -256,6 +267,7 @@ def test_a_worker_that_is_killed_and_started_again_goes_on_with_its_feed(tmp_pat
         with bench.worker(command=command) as first:
             eventually(followed_by)
             owner = followed_by()
+            eventually(lambda: niceness_of(first.pid, "feed") < niceness_of(first.pid, "device"))
             first.kill()
             first.wait()
         began = bench.queue.feed(record.feed_id)

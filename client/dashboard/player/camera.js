@@ -166,13 +166,6 @@ export class Cameras {
     return rows.slice(0, 3).map((row) => [...row.slice(0, 3), row[3] * this.unitsPerMm]);
   }
 
-  /** @param {Matrix} pose @returns {number} distance from the nearest trained pose, in median depths */
-  distanceFromTrained(pose) {
-    const centre = centreOf(pose);
-    const offsets = this.trainedFrames.map((frame) => centreOf(this.poses[frame]).map((each, i) => each - centre[i]));
-    return (Math.min(...offsets.map((each) => Math.hypot(...each))) * this.unitsPerMm) / MEDIAN_DEPTH_UNITS;
-  }
-
   /**
    * The size of a picture so many times as wide as the clip's, but no coarser than what is shown is judged in: unseen
    * shares and warnings would depend on the screen (docs/conventions.md, "Size of a picture").

@@ -1,5 +1,6 @@
 // A finished scene, drawn by this browser at any time and from any pose: the same picture as GET /render.
 
+import { Aside } from "./aside.js";
 import { Cameras } from "./camera.js";
 import { DamagedError } from "./decode.js";
 import { Drawing } from "./draw.js";
@@ -8,7 +9,8 @@ import { patternsAt } from "./motion.js";
 import { readTable } from "./table.js";
 
 /** Of intrasplat/view/render.py. */
-const FAR_POSE = 0.35;
+const FAR_DEG = 20;
+const MAX_ENLARGEMENT = 4;
 const MAX_UNSEEN_SHARE = 0.05;
 const MAX_LOW_SHARE = 0.1;
 const ROUNDING = 1e-6;
@@ -69,6 +71,7 @@ export class Player {
     Object.assign(this, { table, worker, drawing, times });
     this.canvas = drawing.canvas;
     this.cameras = new Cameras(manifest);
+    this.aside = new Aside(this.cameras);
     this.settings = manifest.settings ?? {};
     this.poseWarnings = this.settings.pose_warnings ?? [];
     /** Whether recorded frames are stored, from which views take detail. */
@@ -226,10 +229,12 @@ export class Player {
     if (!(view.t >= 0 && view.t <= last + ROUNDING)) {
       tell("time_outside_clip", `t = ${view.t} lies outside the clip; t = ${t.toPrecision(4)} is shown.`);
     }
-    const far = this.cameras.distanceFromTrained(view.pose);
-    if (far > FAR_POSE) {
-      const text = `This pose is ${far.toFixed(1)} viewing distances from the endoscope's: most of it is a guess.`;
-      tell("pose_far", text);
+    const { angleDeg, enlargement } = this.aside.of(view.pose);
+    if (angleDeg > FAR_DEG) {
+      tell("pose_far", `This view looks from ${angleDeg.toFixed(0)} degrees beside the endoscope: most of it is a guess.`);
+    }
+    if (enlargement > MAX_ENLARGEMENT) {
+      tell("enlarged", `This view is enlarged ${enlargement.toFixed(1)} times: it holds no finer detail than the clip.`);
     }
     if (unseen > MAX_UNSEEN_SHARE) {
       const text = `No frame saw ${Math.round(unseen * 100)}% of this view.`;

@@ -17,15 +17,16 @@ from intrasplat.methods.registry import PRESETS
 from intrasplat.names import LABORATORY_PRESETS
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.outcome import scene_of, snapshot_of
+from intrasplat.pose import parse_pose
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.scene import POSE_WARNINGS, TrainedScene
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.run import Run
-from intrasplat.view.camera import endoscope_pose
+from intrasplat.view.camera import endoscope_pose, pose_of
 from intrasplat.view.confidence import followed
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import judged_camera
-from intrasplat.view.render import FAR_POSE, ViewRequest, frame_in_parts, render_frame
+from intrasplat.view.render import ViewRequest, frame_in_parts, render_frame
 from intrasplat.view.renderer import renderer_of
 from lab.phantom import orbit_pose
 from tests.helpers import assert_close
@@ -224,12 +225,28 @@ def test_confidence_falls_with_the_distance_from_the_endoscope(scene: TrainedSce
     assert levels[-1] < levels[0] / 2  # 30 degrees aside
 
 
-def test_a_pose_far_from_the_endoscope_warns(scene: TrainedScene) -> None:
+def codes_from(scene: TrainedScene, orbit: str) -> set[NoticeCode]:
+    return {warning.code for warning in render_frame(scene, 0.5, pose_of(scene, parse_pose(orbit))).warnings}
+
+
+@pytest.mark.parametrize(("orbit", "is_far"), [("15,0,1", False), ("-25,0,1", True), ("0,25,2", True)])
+def test_a_view_from_far_beside_the_endoscope_warns(scene: TrainedScene, orbit: str, is_far: bool) -> None:
+    assert (NoticeCode.POSE_FAR in codes_from(scene, f"orbit:{orbit}")) is is_far
+
+
+def test_a_view_shifted_aside_warns_at_the_angle_of_an_orbit(scene: TrainedScene) -> None:
     depth_mm = 60 / scene.units_per_mm
-    near = render_frame(scene, 0.5, shifted(0.5 * FAR_POSE * depth_mm))
-    far = render_frame(scene, 0.5, shifted(1.1 * FAR_POSE * depth_mm))
-    assert not any("most of it is a guess" in warning.text for warning in near.warnings)
-    assert any("most of it is a guess" in warning.text for warning in far.warnings)
+    for share, is_far in ((0.3, False), (0.45, True)):
+        warnings = render_frame(scene, 0.5, shifted(share * depth_mm)).warnings
+        assert (NoticeCode.POSE_FAR in [each.code for each in warnings]) is is_far
+
+
+def test_coming_straight_nearer_or_farther_is_no_guess_and_a_great_enlargement_is_named(scene: TrainedScene) -> None:
+    for zoom in (0.6, 1.5, 2.12, 3.9):
+        assert not {NoticeCode.POSE_FAR, NoticeCode.ENLARGED} & codes_from(scene, f"orbit:0,0,{zoom}")
+    near = codes_from(scene, "orbit:0,0,6")
+    assert NoticeCode.ENLARGED in near
+    assert NoticeCode.POSE_FAR not in near
 
 
 def test_a_view_of_nothing_is_empty_and_says_so(scene: TrainedScene) -> None:
