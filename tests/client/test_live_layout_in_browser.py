@@ -1,0 +1,69 @@
+"""The live screen judged by axe-core in every state and size, and its layout: nothing overlaps, all can be touched."""
+
+from __future__ import annotations
+
+import pytest
+
+from intrasplat.live.state import FeedReason, FeedState
+from tests.client.live_feed import LivePage, LivePainter
+from tests.client.page import Site
+from tests.client.test_accessible_in_browser import LAYOUT, MIN_LETTER_PX, MIN_TOUCH_PX, violations
+from tests.client.test_accessible_in_browser import axe as axe
+from tests.client.test_live_in_browser import DRAG_TAPE, watched
+from tests.client.test_live_in_browser import page as page
+from tests.client.test_live_in_browser import painter as painter
+from tests.client.test_theatre_in_browser import SIZES, screen_of
+from tests.client.words import LANGUAGES, say
+
+LIVE_SIZES = (*SIZES, (844, 390))
+ACTIONS = ("freeze", "look", "measure", "keep", "live")
+MIN_ACTION_PX = 64
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "language"), [(*size, LANGUAGES[n % 2]) for n, size in enumerate(LIVE_SIZES)]
+)
+def test_it_is_accessible_and_fits_in_every_state(
+    site: Site, page: LivePage, painter: LivePainter, axe: str, width: int, height: int, language: str
+) -> None:
+    page.driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
+    page.script("localStorage.setItem('intrasplat-language', arguments[0])", language)
+    found, layout = {}, {}
+    with screen_of(page, width, height):
+        page.driver.get("about:blank")
+        page.driver.get(f"{site.url}/live.html")
+        page.until_text("#no-feeds", say("live.none_open", language))
+        found["opening"] = violations(page, axe)
+        watched(site, page, "theatre 2")
+
+        def judge(state: str) -> None:
+            found[state] = violations(page, axe)
+            layout[state] = page.script(LAYOUT, MIN_TOUCH_PX, MIN_LETTER_PX)
+
+        judge("live")
+        sizes = page.script(
+            "return arguments[0].map((id) => document.getElementById(id).getBoundingClientRect().height)", ACTIONS
+        )
+        assert min(sizes) >= MIN_ACTION_PX
+        page.click("#measure")
+        page.until(lambda: page.state == "frozen")
+        judge("frozen")
+        page.click("#live")
+        page.script(DRAG_TAPE, -12)
+        page.until(lambda: page.state == "back")
+        judge("back")
+        page.click("#live")
+        painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
+        page.until(lambda: page.state == "lost")
+        judge("lost")
+        painter.state, painter.reason = FeedState.NO_TISSUE, None
+        page.until(lambda: page.state == "empty")
+        judge("empty")
+        page.script("document.getElementById('health').open = true")
+        found["health"] = violations(page, axe)
+        page.click("#end")
+        page.until(lambda: page.find("#confirm").is_displayed())
+        found["question"] = violations(page, axe)
+    assert [(state, *each) for state, some in found.items() for each in some] == []
+    fine = {"over": [], "off": [], "small": [], "faint": []}
+    assert [(state, each) for state, each in layout.items() if each != fine] == []
