@@ -314,6 +314,8 @@ def test_a_presenter_freezes_and_goes_back_to_live(site: Site, page: LivePage, p
 def test_the_page_leads_to_open_feeds(site: Site, page: LivePage, painter: LivePainter) -> None:
     feed_id = opened_feed(site, "theatre 2")
     page.driver.get(site.url)
+    page.until(lambda: page.script("return document.querySelector('#tools [data-drawer=library]') !== null"))
+    page.show("library")
     page.until_text("#open-feeds", "theatre 2")
     page.driver.get("about:blank")
     page.driver.get(f"{site.url}/#/live/{feed_id}")
