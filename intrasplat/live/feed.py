@@ -80,7 +80,11 @@ class Feed:
         earlier = self._past.segments()
         place = (earlier[-1].source_s[1], earlier[-1].arrived_at[1]) if earlier else None
         self._watch = TissueWatch() if self.settings.finds_tissue else None
-        self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
+        try:
+            self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
+        except BaseException:
+            self._past.close()
+            raise
         of_follower, budget_s = self.settings.of_follower(), self.settings.budget_s
         self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
         self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())

@@ -204,7 +204,8 @@ class Follower:
     def read(self, pair: FeedPair) -> DepthClip | None:
         """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
         if self._eyes is None:
-            self._eyes = LiveEyes(self._calibration, self.settings.eyes, (pair.left.shape[1], pair.left.shape[0]))
+            size = pair.left.shape[1], pair.left.shape[0]
+            self._eyes = LiveEyes(self._calibration, self.settings.eyes, size, pair.pixel_aspect)
         clip = self._eyes.moment(pair.left, pair.right, pair.source_s)
         if clip is None:
             return None

@@ -181,7 +181,7 @@ class PhantomSender:
 
     def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
         frames = [phantom.frame(index) for index in range(phantom.settings.frames)]
-        self._pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
+        self.pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
         self.calibration, self.cover, self.url = phantom.settings.calibration, cover, ""
 
     @contextmanager
@@ -191,8 +191,8 @@ class PhantomSender:
             yield self
 
     def _serve(self, connection: socket.socket) -> None:
-        stream, last = Stream(), len(self._pictures) - 1
+        stream, last = Stream(), len(self.pictures) - 1
         for index in in_real_time():
             place = index % (2 * last)
-            shown = self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
+            shown = self.pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
             connection.sendall(stream.frame(shown))
