@@ -8,8 +8,8 @@ The feed records it, and keeps its past on disk. A thread asks for the newest mo
 it. Measured are seconds from the start of the feed to the first picture (`first_s`); the age of what is shown, from the
 arrival of the newest pair in the model to the rendered picture, p50 and p95 after SETTLED_S, and p50 of the first and
 the last third (`age_early_s`, `age_late_s`); rates and steps of training a pair; cores that this process and the one
-that reads were busy on, with the views; lag of decoding; the memory of both; bytes on disk. --kill N: kill the reading process N times, and measure the longest
-time until something newer is shown (`back_s`).
+that reads were busy on, with the views; lag of decoding; the memory of both; bytes on disk. --kill N: kill the reading
+process N times, and measure the longest time until something newer is shown (`back_s`).
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ OPTIONS = {"preset": "veryfast", "tune": "zerolatency", "crf": "18", "x264-param
 KEY = ("clip", "width", "fps", "seconds", "detail", "kills", "device")
 FIELDS = (
     *KEY, "height", "received_fps", "used_fps", "steps", "age_p50_s", "age_p95_s", "age_early_s", "age_late_s",
-    "first_s", "cores", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load", "machine",
-    "commit",
+    "first_s", "cores", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load",
+    "machine", "commit",
 )  # fmt: skip
 
 
