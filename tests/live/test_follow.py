@@ -225,3 +225,11 @@ def test_a_calibration_of_squeezed_pictures_fits_by_the_pixels_aspect() -> None:
 def _squeezed(phantom: Phantom, eye: int) -> RgbFrame:
     """The first frame of an eye with 3 columns for 4."""
     return np.asarray(cv2.resize(_eyes(phantom, 0)[eye], (WIDTH * 3 // 4, HEIGHT)), np.uint8)
+
+
+def test_a_view_between_frames_is_trusted_less_the_more_the_tissue_moves() -> None:
+    at_rest, moving = (_following(_phantom(motion), 8).segments[0] for motion in ("still", "pull"))
+    assert 0 <= at_rest.motion_error < moving.motion_error
+    for scene in (at_rest, moving):
+        at_frame, between = (np.median(render_frame(scene, place / 4).confidence) for place in (1, 1.5))
+        assert between < at_frame
