@@ -235,6 +235,7 @@ function showJobs() {
 
 function showConnection(text, kind) {
   if (kind === "good" && jobs.byId.has(viewer.scene)) viewer.screen.keepAlive();
+  delete get("connection").dataset.words; // else a change of language says again that it connects
   get("connection").textContent = text;
   get("connection").className = `pill ${kind}`;
 }
@@ -303,6 +304,7 @@ get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendAgain(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 languageEvents.addEventListener("changed", () => {
+  jobs.poll();
   list.forget();
   reported = null;
   showJobs();

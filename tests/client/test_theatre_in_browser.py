@@ -151,6 +151,21 @@ def test_on_a_phone_an_open_drawer_has_the_screen_also_below_a_message(site: Sit
         assert page.find("#controls").is_displayed()
 
 
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_message_moves_no_button(site: Site, page: Page, width: int, height: int) -> None:
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        page.find("#tools")
+        pressed = ("#tools [data-drawer=library]", "#show-help", "#play", "#time", "#stage")
+        if width == SIZES[-1][0]:
+            pressed = tuple(css for css in pressed if css != "#show-help")  # below "More"
+        before = [box_of(page, css) for css in pressed]
+        page.script("document.querySelector('#jobs-message').textContent = 'A message that stays.'")
+        assert page.find("#jobs-message").is_displayed()
+        assert [box_of(page, css) for css in pressed] == before
+
+
 def test_controls_step_back_while_idle_and_return(site: Site, page: Page) -> None:
     page.press(site.scene(), "View")
     page.until_state("live")
