@@ -242,3 +242,24 @@ def test_the_status_of_recorded_frames_says_once_what_they_are(site: Site, page:
     )
     page.until_text("#badge", say("screen.recorded"))
     page.until(lambda: page.text("#status-text") == "0.00 s")
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_button_that_sends_is_in_view_however_long_the_form_is(page: Page, width: int, height: int) -> None:
+    with screen_of(page, width, height):
+        page.show("drawer")
+        page.script("document.querySelector('#upload details').open = true")
+        assert is_on_screen(page, "#upload [type=submit]")
+
+
+@pytest.mark.parametrize(("width", "height"), [(820, 1180), (390, 844), (844, 390)])
+def test_on_small_screens_the_slider_is_wide_and_every_tool_is_seen(
+    site: Site, page: Page, width: int, height: int
+) -> None:
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        left, _, right, _ = box_of(page, "#time")
+        assert right - left > 0.4 * width
+        for css in ("[data-drawer=library]", "[data-drawer=drawer]", "[data-drawer=report-drawer]", "#measure"):
+            assert is_on_screen(page, f"#tools {css}"), css
