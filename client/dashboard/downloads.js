@@ -2,7 +2,7 @@
 
 import { exportScene } from "./api.js";
 import { button, element } from "./element.js";
-import { figure, words } from "./messages.js";
+import { words } from "./messages.js";
 import { showProblem } from "./problem.js";
 
 /** The formats of docs/export.md, and what their files' names end in; those of one moment are of the one in view.
@@ -73,7 +73,7 @@ export class Downloads {
    * @param {HTMLDialogElement} dialog
    * @param {HTMLElement} message
    * @param {import("./scopes.js").Scopes} scopes
-   * @param {(id: string) => number} momentOf the moment in view of a scene, 0 of any other
+   * @param {(id: string) => {t: number, seconds: string}} momentOf the moment in view of a scene, the first of any other
    */
   constructor(dialog, message, scopes, momentOf) {
     Object.assign(this, { dialog, message, scopes, momentOf });
@@ -86,12 +86,13 @@ export class Downloads {
 
   /** @param {string} id @param {string} name of the scene, as people call it */
   open(id, name) {
-    const t = Number(this.momentOf(id).toFixed(4));
+    const moment = this.momentOf(id);
+    const t = Number(moment.t.toFixed(4));
     const close = button(words("download.close"), () => this.dialog.close());
     this.dialog.setAttribute("aria-label", words("download.title", { name }));
     this.dialog.replaceChildren(
       element("header", {}, element("h2", { text: words("download.title", { name }) }), close),
-      ...this.#group("moment", id, name, t),
+      ...this.#group("moment", id, name, t, moment.seconds),
       ...this.#group("clip", id, name),
       ...(this.scopes.has("download") ? this.#group("itself", id, name) : []),
       element("p", { class: "quiet", text: words("download.research") }),
@@ -99,9 +100,9 @@ export class Downloads {
     this.dialog.showModal();
   }
 
-  #group(group, id, name, t) {
+  #group(group, id, name, t, seconds) {
     const isMoment = group === "moment";
-    const title = isMoment ? words(t > 0 ? "download.moment" : "download.first", { t: figure(t, 3) }) : words(`download.${group}`);
+    const title = isMoment ? words(t > 0 ? "download.moment" : "download.first", { seconds }) : words(`download.${group}`);
     const buttons = Object.entries(GROUPS[group]).map(([format, suffix]) => {
       const text = `${words(`download.${format}`)} (.${suffix.split(".").at(-1)})`;
       const made = button(text, () => this.#save(id, name, format, suffix, t));

@@ -260,7 +260,10 @@ const list = new JobList(
 const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "" || viewer.isKeptWaiting;
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
-const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
+const momentOf = (id) => {
+  const t = viewer.scene === id ? viewer.timeline.t : 0;
+  return { t, seconds: viewer.timeline.momentOf(t) };
+};
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
 
 const light = new ScreenLight();

@@ -313,7 +313,7 @@ export const DE = {
     "title": "{name} als Datei speichern",
     "close": "Schließen",
     "making": "Die Datei wird erstellt; der Browser speichert sie, wenn sie fertig ist.",
-    "moment": "Der gezeigte Moment (t {t})",
+    "moment": "Der gezeigte Moment ({seconds})",
     "first": "Der erste Moment",
     "clip": "Der ganze Clip",
     "itself": "Die Szene selbst",

@@ -313,7 +313,7 @@ export const EN = {
     "title": "Save {name} as a file",
     "close": "Close",
     "making": "The file is being made; the browser saves it when it is ready.",
-    "moment": "The moment in view (t {t})",
+    "moment": "The moment in view ({seconds})",
     "first": "The first moment",
     "clip": "The whole clip",
     "itself": "The scene itself",

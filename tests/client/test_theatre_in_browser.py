@@ -260,6 +260,6 @@ def test_on_small_screens_the_slider_is_wide_and_every_tool_is_seen(
         page.press(site.scene(), "View")
         page.until_state("live")
         left, _, right, _ = box_of(page, "#time")
-        assert right - left > 0.4 * width
+        assert right - left > 0.3 * width
         for css in ("[data-drawer=library]", "[data-drawer=drawer]", "[data-drawer=report-drawer]", "#measure"):
             assert is_on_screen(page, f"#tools {css}"), css
