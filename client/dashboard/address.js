@@ -1,5 +1,7 @@
 // The page's address: #/scene/ID?t=&pose=&layer= names a view, so that it survives a reload and can be sent to others.
+// #/live/ID leads to the live screen of a feed.
 
+import { addressOf } from "./live/links.js";
 import { words } from "./messages.js";
 
 /** @typedef {{scene: string, t: number, pose: string | null, layer: string}} Place pose: as GET /render spells it, or RIGHT_EYE */
@@ -7,6 +9,7 @@ import { words } from "./messages.js";
 /** Not a pose of the service's: the endoscope's right eye, wherever it is at t. */
 export const RIGHT_EYE = "right";
 const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
+const LIVE = /^#\/live\/([0-9a-f]{32})$/;
 const ID = /^[0-9a-f]{32}$/;
 const POSE = /^(right|orbit:[-\d.e]+(,[-\d.e]+){2}((,[-\d.e]+){3})?|[-\d.e]+(,[-\d.e]+){11})$/;
 const WRITE_AFTER_MS = 400;
@@ -67,6 +70,9 @@ export class Address {
 
   /** Go where the address says. @returns {boolean} whether it names a scene */
   follow() {
+    const [, feed] = LIVE.exec(location.hash) ?? [];
+    if (feed) location.replace(addressOf(feed));
+    if (feed) return true;
     const { place, wrong } = placeOf(location.hash, this.#layers);
     this.tell("");
     if (place) this.go(place);

@@ -19,7 +19,7 @@ const SILENCE_MS = 35000;
  * @param {string} text
  * @returns {[ServerEvent[], string]} the events, and what is left of the text
  */
-function parseEvents(text) {
+export function parseEvents(text) {
   const blocks = text.replaceAll("\r\n", "\n").split("\n\n");
   const rest = blocks.pop();
   const events = blocks.map((block) => {

@@ -22,6 +22,7 @@ import { listenToKeys, onKeys } from "./keys.js";
 import { TimesLeft } from "./left.js";
 import { Legend } from "./legend.js";
 import { drawStrip } from "./lightstrip.js";
+import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure.js";
 import { figure, languageEvents, showWords, words } from "./messages.js";
 import { hush, prepareNews } from "./news.js";
@@ -259,6 +260,7 @@ const list = new JobList(
 );
 const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "" || viewer.isKeptWaiting;
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
+listOpenFeeds(get("open-feeds"), () => drawers.isOpen === "library");
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => {
   const t = viewer.scene === id ? viewer.timeline.t : 0;

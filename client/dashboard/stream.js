@@ -27,7 +27,7 @@ import { connectionLost, Problem, wrongKeyWords } from "./problem.js";
 const LENGTH_BYTES = 4;
 
 /** @param {ArrayBuffer} message @returns {[Record<string, any>, Blob]} head and image */
-function unpack(message) {
+export function unpack(message) {
   const length = new DataView(message).getUint32(0);
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(message, LENGTH_BYTES, length)));
   return [head, new Blob([new Uint8Array(message, LENGTH_BYTES + length)], { type: head.media_type })];

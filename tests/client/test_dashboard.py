@@ -15,9 +15,11 @@ from intrasplat.options import JobOptions
 from tests.client.words import table
 
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
-INDEX, ALONE = DASHBOARD / "index.html", DASHBOARD / "file" / "alone.html"
-pages = pytest.mark.parametrize("path", [INDEX, ALONE], ids=lambda path: path.name)
-"""The page of a service, and the page of a file without one."""
+INDEX, ALONE, LIVE = DASHBOARD / "index.html", DASHBOARD / "file" / "alone.html", DASHBOARD / "live.html"
+pages = pytest.mark.parametrize("path", [INDEX, ALONE, LIVE], ids=lambda path: path.name)
+"""The page of a service, the page of a file without one, and the live screen."""
+FOLDERS = {INDEX: "dashboard", ALONE: "file", LIVE: "live"}
+"""Where the scripts are that look for elements of each page."""
 
 
 class Page(HTMLParser):
@@ -62,6 +64,7 @@ def test_the_page_holds_no_inline_code_that_its_policy_would_stop(path: Path) ->
 
 def test_the_page_says_that_it_is_no_medical_device() -> None:
     assert "Not a medical device" in (DASHBOARD / "index.html").read_text()
+    assert 'data-words="page.notice"' in LIVE.read_text()
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
@@ -85,14 +88,14 @@ def test_the_player_knows_nothing_of_the_page() -> None:
 
 @pages
 def test_every_element_that_a_script_asks_for_is_on_the_page(path: Path) -> None:
-    page, scripts = Page(path), [each for each in SCRIPTS if (each.parent == ALONE.parent) is (path == ALONE)]
+    page, scripts = Page(path), [each for each in SCRIPTS if each.parent.name == FOLDERS[path]]
     asked = {each for script in scripts for each in re.findall(r'(?<!\.)\bget\("([^"]+)"\)', script.read_text())}
     assert asked <= set(page.ids)
     assert len(page.ids) == len(set(page.ids))
 
 
 def test_nothing_is_fetched_from_elsewhere() -> None:
-    for path in (*SCRIPTS, DASHBOARD / "style.css", INDEX, ALONE):
+    for path in (*SCRIPTS, *DASHBOARD.rglob("*.css"), INDEX, ALONE, LIVE):
         assert not re.search(r"(https?:)?//[a-z0-9.-]+\.[a-z]{2,}/", path.read_text()), path.name
 
 

@@ -1,0 +1,138 @@
+// The service's routes of live feeds, as this screen uses them. What goes wrong is thrown as a Problem.
+
+import { bodyOf, request } from "../api.js";
+import { parseEvents } from "../events.js";
+import { pause } from "../pause.js";
+import { connectionLost, Problem } from "../problem.js";
+
+/**
+ * A feed as the service shows it. Moments are UNIX times, s.
+ * @typedef {{id: string, label: string | null, state: string, reason: string | null, text: string, since_s: number,
+ *   recording: string | null, received_fps: number, used_fps: number, dropped: number, model_age_s: number | null,
+ *   decode_lag_s: number | null, reconnects: number, last_frame_at_s: number | null, kept_bytes: number,
+ *   begins_s: number | null, ends_s: number | null, gaussians: number, wish: string,
+ *   options: {source: string | null, keep_s: number, layout: string}}} Feed
+ */
+/** @typedef {{blob: Blob, capturedAtS: number, ageS: number, sentMs: number, receivedMs: number}} LiveImage */
+
+const RETRY_MS = 500;
+/** Numbers come once a second. */
+const SILENCE_MS = 4000;
+const GONE = 404;
+/** Longer than a picture takes on a slow line. */
+const PICTURE_MS = 5000;
+
+const json = async (path, options) => bodyOf(await request(path, options));
+const posted = (body, headers = {}) => ({
+  method: "POST",
+  headers: { "Content-Type": "application/json", ...headers },
+  body: JSON.stringify(body),
+});
+
+/** @returns {Promise<Feed[]>} the open ones, the newest first */
+export const listFeeds = () => json("/feeds");
+/** @param {string} id @returns {Promise<Feed>} */
+export const pauseFeed = (id) => json(`/feeds/${id}/pause`, { method: "POST" });
+/** @param {string} id @returns {Promise<Feed>} */
+export const resumeFeed = (id) => json(`/feeds/${id}/resume`, { method: "POST" });
+/** @param {string} id @returns {Promise<{bytes: number, record: boolean, verified: boolean}>} */
+export const endFeed = (id) => json(`/feeds/${id}`, { method: "DELETE" });
+
+/**
+ * @param {Record<string, unknown>} options of POST /feeds
+ * @param {File} calibration
+ * @returns {Promise<Feed>}
+ */
+export function openFeed(options, calibration) {
+  const body = new FormData();
+  body.append("options", JSON.stringify(options));
+  body.append("calibration", calibration, `calibration${/\.\w+$/.exec(calibration.name)?.[0] ?? ".json"}`);
+  return json("/feeds", { method: "POST", body });
+}
+
+/**
+ * Make a job of a part of the recording.
+ * @param {string} id
+ * @param {{from: number | string, to: number | string, label?: string}} part
+ * @returns {Promise<import("../api.js").Job & {cut: {from_s: number, to_s: number}}>}
+ */
+export function cutFeed(id, part) {
+  const key = [...crypto.getRandomValues(new Uint32Array(4))].map((number) => number.toString(16)).join("-");
+  return json(`/feeds/${id}/cut`, posted(part, { "Idempotency-Key": key }));
+}
+
+/** The newest picture of the left eye. @param {string} id @returns {Promise<LiveImage>} */
+export async function getLivePicture(id) {
+  const sentMs = performance.now();
+  const signal = AbortSignal.timeout(PICTURE_MS);
+  const response = await request(`/scenes/${id}/recorded?t=live&masks=off`, { signal });
+  const receivedMs = performance.now();
+  const [capturedAt, age] = ["Captured-At", "Age-S"].map((name) => response.headers.get(`X-Intrasplat-${name}`));
+  const blob = await bodyOf(response, "blob");
+  return { blob, capturedAtS: Date.parse(capturedAt) / 1000, ageS: Number(age), sentMs, receivedMs };
+}
+
+/** Follows what a feed says of itself until it has ended; comes again after a lost connection. */
+export class FeedEvents {
+  /**
+   * @param {string} id
+   * @param {(feed: Feed) => void} onFeed
+   * @param {() => void} onGone the feed is no more, or not this key's
+   */
+  constructor(id, onFeed, onGone) {
+    Object.assign(this, { id, onFeed, onGone, isOver: false });
+    this.controller = new AbortController();
+    this.#follow();
+  }
+
+  stop() {
+    this.isOver = true;
+    this.controller.abort();
+  }
+
+  async #follow() {
+    while (!this.isOver) {
+      try {
+        await this.#readOnce();
+      } catch (error) {
+        if (error.status === GONE && !this.isOver) {
+          this.stop();
+          this.onGone();
+        }
+        if (!(error instanceof Problem || error.name === "AbortError")) console.error(error); // a fault of this page
+      }
+      if (!this.isOver) await pause(RETRY_MS, this.controller.signal).catch(() => {});
+    }
+  }
+
+  async #readOnce() {
+    const response = await request(`/feeds/${this.id}/events`, { signal: this.controller.signal });
+    const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+    let text = "";
+    try {
+      while (!this.isOver) {
+        const { value, done } = await within(reader.read(), SILENCE_MS);
+        if (done) return;
+        const [events, rest] = parseEvents(text + value);
+        text = rest;
+        const last = events.findLast(({ type }) => type === "feed");
+        if (last && !this.isOver) this.onFeed(JSON.parse(last.data));
+      }
+    } finally {
+      reader.cancel().catch(() => {}); // else the connection stays open beside the next one
+    }
+  }
+}
+
+/** What a promise brings; a Problem if it fails, or takes longer. */
+async function within(promise, ms) {
+  let timer;
+  const late = new Promise((_, reject) => (timer = setTimeout(() => reject(connectionLost()), ms)));
+  try {
+    return await Promise.race([promise, late]);
+  } catch (error) {
+    throw error instanceof Problem || error.name === "AbortError" ? error : connectionLost();
+  } finally {
+    clearTimeout(timer);
+  }
+}

@@ -1,0 +1,103 @@
+// "Keep last 30 s": a part of the recording becomes a clip, and a scene in the background. A line says how far it is.
+
+import { getJob } from "../api.js";
+import { clockTime, element, setText } from "../element.js";
+import { TimesLeft } from "../left.js";
+import { figure, languageEvents, words } from "../messages.js";
+import { pause } from "../pause.js";
+import { failureOf } from "../problem.js";
+import { progressOf } from "../progress.js";
+import { cutFeed } from "./feeds.js";
+
+export const KEPT_S = 30;
+const LOOK_MS = 1000;
+
+const isOver = ({ state }) => state !== "queued" && state !== "running";
+
+export class Keeping {
+  /**
+   * @param {{button: HTMLButtonElement, line: HTMLElement}} parts
+   * @param {import("./clock.js").FeedClock} clock
+   * @param {(fromS: number, toS: number) => void} onKept
+   */
+  constructor({ button, line }, clock, onKept) {
+    Object.assign(this, { button, line, clock, onKept, visit: 0, times: new TimesLeft() });
+    languageEvents.addEventListener("changed", () => this.#say());
+    this.forget();
+  }
+
+  /** What was kept of another feed is not spoken of here. */
+  forget() {
+    this.visit += 1;
+    this.isCutting = false;
+    /** @type {{fromS: number, toS: number, job: import("../api.js").Job} | null} */
+    this.kept = null;
+    /** @type {Error | null} */
+    this.problem = null;
+    this.#say();
+  }
+
+  /** @param {import("./feeds.js").Feed} feed */
+  async keep(feed) {
+    if (this.isCutting) return;
+    const visit = ++this.visit;
+    const nowS = this.clock.nowS;
+    const lengthS = feed.begins_s === null ? KEPT_S : Math.min(KEPT_S, Math.max(1, nowS - feed.begins_s));
+    Object.assign(this, { isCutting: true, kept: null, problem: null });
+    this.#say();
+    try {
+      const job = await cutFeed(feed.id, { from: -Number(lengthS.toFixed(1)), to: "live", label: this.#label(feed, nowS) });
+      this.isCutting = false;
+      if (visit !== this.visit) return;
+      this.kept = { fromS: job.cut.from_s, toS: job.cut.to_s, job };
+      this.onKept(job.cut.from_s, job.cut.to_s);
+      this.#say();
+      await this.#watch(visit);
+    } catch (error) {
+      if (visit === this.visit) this.problem = error;
+    }
+    if (visit === this.visit) this.isCutting = false;
+    this.#say();
+  }
+
+  #label(feed, nowS) {
+    return `${feed.label ?? words("live.title")}, ${clockTime(1000 * nowS)}`.slice(0, 80);
+  }
+
+  async #watch(visit) {
+    while (visit === this.visit && !isOver(this.kept.job)) {
+      await pause(LOOK_MS);
+      try {
+        const job = await getJob(this.kept.job.id);
+        if (visit === this.visit) this.kept.job = job;
+      } catch (error) {
+        if (!error.mayPass) throw error;
+      }
+      this.#say();
+    }
+  }
+
+  #say() {
+    const { line, kept } = this;
+    this.button.disabled = this.isCutting;
+    line.classList.toggle("bad", this.problem !== null);
+    const text = this.#text();
+    line.hidden = text === "";
+    const link = line.querySelector("a") ?? element("a");
+    if (!line.firstChild) line.append(link, document.createTextNode(" "), element("span"));
+    setText(line.lastChild, text);
+    link.hidden = kept === null || kept.job.state === "failed";
+    if (kept) link.href = `./#/scene/${kept.job.id}`;
+    setText(link, words("live.kept_open"));
+  }
+
+  #text() {
+    if (this.problem) return words("live.kept_failed", { why: this.problem.message });
+    if (this.isCutting) return words("live.keeping");
+    if (!this.kept) return "";
+    const { fromS, toS, job } = this.kept;
+    const range = { from: clockTime(1000 * fromS), to: clockTime(1000 * toS), s: figure(toS - fromS) };
+    const how = failureOf(job) || progressOf(job, this.times);
+    return `${how} · ${words("live.kept", range)}`;
+  }
+}

@@ -1,0 +1,134 @@
+// The model's picture over /stream. A view that moves is asked for again and again, the newest wish alone; one that rests
+// at the newest moment is followed: the service sends each newer moment by itself.
+
+import { askForKey, currentKey } from "../key.js";
+import { Problem, wrongKeyWords } from "../problem.js";
+import { unpack } from "../stream.js";
+
+/** @typedef {{scene: string, t: string, pose?: string, follow?: true}} Wish of a view */
+/**
+ * What came. image: of the view. capturedAtS: the moment of the feed. asked: the wish that it answers.
+ * @typedef {{asked: Wish, capturedAtS: number, camera: import("../stream.js").Camera | null, unseen: number,
+ *   warnings: import("../wire.js").Notice[]}} ModelShown
+ */
+
+const RECONNECT_MS = 500;
+const AGAIN_MS = 1000;
+/** An answer that has not come after this comes over another connection. */
+const SILENCE_MS = 5000;
+const BUSY = [429, 503];
+const QUALITY = 85;
+
+/** Tells "shown", "answered" when the service has said anything, and "refused" with a Problem. */
+export class ModelPicture extends EventTarget {
+  /** @param {HTMLCanvasElement} canvas @param {import("./clock.js").FeedClock} clock */
+  constructor(canvas, clock) {
+    super();
+    Object.assign(this, { canvas, clock, number: 0, drawn: 0, socket: null });
+    /** @type {Wish | null} */
+    this.wish = null;
+    /** @type {{id: number, wish: Wish, atMs: number, isAnswered: boolean} | null} what was asked for last */
+    this.asked = null;
+    /** @type {ModelShown | null} */
+    this.shown = null;
+    setInterval(() => this.#watch(), AGAIN_MS);
+  }
+
+  /** Show none until the next comes. */
+  clear() {
+    this.shown = null;
+    this.drawn = this.number;
+    this.canvas.hidden = true;
+    this.canvas.width = this.canvas.height = 0;
+  }
+
+  /** @param {Wish | null} wish null: nothing, and no connection */
+  want(wish) {
+    this.wish = wish;
+    if (wish === null) {
+      this.socket?.close();
+      this.socket = this.asked = null;
+    } else if (this.socket === null) this.#connect();
+    else this.#send();
+  }
+
+  #connect() {
+    const socket = (this.socket = new WebSocket(new URL("/stream", location.href.replace(/^http/, "ws"))));
+    const key = currentKey();
+    socket.binaryType = "arraybuffer";
+    this.asked = null;
+    socket.addEventListener("open", () => {
+      if (key) socket.send(JSON.stringify({ authorize: key }));
+      this.#send();
+    });
+    socket.addEventListener("message", (event) => socket === this.socket && this.#take(event.data, key));
+    socket.addEventListener("close", () => {
+      if (socket !== this.socket) return;
+      this.asked = null;
+      setTimeout(() => socket === this.socket && this.wish !== null && this.#connect(), RECONNECT_MS);
+    });
+  }
+
+  /** Ask for what is wished, unless that was asked for already or an answer is under way. */
+  #send() {
+    const { socket, wish, asked } = this;
+    if (wish === null || socket?.readyState !== WebSocket.OPEN) return;
+    if (asked && (!asked.isAnswered || JSON.stringify(asked.wish) === JSON.stringify(wish))) return;
+    this.asked = { id: ++this.number, wish, atMs: performance.now(), isAnswered: false };
+    socket.send(JSON.stringify({ format: "jpeg", quality: QUALITY, ...wish, id: this.number }));
+  }
+
+  #watch() {
+    const { asked, socket } = this;
+    if (asked && !asked.isAnswered && performance.now() - asked.atMs > SILENCE_MS) socket?.close();
+  }
+
+  #take(data, key) {
+    this.dispatchEvent(new Event("answered"));
+    if (typeof data === "string") return this.#fail(JSON.parse(data), key);
+    const receivedMs = performance.now();
+    const [head, blob] = unpack(data);
+    const capturedAtS = Date.parse(head.captured_at) / 1000;
+    const { asked } = this;
+    const isAnswer = asked?.id === head.id && !asked.isAnswered;
+    this.clock.note(capturedAtS + head.age_s, receivedMs);
+    if (asked?.id !== head.id) return; // of a view that nobody waits for any more
+    if (isAnswer) asked.isAnswered = true;
+    this.#show(blob, { asked: asked.wish, capturedAtS, camera: head.camera, unseen: head.unseen, warnings: head.warnings });
+    this.#send();
+  }
+
+  #fail(document, key) {
+    const problem = new Problem(document.status, document, document.retry_after_s);
+    if (problem.status === 401 && key === currentKey()) askForKey(key ? wrongKeyWords(problem) : problem.message);
+    const { asked } = this;
+    if (!asked || document.id !== asked.id) return;
+    asked.isAnswered = true;
+    this.dispatchEvent(new CustomEvent("refused", { detail: problem }));
+    if (JSON.stringify(asked.wish) !== JSON.stringify(this.wish)) this.#send();
+    else if (BUSY.includes(problem.status) && !asked.wish.follow) {
+      setTimeout(() => {
+        if (this.asked !== asked) return;
+        this.asked = null;
+        this.#send();
+      }, Math.max(AGAIN_MS, 1000 * problem.turnInS));
+    }
+  }
+
+  async #show(blob, shown) {
+    const number = ++this.number; // also orders pictures that are decoded at once
+    const bitmap = await createImageBitmap(blob);
+    if (number > this.drawn && this.wish?.scene === shown.asked.scene) {
+      this.drawn = number;
+      const { canvas } = this;
+      if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
+        [canvas.width, canvas.height] = [bitmap.width, bitmap.height];
+      }
+      canvas.getContext("2d").drawImage(bitmap, 0, 0);
+      canvas.hidden = false;
+      this.shown = shown;
+      this.dispatchEvent(new CustomEvent("shown", { detail: shown }));
+    }
+    bitmap.close();
+  }
+}

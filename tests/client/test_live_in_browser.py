@@ -1,0 +1,409 @@
+"""The live screen in a browser, beside a worker whose pictures carry their own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from selenium import webdriver
+
+from client.page import DASHBOARD
+from contract.wire.job import JobState
+from intrasplat.live.state import FeedReason, FeedState
+from tests.client.live_feed import PAST_S, READ_TIME, LivePage, LivePainter, live_painter, opened_feed
+from tests.client.page import Site
+from tests.client.test_accessible_in_browser import LAYOUT, MIN_LETTER_PX, MIN_TOUCH_PX, violations
+from tests.client.test_accessible_in_browser import axe as axe
+from tests.client.test_theatre_in_browser import SIZES, screen_of
+from tests.client.words import LANGUAGES, say, table
+
+LIVE_SIZES = (*SIZES, (844, 390))
+TOLERANCE_MS = 100.0
+ACTIONS = ("freeze", "look", "measure", "keep", "live")
+MIN_ACTION_PX = 64
+CLICK = """
+const stage = document.getElementById("model-stage");
+const canvas = document.getElementById("model-picture");
+const box = canvas.getBoundingClientRect();
+const scale = Math.min(box.width / canvas.width, box.height / canvas.height);
+const x = box.left + box.width / 2 + (arguments[0] - 0.5) * scale * canvas.width;
+const y = box.top + box.height / 2 + (arguments[1] - 0.5) * scale * canvas.height;
+stage.setPointerCapture = () => {};
+const about = { bubbles: true, isPrimary: true, button: 0, pointerId: 7, clientX: x, clientY: y };
+for (const kind of ["pointerdown", "pointerup"]) stage.dispatchEvent(new PointerEvent(kind, about));
+"""
+DRAG_TAPE = """
+const tape = document.getElementById("tape");
+tape.value = String(arguments[0]);
+for (const kind of ["input", "change"]) tape.dispatchEvent(new Event(kind, { bubbles: true }));
+"""
+PRESS = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: arguments[0], bubbles: true }))"
+
+
+@pytest.fixture
+def painter(site: Site, tmp_path: Path) -> Iterator[LivePainter]:
+    with live_painter(site, tmp_path) as painter:
+        yield painter
+
+
+@pytest.fixture
+def page(site: Site, painter: LivePainter, driver: webdriver.Chrome) -> Iterator[LivePage]:
+    page = LivePage(driver, site.url)
+    driver.get(site.url)
+    page.script("localStorage.setItem('intrasplat-language', 'en')")
+    yield page
+    assert page.faults() == []
+    page.script("localStorage.clear()")
+    driver.get("about:blank")
+
+
+def watched(site: Site, page: LivePage, label: str | None = None) -> str:
+    """A feed whose screen is live, with pictures of endoscope and model."""
+    feed_id = opened_feed(site, label)
+    page.watch(feed_id)
+    page.until(lambda: page.state == "live" and age_of(page, "model") is not None and age_of(page, "live") is not None)
+    page.until(lambda: page.script("return !document.getElementById('tape').disabled"))
+    return feed_id
+
+
+def age_of(page: LivePage, name: str) -> dict[str, Any] | None:
+    found: dict[str, Any] | None = page.script(READ_TIME, f"{name}-picture", f"{name}-age")
+    return found
+
+
+def shown_ms(text: str) -> float:
+    """What "80 ms old" or "1.2 s behind" says."""
+    number, unit, *_ = text.split()
+    return float(number) * (1 if unit == "ms" else 1000)
+
+
+def word(page: LivePage) -> str:
+    return page.text("#word")
+
+
+def test_it_shows_the_endoscope_and_the_model_with_their_true_ages(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    watched(site, page)
+    assert word(page) == say("live.word_live")
+    page.until(lambda: page.script("return import('/live/main.js').then(({ clock }) => clock.bounds.length > 10)"))
+    for name in ("live", "model"):
+        differences, moments = [], set()
+        for _ in range(15):
+            found = age_of(page, name)
+            assert found is not None
+            differences.append(abs(shown_ms(found["text"]) - found["ageMs"]))
+            moments.add(found["ms"])
+            time.sleep(0.1)
+        assert sorted(differences)[-2] <= TOLERANCE_MS, (name, differences)  # one may fall between picture and text
+        assert len(moments) >= 4, name
+    assert page.text("#trust").endswith(say("light.good"))
+
+
+def test_ages_are_true_where_the_browser_s_clock_is_wrong(site: Site, page: LivePage, painter: LivePainter) -> None:
+    wrong = page.driver.execute_cdp_cmd(
+        "Page.addScriptToEvaluateOnNewDocument", {"source": "const now = Date.now; Date.now = () => now() - 3600e3;"}
+    )
+    try:
+        watched(site, page)
+        page.until(lambda: page.script("return import('/live/main.js').then(({ clock }) => clock.bounds.length > 10)"))
+        found = age_of(page, "live")
+        assert found is not None
+        age_ms = time.time() * 1000 % 2**24 - found["ms"]
+        assert abs(shown_ms(found["text"]) - age_ms) <= 2 * TOLERANCE_MS  # the driver takes some
+    finally:
+        page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", wrong)
+
+
+def test_a_model_that_is_late_is_said_to_be_behind(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    painter.model_lag_s = 3.3
+    page.until_text("#word", "MODEL BEHIND 3 s")
+    assert page.text("#live-word") == say("live.word_live")
+    painter.model_lag_s = 0.4
+    page.until_text("#word", say("live.word_live"))
+
+
+def test_loss_of_signal_is_said_within_two_seconds_and_marks_the_last_picture(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    watched(site, page)
+    painter.stops_s = began_s = time.time()
+    page.until_text("#word", say("live.word_stalled"))
+    assert time.time() - began_s < 2.5
+    assert page.script("return getComputedStyle(document.getElementById('live-picture')).opacity") == "0.35"
+    painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
+    page.until_text("#why", say("live.reason_silent"))
+    painter.stops_s, painter.state, painter.reason = None, FeedState.LIVE, None
+    page.until_text("#word", say("live.word_live"))
+
+
+def test_a_service_that_is_gone_is_said_to_be_lost_and_comes_back(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    watched(site, page)
+    site.stop()
+    began_s = time.time()
+    page.until_text("#word", say("live.word_service_lost"))
+    assert time.time() - began_s < 2.5
+    site.start()
+    page.until_text("#word", say("live.word_live"))
+
+
+def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.click("#freeze")
+    page.until(lambda: page.state == "frozen")
+    held = age_of(page, "model")
+    live = age_of(page, "live")
+    assert held is not None
+    assert live is not None
+    page.until(lambda: (age_of(page, "live") or live)["ms"] - live["ms"] > 1000)
+    after = age_of(page, "model")
+    assert after is not None
+    assert after["ms"] == held["ms"]
+    assert word(page).startswith("FROZEN")
+    assert page.text("#live-word") == say("live.word_live")
+    frame = "return getComputedStyle(document.body, '::after')"
+    assert page.script(f"{frame}.borderTopStyle") == "double"
+    assert page.script("return getComputedStyle(document.querySelector('.strike')).visibility") == "visible"
+    page.script(PRESS, "l")
+    page.until(lambda: page.state == "live")
+    assert page.script(f"{frame}.borderTopWidth") == "0px"
+
+
+def test_the_tape_goes_back_and_plays_on_from_there(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.script(DRAG_TAPE, -12)
+    page.until_text("#word", "LOOKING BACK 12 s")
+    page.until(lambda: 11_000 < (age_of(page, "model") or {"ageMs": 0})["ageMs"] < 13_000)
+    first = age_of(page, "model")
+    assert first is not None
+    page.until(lambda: (age_of(page, "model") or first)["ms"] > first["ms"] + 500)
+    assert word(page) == "LOOKING BACK 12 s"
+    page.script(PRESS, "ArrowLeft")
+    page.until_text("#word", "LOOKING BACK 13 s")
+    page.script(DRAG_TAPE, -PAST_S - 20)
+    page.until(lambda: page.text("#model-message") != "")
+    page.click("#live")
+    page.until(lambda: page.state == "live" and page.text("#model-message") == "")
+
+
+def test_a_frozen_moment_is_measured_with_its_interval(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.click("#measure")
+    page.until(lambda: page.state == "frozen")
+    page.until_text("#measured", say("live.measure_first"))
+    page.script(CLICK, 0.4, 0.6)
+    page.until_text("#measured", say("live.measure_second"))
+    page.script(CLICK, 0.6, 0.6)
+    page.until_text("#measured", "mm")
+    found = age_of(page, "model")
+    assert found is not None
+    assert page.text("#measured").count("±") == 1
+    measured = painter.measured[-1]
+    assert measured.moment is not None
+    assert measured.moment.at_s is not None
+    assert abs(measured.moment.at_s * 1000 % 2**24 - found["ms"]) <= 2
+    assert [round(x) for point in measured.points for x in point] == [160, 192, 240, 192]
+    page.script(PRESS, "Escape")
+    page.until(lambda: page.script("return document.getElementById('measured').hidden"))
+
+
+def test_points_are_chosen_by_keys_too(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.script(PRESS, "m")
+    page.until_text("#measured", say("live.measure_first"))
+    on_stage = PRESS.replace("document.body", "document.getElementById('model-stage')")
+    page.script(on_stage, "ArrowDown")
+    page.script(on_stage, "Enter")
+    page.until_text("#measured", say("live.measure_second"))
+    for _ in range(5):
+        page.script(on_stage, "ArrowRight")
+    page.script(on_stage, "Enter")
+    page.until_text("#measured", "±")
+
+
+def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page, "liver")
+    page.click("#keep")
+    page.until_text("#kept", say("live.kept_open"))
+    (job,) = site.queue.records()
+    assert page.script("return document.querySelector('#kept a').hash") == f"#/scene/{job.job_id}"
+    asked = f"import('/api.js').then(({{ getJob }}) => getJob('{job.job_id}'))"
+    label = page.script(f"return {asked}.then(({{ label }}) => label)")
+    assert label.startswith("liver")
+    assert job.state is JobState.QUEUED
+    page.until_text("#kept", say("state.queued"))
+    claim = site.claim()
+    site.train(claim, 40, 28.0)
+    page.until_text("#kept", say("stage.train"))
+    site.finish(claim)
+    page.until_text("#kept", say("state.done"))
+
+
+def test_out_of_the_body_nothing_is_shown(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    painter.state = FeedState.NO_TISSUE
+    page.until_text("#word", say("live.word_no_tissue"))
+    page.until_text("#live-message", say("live.nothing_recorded"))
+    time.sleep(0.5)  # pictures that come now stay unseen
+    assert page.script("const { hidden, width } = document.getElementById('live-picture'); return [hidden, width]") == [
+        True,
+        0,
+    ]
+    painter.state = FeedState.LIVE
+    page.until(lambda: page.state == "live" and age_of(page, "live") is not None)
+
+
+def test_pause_and_end_say_what_they_do(site: Site, page: LivePage, painter: LivePainter) -> None:
+    feed_id = watched(site, page)
+    page.click("#pause")
+    page.until_text("#word", say("live.word_paused"))
+    page.until_text("#why", say("live.reason_by_hand"))
+    page.until_text("#pause", say("live.resume"))
+    page.click("#pause")
+    page.until_text("#word", say("live.word_live"))
+    page.click("#end")
+    page.until_text("#confirm-question", "12.3 MB")
+    page.click("#confirm [value=no]")
+    assert site.queue.feed(feed_id) is not None
+    page.click("#end")
+    page.click("#confirm [value=yes]")
+    page.until_text("#word", say("live.word_ended"))
+    assert site.queue.feed(feed_id) is None
+
+
+def test_health_says_rates_and_why_nothing_is_recorded(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.script("document.getElementById('health').open = true")
+    for part in ("30.0/s", "4.9/s", "12.3 MB", "0.06 s"):
+        page.until_text("#health-list", part)
+    painter.recording = FeedReason.DISK_FULL
+    page.until_text("#health-list", say("live.reason_disk_full"))
+    assert word(page) == say("live.word_live")
+
+
+def test_turning_is_shown_with_its_trust_and_ends_without_a_hand(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    watched(site, page)
+    page.script("import('/live/main.js').then(({ look }) => look.turn((orbit) => orbit.stand('orbit:18,0,1')))")
+    page.until_text("#trust", say("light.care"))
+    page.until_text("#trust-why", say("notice.pose_far"))
+    page.script("import('/live/main.js').then(({ look }) => (look.handMs -= 20000))")
+    page.until_text("#trust", say("light.good"))
+    page.until_text("#model-place", say("view.endoscope"))
+
+
+def test_rocking_turns_to_and_fro_by_8_degrees(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    page.click("#look")
+    page.until_text("#model-place", say("live.rocking"))
+    yaws = lambda: [getattr(each.pose, "yaw_deg", 0.0) for each in painter.renders]  # noqa: E731
+    page.until(lambda: min(yaws()) < -6 and max(yaws()) > 6)
+    assert max(abs(yaw) for yaw in yaws()) <= 8.01
+    page.click("#live")
+    page.until_text("#model-place", say("view.endoscope"))
+
+
+def test_a_presenter_freezes_and_goes_back_to_live(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    for key, state in (("PageDown", "frozen"), ("PageUp", "live"), (" ", "frozen"), (" ", "live")):
+        page.script(PRESS, key)
+        page.until(lambda state=state: page.state == state)  # type: ignore[misc]
+
+
+def test_the_page_leads_to_open_feeds(site: Site, page: LivePage, painter: LivePainter) -> None:
+    feed_id = opened_feed(site, "theatre 2")
+    page.driver.get(site.url)
+    page.until_text("#open-feeds", "theatre 2")
+    page.driver.get("about:blank")
+    page.driver.get(f"{site.url}/#/live/{feed_id}")
+    page.until(lambda: page.driver.current_url == f"{site.url}/live.html#/{feed_id}")
+    page.until_text("#word", say("live.word_live"))
+
+
+def test_a_feed_that_is_no_more_is_said_to_have_ended(site: Site, page: LivePage) -> None:
+    page.watch("0" * 32)
+    page.until_text("#word", say("live.word_ended"))
+
+
+def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_path: Path) -> None:
+    page.driver.get("about:blank")
+    page.driver.get(f"{site.url}/live.html")
+    page.until_text("#no-feeds", say("live.none_open"))
+    calibration = tmp_path / "calibration.json"
+    calibration.write_text('{"model": "rectified"}')
+    page.until(lambda: page.find("#open-feed [name=calibration]").is_displayed())
+    page.find("#open-feed [name=calibration]").send_keys(str(calibration))
+    page.find("#open-feed [name=source]").send_keys("rtsp://nowhere.example.org/1")
+    page.click("#open-feed [type=submit]")
+    page.until(lambda: page.text("#open-message") != "")
+
+
+def test_every_state_and_reason_has_words() -> None:
+    for language in LANGUAGES:
+        places = set(table(language)["live"])
+        assert {f"reason_{reason.value}" for reason in FeedReason} == {each for each in places if "reason_" in each}
+        assert {f"state_{state.value}" for state in FeedState} == {each for each in places if "state_" in each}
+    source = (DASHBOARD / "live" / "headline.js").read_text()
+    assert all(f"{state.value}:" in source for state in FeedState if state not in (FeedState.LIVE, FeedState.BEHIND))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "language"), [(*size, LANGUAGES[n % 2]) for n, size in enumerate(LIVE_SIZES)]
+)
+def test_it_is_accessible_and_fits_in_every_state(
+    site: Site, page: LivePage, painter: LivePainter, axe: str, width: int, height: int, language: str
+) -> None:
+    page.driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
+    page.script("localStorage.setItem('intrasplat-language', arguments[0])", language)
+    found, layout = {}, {}
+    with screen_of(page, width, height):
+        page.driver.get("about:blank")
+        page.driver.get(f"{site.url}/live.html")
+        page.until_text("#no-feeds", say("live.none_open", language))
+        found["opening"] = violations(page, axe)
+        watched(site, page, "theatre 2")
+
+        def judge(state: str) -> None:
+            found[state] = violations(page, axe)
+            layout[state] = page.script(LAYOUT, MIN_TOUCH_PX, MIN_LETTER_PX)
+
+        judge("live")
+        sizes = page.script(
+            "return arguments[0].map((id) => document.getElementById(id).getBoundingClientRect().height)", ACTIONS
+        )
+        assert min(sizes) >= MIN_ACTION_PX
+        page.click("#measure")
+        page.until(lambda: page.state == "frozen")
+        judge("frozen")
+        page.click("#live")
+        page.script(DRAG_TAPE, -12)
+        page.until(lambda: page.state == "back")
+        judge("back")
+        page.click("#live")
+        painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
+        page.until(lambda: page.state == "lost")
+        judge("lost")
+        painter.state, painter.reason = FeedState.NO_TISSUE, None
+        page.until(lambda: page.state == "empty")
+        judge("empty")
+        page.script("document.getElementById('health').open = true")
+        found["health"] = violations(page, axe)
+        page.click("#end")
+        page.until(lambda: page.find("#confirm").is_displayed())
+        found["question"] = violations(page, axe)
+    assert [(state, *each) for state, some in found.items() for each in some] == []
+    fine = {"over": [], "off": [], "small": [], "faint": []}
+    assert [(state, each) for state, each in layout.items() if each != fine] == []
+
+
+def test_it_asks_nobody_else(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    names = page.script("return performance.getEntriesByType('resource').map((each) => each.name)")
+    assert [each for each in names if not each.startswith((site.url, "blob:"))] == []
