@@ -9,7 +9,7 @@ from pathlib import Path
 from contract.runtime.settings import Settings
 from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
 from intrasplat.errors import InputError
-from intrasplat.intake.calibration.text import read_calibration
+from intrasplat.intake.calibration.text import parse_text, read_calibration
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.spec import FIELD, AllowedHosts, RecordingSpec, SourceKind, SourceSpec, parsed
 from intrasplat.live.state import FeedReason, FeedState
@@ -17,7 +17,7 @@ from intrasplat.live.state import FeedReport as LiveReport
 from intrasplat.splat.backend import CPU, Device
 from worker.reply import NotYetError
 
-CALIBRATION_REMEDY = "Send it as JSON, YAML or ini, with the size of the pictures that it was made for."
+CALIBRATION = "calibration.txt"
 
 
 class HostedFeed:
@@ -100,10 +100,9 @@ class HostedFeed:
                 self._feed.close()
 
     def _made(self) -> Feed:
-        calibration = read_calibration(self._record.calibration)
-        if calibration is None:
-            name = self._record.calibration_name
-            raise InputError("calibration", f"{name} is XML, or names no size of pictures.", CALIBRATION_REMEDY)
+        check_calibration_of(self._record)
+        calibration = self._folder / CALIBRATION  # what it says depends on the size of the pictures
+        calibration.write_text(self._record.calibration, encoding="utf-8")
         options, half = self._record.options, self._settings.feed_disk_bytes // 2
         keep_s = min(options.keep_s, self._settings.feed_keep_s)
         source = SourceSpec(
@@ -120,6 +119,14 @@ class HostedFeed:
         if self._wish is FeedWish.PAUSE:
             made.pause()
         return made
+
+
+def check_calibration_of(record: FeedRecord) -> None:
+    """Raises InputError if the calibration cannot be used, whatever the pictures are."""
+    if parse_text(record.calibration) is None:  # its parser is not safe enough for a process that is not confined
+        problem = f"{record.calibration_name[:80]} is XML."
+        raise InputError("calibration", problem, "Send it as JSON, YAML or ini.")
+    read_calibration(record.calibration)
 
 
 def hosts_of(source: str | None, settings: Settings) -> AllowedHosts | None:

@@ -67,7 +67,7 @@ export function markTime(svg, { time_s: times }, t) {
 function spanOf(values) {
   const [low, high] = [Math.min(...values), Math.max(...values)];
   const more = Math.max(0, MIN_SPAN_MM - (high - low)) / 2;
-  return [low - more, high + more];
+  return [Math.max(0, low - more), high + more];
 }
 
 /** Neighbouring frames together. */

@@ -22,6 +22,13 @@ function describeReceipt(receipt) {
   return [`${receipt.job_id}: ${sum(receipt.files)} files, ${sum(receipt.bytes)} bytes, ${receipt.purged_at}`, ...others].join("; ");
 }
 
+/** A click on picture and name opens it, as its button does for keyboards. @param {HTMLElement} item @param {() => void} onOpen */
+function openByClick(item, onOpen) {
+  const card = item.querySelector(".card");
+  card.classList.add("opens");
+  card.addEventListener("click", ({ target }) => target.closest("form, details, button") || onOpen());
+}
+
 export class JobList {
   /**
    * @param {{list: HTMLElement, nothing: HTMLElement, message: HTMLElement, confirm: HTMLDialogElement}} parts
@@ -79,6 +86,8 @@ export class JobList {
     let row = this.rows.get(job.id);
     if (row?.key !== key && !(row && this.renamed === job.id)) {
       const made = { ...makeCard(job, { summary, buttons: this.#buttons(job, nameOf(job)), thumbnails: this.thumbnails }), key };
+      const open = this.#actions(job).find((action) => action === "view" || action === "watch");
+      if (open) openByClick(made.item, () => this.onView(job.id));
       const hadFocus = row?.item.contains(document.activeElement);
       if (row) this.thumbnails.letGo(row.item);
       row?.item.replaceWith(made.item);
@@ -147,7 +156,7 @@ export class JobList {
   /** Ask before what cannot be taken back. @param {"cancel"|"delete"} action @param {string} name @param {() => void} onYes */
   #ask(action, name, onYes) {
     this.onYes = onYes;
-    this.confirm.querySelector("[value=yes]").textContent = words(`job.${action}`);
+    for (const answer of ["yes", "no"]) this.confirm.querySelector(`[value=${answer}]`).textContent = words(`job.${answer}_${action}`);
     this.confirm.querySelector("p").textContent = words(`job.ask_${action}`, { name });
     this.confirm.showModal();
   }

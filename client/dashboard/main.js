@@ -236,6 +236,7 @@ function showJobs() {
 
 function showConnection(text, kind) {
   if (kind === "good" && jobs.byId.has(viewer.scene)) viewer.screen.keepAlive();
+  delete get("connection").dataset.words; // else a change of language says again that it connects
   get("connection").textContent = text;
   get("connection").className = `pill ${kind}`;
 }
@@ -261,7 +262,10 @@ const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !=
 export const jobs = new Jobs(showJobs, showConnection, isWatched);
 listOpenFeeds(get("open-feeds"), () => drawers.isOpen === "library");
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
-const momentOf = (id) => (viewer.scene === id ? viewer.timeline.t : 0);
+const momentOf = (id) => {
+  const t = viewer.scene === id ? viewer.timeline.t : 0;
+  return { t, seconds: viewer.timeline.momentOf(t) };
+};
 const downloads = new Downloads(get("download"), get("jobs-message"), scopes, momentOf);
 
 const light = new ScreenLight();
@@ -305,6 +309,7 @@ get("layer").addEventListener("change", offerMasks);
 get("better-masks").addEventListener("click", () => sendAgain(viewer.scene));
 showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget-key") });
 languageEvents.addEventListener("changed", () => {
+  jobs.poll();
   list.forget();
   reported = null;
   showJobs();

@@ -164,7 +164,7 @@ export class Measure {
     if (!this.isOn) return;
     const { shown } = this.viewer;
     const now = this.found && shown?.camera ? this.#now() : null;
-    if (now) this.overlay.line(shown.camera, now.places, `${figure(now.mm, 1)} mm`);
+    if (now) this.overlay.line(shown.camera, now.places, words("measure.distance", { mm: figure(now.mm, 1), sigma: figure(now.sigma, 1) }));
     else if (!this.found && shown?.camera && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
     else this.overlay.clear();
     if (shown?.camera && this.cross) this.overlay.cross(shown.camera, this.#crossIn(shown.camera));

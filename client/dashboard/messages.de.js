@@ -157,7 +157,8 @@ export const DE = {
     "http_503:disk": "Der Dienst hat keinen Platz mehr und nimmt nichts Neues an.",
     "http_503:queue": "Der Dienst kann zurzeit keine neue Arbeit annehmen.",
     "http_504": "Der Dienst antwortet nicht rechtzeitig. Die Seite versucht es weiter.",
-    "http_other": "Der Dienst antwortete mit einem Fehler."
+    "http_other": "Der Dienst antwortete mit einem Fehler.",
+    "input:format": "Diese Installation kann so eine Datei von dieser Szene nicht erzeugen; die Details sagen, was ihr fehlt."
   },
   "state": {
     "queued": "wartet",
@@ -289,13 +290,17 @@ export const DE = {
     "ask_delete": "Clip und Szene von {name} endgültig löschen?",
     "purged": "Clip und Szene von {name} sind endgültig gelöscht.",
     "purge_checked": "Es wurde geprüft, dass nichts übrig ist.",
-    "clip_kept": "Derselbe Clip bleibt bei einer anderen Szene."
+    "clip_kept": "Derselbe Clip bleibt bei einer anderen Szene.",
+    "yes_cancel": "Arbeit abbrechen",
+    "no_cancel": "Weiterlaufen lassen",
+    "yes_delete": "Löschen",
+    "no_delete": "Abbrechen"
   },
   "label": {
     "name": "Name dieser Szene",
     "no_names": "Nicht für Namen von Personen: Wer die Szene ansehen darf, liest ihn.",
-    "keep": "Übernehmen",
-    "leave": "Lassen, wie es war",
+    "keep": "Speichern",
+    "leave": "Abbrechen",
     "search": "Nach Namen suchen",
     "none": "Noch keine.",
     "no_key": "Für die Szenen wird ein Schlüssel gebraucht. Geben Sie ihn oben ein.",
@@ -310,11 +315,11 @@ export const DE = {
     "title": "{name} als Datei speichern",
     "close": "Schließen",
     "making": "Die Datei wird erstellt; der Browser speichert sie, wenn sie fertig ist.",
-    "moment": "Der gezeigte Moment (t {t})",
+    "moment": "Der gezeigte Moment ({seconds})",
     "first": "Der erste Moment",
     "clip": "Der ganze Clip",
     "itself": "Die Szene selbst",
-    "research": "Für die Forschung. Messen Sie damit keine Anatomie aus.",
+    "research": "Für die Forschung. Abstände dienen nur der Forschung.",
     "mesh-glb": "Oberfläche mit Farben, in Metern",
     "mesh-ply": "Oberfläche mit Farben, in mm",
     "mesh-stl": "Oberfläche ohne Farben, in mm",
@@ -374,14 +379,15 @@ export const DE = {
     "camera_estimated": "Das Endoskop bewegte sich insgesamt um etwa {mm} mm.",
     "camera_estimated_or_tissue": "Das Endoskop bewegte sich wohl um etwa {mm} mm; ein Teil davon ist vielleicht Bewegung des Gewebes.",
     "more_reasons": "{count} weitere unter den Einzelheiten.",
-    "tested_here": "Geprüft wurde es von dort, wo das Endoskop war. Ansichten von daneben wurden nicht geprüft. Messen Sie damit keine Anatomie aus.",
-    "tested_beside": "Geprüft wurde es von beiden Augen des Endoskops. Ansichten von weiter daneben wurden nicht geprüft. Messen Sie damit keine Anatomie aus.",
+    "tested_here": "Geprüft wurde es von dort, wo das Endoskop war. Ansichten von daneben wurden nicht geprüft. Abstände dienen nur der Forschung.",
+    "tested_beside": "Geprüft wurde es von beiden Augen des Endoskops. Ansichten von weiter daneben wurden nicht geprüft. Abstände dienen nur der Forschung.",
     "careful": "Zu beachten",
     "details": "Einzelheiten und Zahlen",
     "save_masks": "Masken speichern (.zip)",
     "send_masks": "Masken senden",
     "send_better_masks": "Bessere Masken senden",
-    "how_to_correct": "So werden Masken besser: speichern, Instrumente weiß und Gewebe schwarz malen, senden. Der Clip selbst muss nicht noch einmal gesendet werden."
+    "how_to_correct": "So werden Masken besser: speichern, Instrumente weiß und Gewebe schwarz malen, senden. Der Clip selbst muss nicht noch einmal gesendet werden.",
+    "covered_all": "Fast alles Gewebe wurde gesehen; der Rest ist schraffiert, oder geraten, wenn Sie es wünschen."
   },
   "strip": {
     "title": "Licht der Aufnahme",
@@ -431,7 +437,6 @@ export const DE = {
     "forget_key": "Schlüssel vergessen",
     "notice": "Nur für die Forschung. Kein Medizinprodukt; keine Grundlage einer Behandlung.",
     "connecting": "verbindet",
-    "keep": "Behalten",
     "details": "Einzelheiten",
     "close": "Schließen",
     "ready": "bereit",
@@ -463,7 +468,7 @@ export const DE = {
   },
   "measure": {
     "title": "Messen",
-    "research": "Nur für die Forschung. 95 von 100 wahren Werten liegen innerhalb von ±.",
+    "research": "Nur für die Forschung. ± ist ein 95-%-Intervall.",
     "first": "Wählen Sie den ersten Punkt: anklicken, oder das Kreuz mit den Pfeiltasten bewegen und Enter drücken. Escape beendet.",
     "second": "Erster Punkt: {reading}. Wählen Sie den zweiten Punkt.",
     "asking": "Es wird gemessen.",
@@ -747,9 +752,9 @@ export const DE = {
     "recorded": "Aufnahme, Masken markiert"
   },
   "view": {
-    "guesses": "Vermutetes zeigen",
+    "guesses": "Nie Gesehenes füllen",
     "guesses_why": "Was kein Bild des Clips sah, ist schraffiert, außer Sie wollen sehen, was das Modell dort vermutet.",
-    "highlights": "Glanz zeigen",
+    "highlights": "Feuchter Glanz",
     "highlights_why": "Farben gibt es auch ohne den Glanz, den die zwei Augen eines Stereoclips an verschiedenen Stellen sahen; was beide an derselben Stelle sahen, bleibt.",
     "stage": "Das Gewebe. Das Fragezeichen zeigt alle Tasten.",
     "eye": "Auge des Endoskops",

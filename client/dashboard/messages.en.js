@@ -157,7 +157,8 @@ export const EN = {
     "http_503:disk": "The service has no room left, and takes nothing new.",
     "http_503:queue": "The service cannot take new work at the moment.",
     "http_504": "The service does not answer in time. The page keeps trying.",
-    "http_other": "The service answered with an error."
+    "http_other": "The service answered with an error.",
+    "input:format": "This installation cannot make such a file of this scene; the details say what it lacks."
   },
   "state": {
     "queued": "waiting",
@@ -289,13 +290,17 @@ export const EN = {
     "ask_delete": "Delete the clip and the scene of {name} for good?",
     "purged": "The clip and the scene of {name} are deleted for good.",
     "purge_checked": "It was checked that nothing is left.",
-    "clip_kept": "The same clip stays with another scene."
+    "clip_kept": "The same clip stays with another scene.",
+    "yes_cancel": "Stop the work",
+    "no_cancel": "Let it go on",
+    "yes_delete": "Delete",
+    "no_delete": "Cancel"
   },
   "label": {
     "name": "Name of this scene",
     "no_names": "Not for names of persons: whoever may view the scene reads it.",
-    "keep": "Keep it",
-    "leave": "Leave it as it was",
+    "keep": "Save",
+    "leave": "Cancel",
     "search": "Search by name",
     "none": "None yet.",
     "no_key": "A key is needed to see the scenes. Enter it above.",
@@ -310,11 +315,11 @@ export const EN = {
     "title": "Save {name} as a file",
     "close": "Close",
     "making": "The file is being made; the browser saves it when it is ready.",
-    "moment": "The moment in view (t {t})",
+    "moment": "The moment in view ({seconds})",
     "first": "The first moment",
     "clip": "The whole clip",
     "itself": "The scene itself",
-    "research": "For research. Do not measure anatomy with it.",
+    "research": "For research. Distances are for research only.",
     "mesh-glb": "Surface with colours, in metres",
     "mesh-ply": "Surface with colours, in mm",
     "mesh-stl": "Surface without colours, in mm",
@@ -374,14 +379,15 @@ export const EN = {
     "camera_estimated": "The endoscope moved by about {mm} mm in all.",
     "camera_estimated_or_tissue": "The endoscope seems to have moved by about {mm} mm in all; some of it may be the tissue's movement.",
     "more_reasons": "{count} more under the details.",
-    "tested_here": "It was tested from where the endoscope was. Views from beside it were not tested. Do not measure anatomy with it.",
-    "tested_beside": "It was tested from both eyes of the endoscope. Views from farther beside were not tested. Do not measure anatomy with it.",
+    "tested_here": "It was tested from where the endoscope was. Views from beside it were not tested. Distances are for research only.",
+    "tested_beside": "It was tested from both eyes of the endoscope. Views from farther beside were not tested. Distances are for research only.",
     "careful": "What to be careful about",
     "details": "Details and figures",
     "save_masks": "Save the masks (.zip)",
     "send_masks": "Send masks",
     "send_better_masks": "Send better masks",
-    "how_to_correct": "To correct the masks: save them, paint instruments white and tissue black, and send them. The clip itself need not be sent again."
+    "how_to_correct": "To correct the masks: save them, paint instruments white and tissue black, and send them. The clip itself need not be sent again.",
+    "covered_all": "Nearly all of the tissue was seen; the rest is hatched, or guessed if you ask for it."
   },
   "strip": {
     "title": "Light of the recording",
@@ -431,7 +437,6 @@ export const EN = {
     "forget_key": "Forget key",
     "notice": "Research use only. Not a medical device; it must not guide treatment.",
     "connecting": "connecting",
-    "keep": "Keep",
     "details": "Details",
     "close": "Close",
     "ready": "ready",
@@ -463,7 +468,7 @@ export const EN = {
   },
   "measure": {
     "title": "Measure",
-    "research": "For research only. 95 of 100 true values lie within ±.",
+    "research": "For research only. ± is a 95 % interval.",
     "first": "Choose the first point: click it, or move the cross with the arrow keys and press Enter. Escape ends.",
     "second": "First point: {reading}. Choose the second point.",
     "asking": "Measuring.",
@@ -747,9 +752,9 @@ export const EN = {
     "recorded": "recorded, masks marked"
   },
   "view": {
-    "guesses": "Show guesses",
+    "guesses": "Fill what was never seen",
     "guesses_why": "What no frame of the clip saw is hatched, unless you want to see what the model guesses there.",
-    "highlights": "Show highlights",
+    "highlights": "Wet shine",
     "highlights_why": "Colours can be shown without the highlights that the two eyes of a stereo clip saw in different places; what both saw in one place stays.",
     "stage": "The tissue. Question mark lists all keys.",
     "eye": "Eye of the endoscope",

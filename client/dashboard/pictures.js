@@ -16,6 +16,8 @@ const MAX_RETRY_MS = 15000;
 /** Not a layer of the model, but what the endoscope saw, with the masked parts marked. */
 const RECORDED = "recorded";
 
+/** A smaller share of a view is no hatch that anybody sees. The service warns from 0.05 on. */
+const LEAST_UNSEEN = 0.005;
 const GUESSES = ["pose_far", "time_outside_clip"];
 /** What a view itself says; all other notices are of its scene. */
 const OF_VIEW = [...GUESSES, "unseen", "hardly_seen", "enlarged"];
@@ -71,6 +73,8 @@ export function warningOf(codes, view, reasons) {
 
 /** Note of a picture of a view what its codes mean. @param {Picture} picture @param {View} view @returns {Picture} */
 export function judged(picture, view) {
+  const isUnseen = picture.unseen >= LEAST_UNSEEN && !picture.codes.includes("unseen");
+  if (isUnseen) picture.codes = [...picture.codes, "unseen"]; // what is hatched, or guessed, is named
   picture.isRecorded = view.layer === RECORDED;
   picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
   return picture;

@@ -32,7 +32,7 @@ function trusted(report) {
   const sentences = [words(`report.clip${eyes ? `_${eyes}` : ""}`, { frames: figure(frames), seconds })];
   const isMeasured = Number.isFinite(depth_mm);
   sentences.push(words(isMeasured ? "report.depth" : "report.no_depth", { mm: figure(depth_mm ?? 0, 1) }));
-  if (Number.isFinite(coverage)) sentences.push(words("report.covered", { share: percent(coverage) }));
+  if (Number.isFinite(coverage)) sentences.push(words(coverage < 0.995 ? "report.covered" : "report.covered_all", { share: percent(coverage) }));
   const fieldWords = field?.source === "given" ? "report.field_of_view_given" : "report.field_of_view";
   if (field && field.share < 1) sentences.push(words(fieldWords, { share: percent(field.share) }));
   if (masks) sentences.push(words(masks.source === "none" ? "report.no_masks" : "report.masks", { share: percent(masks.share) }));

@@ -58,7 +58,7 @@ export class Screen {
     if (canvas.height !== image.height) canvas.height = image.height;
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close?.();
-    const label = `${name}, ${moment}`;
+    const label = [name, moment].filter(Boolean).join(", ");
     canvas.setAttribute("aria-label", label);
     this.about = picture.isRecorded ? moment : label; // the badge says what recorded frames are
     this.shown = picture;

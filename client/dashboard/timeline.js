@@ -166,9 +166,9 @@ export class Timeline {
     time.setAttribute("aria-valuetext", text);
   }
 
-  /** @param {number} t @returns {string} the moment, in seconds; while they are not known, t */
+  /** @param {number} t @returns {string} the moment, in seconds; empty while they are not known */
   momentOf(t) {
-    return this.cameras ? words("time.moment", { seconds: figure(this.#seconds(t), 2) }) : `t ${t.toFixed(3)}`;
+    return this.cameras ? words("time.moment", { seconds: figure(this.#seconds(t), 2) }) : "";
   }
 
   /** @param {number} t @returns {string} where in the clip that is */

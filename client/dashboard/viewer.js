@@ -74,7 +74,10 @@ export class Viewer extends EventTarget {
     this.timeline.playEvents.addEventListener("changed", () => this.refresh()); // what rests is drawn exactly
     this.memory.addEventListener("changed", () => this.#tellWay());
     this.memory.addEventListener("changed", () => this.memory.player && this.refresh());
-    languageEvents.addEventListener("changed", () => this.#tellWay());
+    languageEvents.addEventListener("changed", () => {
+      this.#tellWay();
+      this.refresh(); // what is said of the picture
+    });
     new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.stage);
     this.#tellWay();
   }

@@ -1,7 +1,7 @@
-"""A live feed: its newest stereo pair, its recording, and a model that follows it.
+"""A live feed: its newest stereo pair, its recording, a model that follows it, and its past.
 
-`source` hands over the newest pair of a source that a confined process reads, and records it; `follow` learns pairs and
-shows the newest moment and the past.
+`feed` joins them: `source` hands over the newest pair of a source that a confined process reads, and records it;
+`model` gives pairs that show tissue to the follower of `follow`; `past` keeps what that knew; `looking` finds times.
 
-Verbs: open_source, then Source.newest, .pause, .resume, .cut, .close; Follower.add, .scene_at.
+Verbs: Feed.report, .view_of, .wait_for_newer, .cut, .pause, .resume, .close; followed.follow for users.
 """

@@ -61,9 +61,14 @@ class LiveEyes:
     """
 
     def __init__(
-        self, calibration: StereoCalibration | Path, settings: EyesSettings, recorded_size: tuple[int, int]
+        self,
+        calibration: StereoCalibration | Path,
+        settings: EyesSettings,
+        recorded_size: tuple[int, int],
+        pixel_aspect: float = 1.0,
     ) -> None:
         """calibration: of these eyes, in any size; a path: its file. recorded_size: width and height of one eye.
+        pixel_aspect: width / height of a pixel.
 
         Raises:
             InputError: the calibration cannot be read, or is of no such eyes.
@@ -75,8 +80,10 @@ class LiveEyes:
         nothing = np.zeros((*self._size[::-1], 3), np.uint8)
         self._pair = nothing, nothing
         if isinstance(calibration, Path):
-            calibration = load_calibration(calibration, eye_width=width, eye_height=height)
-        self._rectified = rectify(self._stereo_clip(), fitted(calibration, width, height).resized(*self._size))
+            found = load_calibration(calibration, eye_width=width, eye_height=height, pixel_aspect=pixel_aspect)
+        else:
+            found = fitted(calibration, width, height, pixel_aspect)
+        self._rectified = rectify(self._stereo_clip(), found.resized(*self._size))
         self._work: FrameWork | None = None
 
     def moment(self, left: RgbFrame, right: RgbFrame, time_s: float) -> DepthClip | None:

@@ -27,6 +27,8 @@ from intrasplat.splat.backend import CPU, Device
 
 PEEK_S = 0.05
 """How long a newer pair is waited for where somebody only looks: the model may wait for one, too."""
+MAX_MEMORY_BYTES = 512 << 20
+"""Of a past that is in memory."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class FeedSettings:
     camera       as in FollowSettings
     keep_s       seconds that can be looked back
     segments     folder of the past, of this feed alone; None: it is in memory, and ends with the feed
-    max_bytes    of the past on disk
+    max_bytes    of the past on disk; in memory, MAX_MEMORY_BYTES if that is less
     max_age_s    a feed whose model is older is behind, and its newest moment is stale
     budget_s     seconds for each pair; None: chosen by size and device
     finds_tissue whether nothing is learnt, shown or kept while the pictures show no tissue
@@ -60,7 +62,8 @@ class FeedSettings:
 
     def of_past(self) -> PastSpec:
         """What is kept of the model."""
-        return PastSpec(self.segments, self.keep_s, self.max_bytes)
+        max_bytes = self.max_bytes if self.segments else min(self.max_bytes, MAX_MEMORY_BYTES)
+        return PastSpec(self.segments, self.keep_s, max_bytes)
 
 
 class Feed:
@@ -86,7 +89,11 @@ class Feed:
         earlier = self._past.segments()
         place = (earlier[-1].source_s[1], earlier[-1].arrived_at[1]) if earlier else None
         self._watch = TissueWatch() if self.settings.finds_tissue else None
-        self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
+        try:
+            self._source = Source(source, place, None if self._watch is None else self._watch.keeps)
+        except BaseException:
+            self._past.close()
+            raise
         of_follower, budget_s = self.settings.of_follower(), self.settings.budget_s
         self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
         self._looking = threading.Lock()

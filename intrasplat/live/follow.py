@@ -137,6 +137,7 @@ class Follower:
         self._scene: tuple[int, TrainedScene] | None = None
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
         self._rehearsed = self._version = 0
+        self._motion_error = 0.0
         self._flow: FlowStart
         self._placer: Placer
         self._cover: Cover
@@ -204,7 +205,8 @@ class Follower:
     def read(self, pair: FeedPair) -> DepthClip | None:
         """The clip of one frame that a pair gives; None: it shows too little tissue with depth."""
         if self._eyes is None:
-            self._eyes = LiveEyes(self._calibration, self.settings.eyes, (pair.left.shape[1], pair.left.shape[0]))
+            size = pair.left.shape[1], pair.left.shape[0]
+            self._eyes = LiveEyes(self._calibration, self.settings.eyes, size, pair.pixel_aspect)
         clip = self._eyes.moment(pair.left, pair.right, pair.source_s)
         if clip is None:
             return None
@@ -238,7 +240,7 @@ class Follower:
 
     def _scene_of(self, window: Window, end: int) -> TrainedScene:
         """The scene of the window's first `end` frames."""
-        return window.scene(end, self._trusted.trust(), seed=self.settings.seed)
+        return window.scene(end, self._trusted.trust(), self._motion_error, seed=self.settings.seed)
 
     def _look(self, window: Window) -> None:
         """Look at how the model shows what it has just learnt; from now on its scene is another one."""
@@ -300,6 +302,8 @@ class Follower:
         """Make the window's first segment a scene of the past."""
         assert self._eyes is not None
         count = self.settings.segment_frames
+        with self._lock:
+            self._motion_error = window.motion_error(count + 1)
         self._keep(self._scene_of(window, count + 1))  # one more frame: no gap is between them
         with self._lock:
             window.give_up()

@@ -45,7 +45,7 @@ class KeptSegment:
 
     source_s, arrived_at  of its first and last frame: source times, and UNIX times, s
     path                  its folder; None: it is in memory alone
-    bytes                 on disk
+    bytes                 on disk; in memory, of its model
     """
 
     number: int
@@ -60,7 +60,7 @@ class KeptSegment:
         (first_s, last_s), (first_at, last_at) = (
             (float(times[0]), float(times[-1])) for times in (scene.frame_times_s, arrivals(scene))
         )
-        return cls(number, (first_s, last_s), (first_at, last_at))
+        return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count)
 
     @classmethod
     def at(cls, path: Path) -> KeptSegment | None:

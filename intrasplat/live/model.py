@@ -9,7 +9,6 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -260,7 +259,8 @@ class FeedModel:
             self._trouble = Trouble(FeedReason.FAULT, text)
         self._end_follower()
 
-    def _rest(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+    def _rest(self, seconds: float) -> None:
+        """Wait, but not beyond the end."""
         with self.changed:
-            if not self._closed and not until():
+            if not self._closed:
                 self.changed.wait(seconds)

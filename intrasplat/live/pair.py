@@ -16,6 +16,7 @@ class FeedPair:
     source_s     seconds of the source's clock since the feed's first frame; never falls, and a gap stays a gap
     arrived_at   UNIX time, s, at which the last byte of the pair's packet came in
     sequence     number of the pair in the feed, rising
+    pixel_aspect width / height of a pixel
     """
 
     left: NDArray[np.uint8]
@@ -23,3 +24,4 @@ class FeedPair:
     source_s: float
     arrived_at: float
     sequence: int
+    pixel_aspect: float = 1.0

@@ -35,7 +35,7 @@ class PastSpec:
 
     folder       of this feed alone; None: in memory
     keep_s       a segment is deleted this long after its last frame came in
-    max_bytes    of all segments on disk: the oldest ones go first
+    max_bytes    of all segments: the oldest ones go first
     spare_bytes  segments are written only while more is free: the recording goes on for longer
     cached       segments in memory beside those on disk: the last ones that were added or looked at
     """
@@ -78,7 +78,7 @@ class Past:
     def kept_bytes(self) -> int:
         """Bytes of all segments on disk."""
         with self._lock:
-            return sum(each.bytes for each in self._segments)
+            return sum(each.bytes for each in self._segments if each.path is not None)
 
     def segments(self) -> tuple[KeptSegment, ...]:
         """All segments, oldest first."""
@@ -122,9 +122,9 @@ class Past:
 
     def prune(self) -> None:
         """Delete segments that are too old or too many, oldest first."""
-        oldest_at, total = time.time() - self._spec.keep_s, self.kept_bytes
-        old = []
-        for segment in self.segments():
+        oldest_at, segments, old = time.time() - self._spec.keep_s, self.segments(), []
+        total = sum(each.bytes for each in segments)
+        for segment in segments:
             if segment.arrived_at[1] >= oldest_at and total <= self._spec.max_bytes:
                 break
             total -= segment.bytes

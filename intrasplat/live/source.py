@@ -212,7 +212,8 @@ class Source:
                 reason = FeedReason.TIMES_JUMPED if pair.epoch else ended_for
                 number = segments + pair.epoch
                 self._segment = Segment(number, reason, height, width, aspect, packing, numbers.codec)
-            return FeedPair(pair.left, pair.right, source_s, pair.arrived_at, pair.sequence)
+            aspect = self._segment.pixel_aspect if self._segment else 1.0
+            return FeedPair(pair.left, pair.right, source_s, pair.arrived_at, pair.sequence, aspect)
 
     def _run(self) -> None:
         try:

@@ -19,7 +19,7 @@ RED_TO_GREEN, RED_TO_BLUE, BLUE_TO_GREEN = 1.3, 1.1, 0.85
 """Least ratios of the colours of a pixel of tissue."""
 DARK, BRIGHT = 25, 220
 """A pixel has a colour if its largest value is above DARK and its smallest one below BRIGHT."""
-MIN_SHARE = 0.15
+MIN_SHARE = 0.2
 """Least share of tissue among pixels with a colour."""
 MIN_COLOURED_SHARE = 0.3
 """Of a darker picture the share counts as if so many had a colour."""

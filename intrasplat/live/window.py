@@ -41,6 +41,11 @@ ARRIVED_AT = "arrived_at"
 """Setting of a scene of a feed: UNIX times, s, at which its frames came in."""
 RIGHT_EYE = "right_eye"
 """Setting of a scene of a feed: a RightEye of intrasplat/report.py."""
+MOTION_EVERY = 3
+"""Frames from one at which the error of the motion is measured to the next."""
+BETWEEN = 1 / 128
+"""The squared error half-way between two frames, as a share of that at a frame that is left out: 1 / 16 for smooth
+motion without noise; phantoms show less."""
 SIDES = (-0.5, 0.5)
 """Camera.side of the left and the right eye, for the gloss."""
 
@@ -159,8 +164,23 @@ class Window:
             right=None,
         )
 
-    def scene(self, end: int, seen: NDArray[np.float32], *, seed: int = 0) -> TrainedScene:
-        """The scene of the first `end` frames, as a copy. seen: [N] as in TrainedScene."""
+    def motion_error(self, end: int) -> float:
+        """How far the motion between the first `end` frames may be wrong, in squared grey levels; 0 for two frames.
+
+        It is in proportion to what frames differ by from the mean of the frames before and after them.
+        """
+        weights, errors = self.weights(), []
+        for slot in range(1, end - 1, MOTION_EVERY):
+            camera, tissue = self.moments[slot].frames[0].camera, self.moments[slot].clip.tissue[0]
+            own = self.model.render(camera, float(slot))[:3, tissue].copy()
+            kept = weights[slot].clone()
+            weights[slot] = (weights[slot - 1] + weights[slot + 1]) / 2
+            errors.append(float(np.square(255 * (self.model.render(camera, float(slot))[:3, tissue] - own)).mean()))
+            weights[slot] = kept
+        return BETWEEN * float(np.nanmean(errors)) if errors else 0.0
+
+    def scene(self, end: int, seen: NDArray[np.float32], motion_error: float, *, seed: int = 0) -> TrainedScene:
+        """The scene of the first `end` frames, as a copy. seen, motion_error: as in TrainedScene."""
         moments = self.moments[:end]
         count = len(moments)
         gaussians, motion = self.model.export(as_it_lies=True)
@@ -189,6 +209,7 @@ class Window:
             settings={
                 ARRIVED_AT: [moment.arrived_at for moment in moments],
                 RIGHT_EYE: clip.registration and clip.registration.model_dump(),
+                "motion_error": motion_error,
             },
             pictures=WindowPictures(moments),
         )

@@ -7,9 +7,9 @@ The clip is encoded once (H.264, both eyes side by side in the recorded size) an
 The feed records it, and keeps its past on disk. A thread asks for the newest moment views-hz times a second and renders
 it. Measured are seconds from the start of the feed to the first picture (`first_s`); the age of what is shown, from the
 arrival of the newest pair in the model to the rendered picture, p50 and p95 after SETTLED_S, and p50 of the first and
-the last third (`age_early_s`, `age_late_s`); rates and steps of training a pair; lag of decoding; the memory of this
-process and of the one that reads; bytes on disk. --kill N: kill the reading process N times, and measure the longest
-time until something newer is shown (`back_s`).
+the last third (`age_early_s`, `age_late_s`); rates and steps of training a pair; cores that this process and the one
+that reads were busy on, with the views; lag of decoding; the memory of both; bytes on disk. --kill N: kill the reading
+process N times, and measure the longest time until something newer is shown (`back_s`).
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ OPTIONS = {"preset": "veryfast", "tune": "zerolatency", "crf": "18", "x264-param
 KEY = ("clip", "width", "fps", "seconds", "detail", "kills", "device")
 FIELDS = (
     *KEY, "height", "received_fps", "used_fps", "steps", "age_p50_s", "age_p95_s", "age_early_s", "age_late_s",
-    "first_s", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load", "machine",
-    "commit",
+    "first_s", "cores", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load",
+    "machine", "commit",
 )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def followed(played: Played, stream: Path, options: argparse.Namespace, device: 
         recording = RecordingSpec(stream.parent / "recording", keep_s=options.keep_s)
         spec = SourceSpec(url, layout="sbs", recording=recording)
         settings = FeedSettings(options.width, options.camera, options.keep_s, stream.parent / "segments")
-        found, ended, began_s = Found(), threading.Event(), time.monotonic()
+        found, ended, began_s, cpu_s = Found(), threading.Event(), time.monotonic(), _cpu_s()
         with Feed(spec, played.calibration, settings, device) as feed:
             looking = (feed, found, ended, began_s, options.views_hz, options.detail, device)
             viewer = threading.Thread(target=_look, args=looking)
@@ -157,10 +157,16 @@ def followed(played: Played, stream: Path, options: argparse.Namespace, device: 
                 time.sleep(REPORT_PERIOD_S)
             ended.set()
             viewer.join()
-            return _summary(found, options.seconds)
+        return _summary(found, options.seconds) | {"cores": (_cpu_s() - cpu_s) / options.seconds}
     finally:
         sender.kill()
         sender.wait()
+
+
+def _cpu_s() -> float:
+    """Seconds of a core that this process has used, and those of its processes that have ended."""
+    used = [resource.getrusage(each) for each in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
 
 
 def _look(

@@ -129,6 +129,8 @@ class Painter:
         self.pause_s = 0.0
         self.warnings: list[Notice] = []
         """Of every picture."""
+        self.unseen_share = 0.0
+        """Of pictures without the warning."""
         self.shown_unseen: Unseen | None = None
         self.shown_highlights: Highlights | None = None
         self.eye: Eye = "left"
@@ -167,7 +169,7 @@ class Painter:
             request.t,
             tuple(warnings),
             iteration,
-            0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else 0.0,
+            0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else self.unseen_share,
             camera=CAMERA,
             depth_range_mm=RANGE_MM if request.layer is Layer.DEPTH else None,
         )

@@ -151,6 +151,21 @@ def test_on_a_phone_an_open_drawer_has_the_screen_also_below_a_message(site: Sit
         assert page.find("#controls").is_displayed()
 
 
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_message_moves_no_button(site: Site, page: Page, width: int, height: int) -> None:
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        page.find("#tools")
+        pressed = ("#tools [data-drawer=library]", "#show-help", "#play", "#time", "#stage")
+        if width == SIZES[-1][0]:
+            pressed = tuple(css for css in pressed if css != "#show-help")  # below "More"
+        before = [box_of(page, css) for css in pressed]
+        page.script("document.querySelector('#jobs-message').textContent = 'A message that stays.'")
+        assert page.find("#jobs-message").is_displayed()
+        assert [box_of(page, css) for css in pressed] == before
+
+
 def test_controls_step_back_while_idle_and_return(site: Site, page: Page) -> None:
     page.press(site.scene(), "View")
     page.until_state("live")
@@ -227,3 +242,24 @@ def test_the_status_of_recorded_frames_says_once_what_they_are(site: Site, page:
     )
     page.until_text("#badge", say("screen.recorded"))
     page.until(lambda: page.text("#status-text") == "0.00 s")
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_button_that_sends_is_in_view_however_long_the_form_is(page: Page, width: int, height: int) -> None:
+    with screen_of(page, width, height):
+        page.show("drawer")
+        page.script("document.querySelector('#upload details').open = true")
+        assert is_on_screen(page, "#upload [type=submit]")
+
+
+@pytest.mark.parametrize(("width", "height"), [(820, 1180), (390, 844), (844, 390)])
+def test_on_small_screens_the_slider_is_wide_and_every_tool_is_seen(
+    site: Site, page: Page, width: int, height: int
+) -> None:
+    with screen_of(page, width, height):
+        page.press(site.scene(), "View")
+        page.until_state("live")
+        left, _, right, _ = box_of(page, "#time")
+        assert right - left > 0.3 * width
+        for css in ("[data-drawer=library]", "[data-drawer=drawer]", "[data-drawer=report-drawer]", "#measure"):
+            assert is_on_screen(page, f"#tools {css}"), css

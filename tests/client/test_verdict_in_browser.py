@@ -59,6 +59,16 @@ def test_a_scene_without_doubt_is_called_good_but_not_beside_a_view_that_is_a_gu
     assert not page.find("#verdict").is_displayed()
 
 
+def test_a_little_that_was_never_seen_is_named_and_filling_it_is_a_guess(site: Site, page: Page) -> None:
+    site.painter.unseen_share = 0.04
+    page.press(scene_with(site), "View")
+    page.until_text("#picture-warning", say("notice.unseen"))
+    assert page.state == "live"
+    page.click("#guess")
+    page.until_state("extrapolated")
+    page.until_text("#picture-warning", say("picture.guessed"))
+
+
 def test_a_converted_calibration_asks_for_care(site: Site, page: Page) -> None:
     page.press(scene_with(site, NoticeCode.CALIBRATION_SCALED), "View")
     page.until_text("#verdict", say("light.care"))

@@ -182,7 +182,7 @@ class PhantomSender:
 
     def __init__(self, phantom: Phantom, cover: NDArray[np.uint8] | None = None) -> None:
         frames = [phantom.frame(index) for index in range(phantom.settings.frames)]
-        self._pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
+        self.pictures = [np.concatenate([frame.left, frame.right], axis=1) for frame in frames]
         self.calibration, self.cover, self.url = phantom.settings.calibration, cover, ""
 
     @contextmanager
@@ -197,7 +197,7 @@ class PhantomSender:
         for index in in_real_time():
             yield stream.frame(self._shown(index))
 
-    def pictures(self) -> Iterator[bytes]:
+    def jpegs(self) -> Iterator[bytes]:
         """JPEG pictures of both eyes, each after its header and when it is due."""
         for index in in_real_time():
             bgr = cv2.cvtColor(self._shown(index), cv2.COLOR_RGB2BGR)
@@ -205,9 +205,9 @@ class PhantomSender:
             yield PICTURE_HEADER.pack(time.time(), len(content)) + content
 
     def _shown(self, index: int) -> NDArray[np.uint8]:
-        last = len(self._pictures) - 1
+        last = len(self.pictures) - 1
         place = index % (2 * last)
-        return self._pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
+        return self.pictures[min(place, 2 * last - place)] if self.cover is None else self.cover
 
     def _serve(self, connection: socket.socket) -> None:
         for content in self.stream():

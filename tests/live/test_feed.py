@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +21,7 @@ from intrasplat.names import Detail
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.render import render_frame
 from tests.live.conftest import FEED, Follow, phantom, until, until_known
-from tests.live.senders import PhantomSender
+from tests.live.senders import PhantomSender, Stream, in_real_time
 
 ON: Detail = "on"
 OFF: Detail = "off"
@@ -181,3 +182,31 @@ def test_the_past_is_there_again_after_a_restart(followed: Follow, tmp_path: Pat
     assert after is not None
     assert after.ends_s - before.ends_s == pytest.approx(after.ends_at - before.ends_at, abs=0.5)
     assert again.report().numbers.kept_bytes > 1000
+
+
+def test_a_pushed_stream_is_followed(sender: PhantomSender) -> None:
+    with Feed(SourceSpec(None, layout="sbs"), sender.calibration, FEED) as feed:
+        enough = threading.Event()
+        pushing = threading.Thread(target=_push, args=(feed, sender, enough))
+        pushing.start()
+        known_s = feed.wait_for_newer(0.5, 15.0)
+        enough.set()
+        pushing.join()
+        assert known_s is not None, feed.report()
+        assert feed.report().model is not None
+
+
+def _push(feed: Feed, sender: PhantomSender, enough: threading.Event) -> None:
+    stream = Stream()
+    for index in in_real_time():
+        feed.write(stream.frame(sender.pictures[index % 20]))
+        if enough.is_set():
+            break
+    feed.end_push()
+
+
+def test_a_source_that_is_none_is_refused_and_leaves_nothing_behind(sender: PhantomSender, tmp_path: Path) -> None:
+    before = threading.active_count()
+    with pytest.raises(InputError):
+        Feed(SourceSpec("ftp://nowhere"), sender.calibration, replace(FEED, segments=tmp_path))
+    assert threading.active_count() == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -211,3 +212,24 @@ def view_beside(scene: TrainedScene) -> NDArray[np.float64]:
     pose = scene.world_from_camera[0].copy()
     pose[0, 3] += 40.0
     return pose
+
+
+def test_a_calibration_of_squeezed_pictures_fits_by_the_pixels_aspect() -> None:
+    phantom = _phantom("breathing")
+    pair = replace(_pair(phantom, 0), left=_squeezed(phantom, 0), right=_squeezed(phantom, 1))
+    with pytest.raises(InputError, match="not one uniform scale"):
+        Follower(phantom.settings.calibration, SETTINGS).add(pair)
+    assert Follower(phantom.settings.calibration, SETTINGS).add(replace(pair, pixel_aspect=4 / 3)) is Added.FIRST
+
+
+def _squeezed(phantom: Phantom, eye: int) -> RgbFrame:
+    """The first frame of an eye with 3 columns for 4."""
+    return np.asarray(cv2.resize(_eyes(phantom, 0)[eye], (WIDTH * 3 // 4, HEIGHT)), np.uint8)
+
+
+def test_a_view_between_frames_is_trusted_less_the_more_the_tissue_moves() -> None:
+    at_rest, moving = (_following(_phantom(motion), 8).segments[0] for motion in ("still", "pull"))
+    assert 0 <= at_rest.motion_error < moving.motion_error
+    for scene in (at_rest, moving):
+        at_frame, between = (np.median(render_frame(scene, place / 4).confidence) for place in (1, 1.5))
+        assert between < at_frame

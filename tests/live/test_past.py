@@ -142,6 +142,17 @@ def test_old_and_too_many_segments_are_deleted(tmp_path: Path) -> None:
     none.close()
 
 
+def test_a_past_in_memory_is_bounded_by_bytes() -> None:
+    size = scene(0.0).byte_count
+    past = Past(PastSpec(keep_s=1000.0, max_bytes=3 * size))
+    for number in range(10):
+        past.add(scene(0.6 * number))
+        past.prune()
+    assert [each.number for each in past.segments()] == [7, 8, 9]
+    assert past.kept_bytes == 0
+    assert len(past._scenes) == 3
+
+
 def test_a_damaged_segment_is_left_out_and_the_nearest_one_is_shown(tmp_path: Path) -> None:
     past = Past(PastSpec(tmp_path, keep_s=1000.0))
     for begins_s in (0.0, 5.0, 10.0):

@@ -206,7 +206,7 @@ def test_what_is_pushed_is_followed_and_a_new_push_takes_the_place_of_the_one_be
         assert last.error is None
 
         ends_s = hosted.known_s(record.feed_id)
-        for index, content in enumerate(sender.pictures()):
+        for index, content in enumerate(sender.jpegs()):
             assert index < 600, hosted.report(record.feed_id)
             half = len(content) // 2
             for piece in (content[:half], content[half:]):
