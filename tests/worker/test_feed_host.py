@@ -12,15 +12,12 @@ from pathlib import Path
 import pytest
 
 from contract.queue.feeds import FeedClaim
-from contract.runtime.settings import Settings
 from contract.wire.feeds import FeedWish
-from intrasplat.errors import InputError, UnavailableError
-from intrasplat.live.spec import AllowedHosts
+from intrasplat.errors import UnavailableError
 from intrasplat.live.state import FeedReason, FeedState
 from tests.worker.feeds import FEED_STANDIN, Hosted, eventually, feed_record
 from worker import feed_child
 from worker.feeds import endpoints_of, following
-from worker.hosted_feed import hosts_of
 
 Start = Callable[..., Hosted]
 
@@ -202,13 +199,3 @@ def test_a_worker_that_ends_lets_its_feeds_be_claimed_at_once(tmp_path: Path) ->
 def test_processes_answer_at_ports_after_that_of_the_worker(tmp_path: Path) -> None:
     assert endpoints_of("w", tmp_path, "tcp://10.0.0.1:5570")[:2] == ("tcp://10.0.0.1:5571", "tcp://10.0.0.1:5572")
     assert endpoints_of("w", tmp_path, "tcp://10.0.0.1:65535") == ()
-
-
-@pytest.mark.parametrize("source", ["/dev/video1", "file:///etc/passwd", "/dev/video0/../video1", "v4l2:///dev/video1"])
-def test_only_listed_files_and_devices_are_read(source: str) -> None:
-    settings = Settings(feed_devices=("/dev/video0", "/clips/a.mp4"), feed_hosts=("rtsp://camera",), feed_private="yes")
-    with pytest.raises(InputError, match="not listed"):
-        hosts_of(source, settings)
-    for listed in ("/dev/video0", "v4l2:///dev/video0", "/clips/a.mp4"):
-        assert hosts_of(listed, settings) is None
-    assert hosts_of("tcp://elsewhere:1", settings) == AllowedHosts(("rtsp://camera",), private=True)
