@@ -22,7 +22,7 @@ from contract.wire.feeds import FeedOptions, FeedReceipt, FeedRecord, FeedView, 
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.encoding import decoded_text
 from intrasplat.intake.sniff import check_file
-from intrasplat.live.state import FeedState
+from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.options import FIELD_PREFIX, parse_options
 from service.access import Caller
 from service.bodies import FEED_BODY
@@ -90,14 +90,14 @@ async def watch_feed(feed_id: str, services: Services, caller: AnyCaller) -> Res
 async def pause_feed(feed_id: str, response: Response, services: Services, caller: AnyCaller) -> FeedView:
     """Stop reading, recording and learning now. 200: it has stopped. Its past stays."""
     await _wish(services, caller, feed_id, FeedWish.PAUSE, AuditAction.FEED_PAUSED)
-    return await _when(services, response, feed_id, caller, lambda feed: _is(feed, FeedState.PAUSED))
+    return await _when(services, response, feed_id, caller, lambda feed: feed.state is FeedState.PAUSED)
 
 
 @router.post("/{feed_id}/resume", operation_id="resume_feed", responses=NOT_YET)
 async def resume_feed(feed_id: str, response: Response, services: Services, caller: AnyCaller) -> FeedView:
     """Go on after a pause. 200: the source is read again."""
     await _wish(services, caller, feed_id, FeedWish.RUN, AuditAction.FEED_RESUMED)
-    return await _when(services, response, feed_id, caller, lambda feed: not _is(feed, FeedState.PAUSED))
+    return await _when(services, response, feed_id, caller, _is_read)
 
 
 @router.delete(
@@ -214,8 +214,9 @@ async def _when(
         await asyncio.sleep(LOOK_PERIOD_S)
 
 
-def _is(feed: FeedView, state: FeedState) -> bool:
-    return feed.state is state
+def _is_read(feed: FeedView) -> bool:
+    """Whether a worker follows the feed and has not paused it."""
+    return feed.state is not FeedState.PAUSED and feed.reason is not FeedReason.NO_WORKER
 
 
 def _view(record: FeedRecord) -> FeedView:

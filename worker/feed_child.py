@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import queue
 import subprocess
 import threading
 import time
@@ -42,14 +43,21 @@ class FeedProcess:
         self.ready: FeedReady | None = None
         self.report: FeedReport | None = None
         self.said_s = time.monotonic()
+        self._orders: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         threading.Thread(target=self._read, name="feed-reports", daemon=True).start()
+        threading.Thread(target=self._write, name="feed-orders", daemon=True).start()
 
     def send(self, order: Message) -> None:
-        """Give an order; nothing happens if the process is dead."""
+        """Give an order and do not wait until the process reads it; nothing happens if the process is dead."""
+        self._orders.put(order)
+
+    def _write(self) -> None:
+        """Write the orders: a first one that is larger than the pipe waits until the process has started."""
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError, ValueError):
-            self.process.stdin.write(line_of(order))
-            self.process.stdin.flush()
+            while (order := self._orders.get()) is not None:
+                self.process.stdin.write(line_of(order))
+                self.process.stdin.flush()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -64,6 +72,7 @@ class FeedProcess:
                     self.ready = message
                 else:
                     self.report = message.report
+        self._orders.put(None)
 
 
 class FeedChild:
@@ -93,8 +102,7 @@ class FeedChild:
         )
         self._running: FeedProcess | None = None
         self._last = record.report or FeedReport(state=FeedState.CONNECTING, since_s=time.time())
-        self._last_s = time.monotonic()
-        self._gap: FeedReport | None = None
+        self._gap = self._without_process(FeedState.CONNECTING, None, "the process that follows it starts")
 
     def look(self) -> None:
         """Start a process unless one runs, and kill it if it hangs. Call it often."""
@@ -111,18 +119,16 @@ class FeedChild:
             record = self._record.model_copy(update={"wish": self.wish})
             self._running.send(FollowFeed(record=record, folder=self._folder, endpoints=self._endpoints))
         if self._running.report is not None:
-            self._last, self._last_s = self._running.report, time.monotonic()
+            self._last = self._running.report
         if (cause := self._hang()) is not None:
             logger.warning("the process of a feed %s and is killed", cause, extra=self._about)
             self._supervised.kill()
 
     def report(self) -> FeedReport:
-        """What the feed does; between two processes it is stalled."""
+        """What the feed does. Until its first process reports it is connecting; between two processes it is stalled."""
         running = self._running
         if running is not None and running.report is not None:
             return running.report
-        if self._gap is None:
-            return self._last
         return self._gap.model_copy(update={"model_age_s": self._age_s()})
 
     def order(self, wish: FeedWish) -> None:
@@ -166,17 +172,15 @@ class FeedChild:
 
     def _note_end(self) -> None:
         if self._running is not None and self._running.report is not None:
-            self._last, self._last_s = self._running.report, time.monotonic()
+            self._last = self._running.report
         self._running = None
-        changes = {
-            "state": FeedState.STALLED,
-            "reason": FeedReason.FAULT,
-            "text": "the process that followed it has ended; another starts",
-            "since_s": time.time(),
-            "received_fps": 0.0,
-            "used_fps": 0.0,
-        }
-        self._gap = self._last.model_copy(update=changes)
+        text = "the process that followed it has ended; another starts"
+        self._gap = self._without_process(FeedState.STALLED, FeedReason.FAULT, text)
+
+    def _without_process(self, state: FeedState, reason: FeedReason | None, text: str) -> FeedReport:
+        """The last report, changed to that of a feed without a process from now on."""
+        changes = {"state": state, "reason": reason, "text": text, "since_s": time.time()}
+        return self._last.model_copy(update={**changes, "received_fps": 0.0, "used_fps": 0.0})
 
     def _age_s(self) -> float | None:
         known = self._last.ends_s

@@ -6,12 +6,13 @@ import threading
 import time
 from pathlib import Path
 
+from contract.runtime.feed_sources import allowed_hosts
 from contract.runtime.settings import Settings
 from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.text import parse_text, read_calibration
 from intrasplat.live.feed import Feed, FeedSettings
-from intrasplat.live.spec import FIELD, AllowedHosts, RecordingSpec, SourceKind, SourceSpec, parsed
+from intrasplat.live.spec import FIELD, RecordingSpec, SourceSpec
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.live.state import FeedReport as LiveReport
 from intrasplat.splat.backend import CPU, Device
@@ -110,7 +111,7 @@ class HostedFeed:
             pictures=self._pictures,
             layout=options.layout,
             recording=RecordingSpec(self._folder / "recording", keep_s, max_bytes=half),
-            hosts=hosts_of(options.source, self._settings),
+            hosts=allowed_hosts(options.source, self._settings),
             limits=self._settings.clip_limits,
         )
         segments = self._folder / "segments"
@@ -127,22 +128,6 @@ def check_calibration_of(record: FeedRecord) -> None:
         problem = f"{record.calibration_name[:80]} is XML."
         raise InputError("calibration", problem, "Send it as JSON, YAML or ini.")
     read_calibration(record.calibration)
-
-
-def hosts_of(source: str | None, settings: Settings) -> AllowedHosts | None:
-    """The hosts that a source may be on; None for a file or device that is listed.
-
-    Raises:
-        InputError: it is no source, or a file or device that is not listed.
-    """
-    if source is not None:
-        target = parsed(source)
-        if target.kind in (SourceKind.FILE, SourceKind.DEVICE):
-            if target.path not in settings.feed_devices:
-                problem = "this file or device of the worker's machine is not listed."
-                raise InputError(FIELD, problem, "Whoever runs the service lists it: INTRASPLAT_FEED_DEVICES.")
-            return None
-    return AllowedHosts(settings.feed_hosts, private=settings.feed_private == "yes")
 
 
 def _reason_of(refused: InputError) -> FeedReason:

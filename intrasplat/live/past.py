@@ -189,14 +189,3 @@ class Past:
                 return None
         shutil.rmtree(written.path or folder / written.name, ignore_errors=True)  # it was forgotten meanwhile
         return None
-
-
-def remove_segments(folder: Path) -> int:
-    """Delete all segments of a feed; their bytes."""
-    removed = 0
-    for path in folder.glob("*"):
-        removed += sum(each.lstat().st_size for each in path.rglob("*") if each.is_file())
-        shutil.rmtree(path)
-    with contextlib.suppress(FileNotFoundError):
-        folder.rmdir()
-    return removed

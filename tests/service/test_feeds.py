@@ -192,6 +192,14 @@ def test_a_pause_that_no_worker_has_done_says_so(
     assert service.http.get(f"/feeds/{feed_id}").json()["wish"] == "end"
 
 
+def test_a_feed_that_no_worker_follows_is_not_said_to_go_on(
+    service: ServiceUnderTest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.feeds.FOLLOWED_WITHIN_S", 0.05)
+    resumed = service.http.post(f"/feeds/{opened(service)}/resume")
+    assert (resumed.status_code, resumed.json()["reason"], resumed.json()["wish"]) == (202, "no_worker", "run")
+
+
 def test_an_ended_feed_leaves_nothing_and_a_receipt_says_so(service: ServiceUnderTest, worker: FeedWorker) -> None:
     feed_id = followed(service)
     wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")

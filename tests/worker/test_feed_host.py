@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from contract.queue.feeds import FeedClaim
-from contract.runtime.settings import Settings
-from contract.wire.feeds import FeedWish
-from intrasplat.errors import InputError, UnavailableError
-from intrasplat.live.spec import AllowedHosts
+from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
+from intrasplat.errors import UnavailableError
+from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
 from intrasplat.live.state import FeedReason, FeedState
 from tests.worker.feeds import FEED_STANDIN, Hosted, eventually, feed_record
 from worker import feed_child
+from worker.feed_child import FeedChild
 from worker.feeds import endpoints_of, following
-from worker.hosted_feed import hosts_of
 
 Start = Callable[..., Hosted]
 
@@ -204,11 +205,26 @@ def test_processes_answer_at_ports_after_that_of_the_worker(tmp_path: Path) -> N
     assert endpoints_of("w", tmp_path, "tcp://10.0.0.1:65535") == ()
 
 
-@pytest.mark.parametrize("source", ["/dev/video1", "file:///etc/passwd", "/dev/video0/../video1", "v4l2:///dev/video1"])
-def test_only_listed_files_and_devices_are_read(source: str) -> None:
-    settings = Settings(feed_devices=("/dev/video0", "/clips/a.mp4"), feed_hosts=("rtsp://camera",), feed_private="yes")
-    with pytest.raises(InputError, match="not listed"):
-        hosts_of(source, settings)
-    for listed in ("/dev/video0", "v4l2:///dev/video0", "/clips/a.mp4"):
-        assert hosts_of(listed, settings) is None
-    assert hosts_of("tcp://elsewhere:1", settings) == AllowedHosts(("rtsp://camera",), private=True)
+def child_of(hosted: Hosted, record: FeedRecord, command: Sequence[str]) -> FeedChild:
+    return FeedChild(record, hosted.files.make(record.feed_id), (), command, None)
+
+
+def test_a_feed_that_is_taken_over_is_not_reported_as_another_worker_left_it(tmp_path: Path) -> None:
+    left = FeedReport(state=FeedState.LIVE, since_s=1.0, received_fps=30.0, model_age_s=0.2, ends_s=time.time() - 100)
+    record = feed_record(None).model_copy(update={"report": left})
+    report = child_of(Hosted(tmp_path), record, FEED_STANDIN).report()
+    assert (report.state, report.reason, report.received_fps) == (FeedState.CONNECTING, None, 0.0)
+    assert report.since_s == pytest.approx(time.time(), abs=10)
+    assert report.model_age_s == pytest.approx(100, abs=10)
+
+
+def test_a_process_that_reads_no_orders_yet_does_not_hold_up_the_others(tmp_path: Path) -> None:
+    record = feed_record(None).model_copy(update={"calibration": " " * MAX_CALIBRATION_BYTES})
+    child = child_of(Hosted(tmp_path), record, (sys.executable, "-c", "import time; time.sleep(60)"))
+    looking = threading.Thread(target=child.look, daemon=True)
+    looking.start()
+    looking.join(10)
+    try:
+        assert not looking.is_alive()
+    finally:
+        child.kill()

@@ -42,7 +42,15 @@ def test_a_push_connects_to_nothing() -> None:
             "http://camera.example.org/",
             "udp://0.0.0.0:1",
         ),
-        *("/srv/other.mp4", "/srv/../srv/x/demo.mp4", "v4l2:///dev/video1", "ftp://camera.example.org/", "tcp://x"),
+        *(
+            "/srv/other.mp4",
+            "file:///etc/passwd",
+            "/srv/../srv/x/demo.mp4",
+            "/srv/x/../demo.mp4",
+            "v4l2:///dev/video1",
+            "ftp://camera.example.org/",
+            "tcp://x",
+        ),
     ],
 )
 def test_all_else_is_refused(source: str) -> None:
