@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import math
-import random
 import threading
 import time
 from collections import deque
@@ -99,7 +98,7 @@ class Source:
             received, newest = self._received + self._numbers.received, self._numbers
             waiting = int(max(self._sequence, newest.sequence) > self._last_given[0])
             self._note_rates()
-            first, last = (self._window[0], self._window[-1]) if self._window else ((0.0, 0, 0), (0.0, 0, 0))
+            first, last = self._window[0], self._window[-1]
             seconds = max(last[0] - first[0], 1e-9)
             return FeedNumbers(
                 received_fps=(last[1] - first[1]) / seconds,
@@ -245,7 +244,7 @@ class Source:
             self._set(FeedState.STALLED, reason, text)
             failures = 0 if self._sequence > before else failures + 1
             if self._push is None:
-                self._wait(lambda: self._paused, self._back_off_s(failures))
+                self._wait(lambda: self._paused, self._spec.back_off.pause_s(failures))
         self._set(FeedState.ENDED, FeedReason.BY_HAND, "closed by hand")
 
     def _is_interrupted(self) -> bool:
@@ -260,11 +259,6 @@ class Source:
     def _is_deaf(self) -> bool:
         """Whether what is pushed is discarded."""
         return self._paused or self._closed or self._status.state is FeedState.ENDED
-
-    def _back_off_s(self, failures: int) -> float:
-        back_off = self._spec.back_off
-        longest_s = min(back_off.most_s, back_off.first_s * 2.0 ** min(failures, 30))
-        return longest_s * random.uniform(0.5, 1.0)
 
     def _wait(self, enough: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until `enough()`, the end or the time; meanwhile old parts go. Whether `enough()`."""
@@ -377,11 +371,8 @@ class Source:
             text = "the pictures have another size, or hold the eyes otherwise, than the feed's first ones"
             self._set(FeedState.STALLED, numbers.problem, text, numbers.recording)
         elif pair_age_s > silent_s and (had_pairs or packet_age_s > silent_s):
-            is_silent = packet_age_s > silent_s
-            reason = FeedReason.SILENT if is_silent else FeedReason.UNDECODABLE
-            self._set(
-                FeedState.STALLED, reason, "the source is silent" if is_silent else "no picture", numbers.recording
-            )
+            silent, undecodable = (FeedReason.SILENT, "the source is silent"), (FeedReason.UNDECODABLE, "no picture")
+            self._set(FeedState.STALLED, *(silent if packet_age_s > silent_s else undecodable), numbers.recording)
         elif had_pairs:
             is_behind = numbers.is_slow or numbers.lag_s > BEHIND_S
             reason_behind = FeedReason.TOO_SLOW if is_behind else None

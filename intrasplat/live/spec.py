@@ -3,6 +3,7 @@ allowed."""
 
 from __future__ import annotations
 
+import random
 import re
 import struct
 from dataclasses import dataclass, field
@@ -127,6 +128,11 @@ class BackOff:
 
     first_s: float = 0.5
     most_s: float = 4.0
+
+    def pause_s(self, failures: int) -> float:
+        """Seconds after so many failures in a row, counted from 0."""
+        longest_s = min(self.most_s, self.first_s * 2.0 ** min(failures, 30))
+        return longest_s * random.uniform(0.5, 1.0)
 
 
 @dataclass(frozen=True)
