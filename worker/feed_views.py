@@ -8,12 +8,11 @@ from collections import OrderedDict
 
 from contract.wire.cameras import CamerasRequest
 from contract.wire.feeds import FeedShown
-from contract.wire.feeds import FeedTime as AskedTime
 from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest, SceneRequest
 from intrasplat.errors import SceneError
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.live.looking import FeedView
-from intrasplat.live.times import LIVE, FeedTime
+from intrasplat.live.times import LIVE
 from intrasplat.live.window import RIGHT_EYE
 from intrasplat.machine.parts import Parts, whole
 from intrasplat.picture import MEDIA_TYPES, ImageFormat, RecordedMasks
@@ -79,7 +78,7 @@ class FeedViews:
             if request.export_id not in self._exported:
                 raise SceneError(f"The export of feed {request.scene_id} has ended.")
             return self._exported[request.export_id]
-        view = self._hosted.feed.view_of(_looked_at(request.moment))
+        view = self._hosted.feed.view_of(request.moment or LIVE)
         if view is None:
             raise NotYetError("The feed shows nothing yet.")
         if isinstance(request, ExportRequest):
@@ -126,17 +125,6 @@ class FeedViews:
             age_s=max(0.0, time.time() - view.captured_at),
             is_newest=view.is_live,
         )
-
-
-def _looked_at(moment: AskedTime | None) -> FeedTime:
-    if moment is None or moment.is_live:
-        return LIVE
-    if moment.before_live_s is not None:
-        return FeedTime.before_live(moment.before_live_s)
-    if moment.source_s is not None:
-        return FeedTime.of_source(moment.source_s)
-    assert moment.at_s is not None
-    return FeedTime.at(moment.at_s)
 
 
 def _right_eye(scene: TrainedScene) -> RightEye | None:

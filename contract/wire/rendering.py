@@ -15,8 +15,9 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
-from contract.wire.feeds import CutRange, FeedShown, FeedTime
+from contract.wire.feeds import CutRange, FeedShown
 from intrasplat.formats import ExportOptions
+from intrasplat.live.times import FeedTime
 from intrasplat.measuring import MAX_POINTS, Point
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
 from intrasplat.notices import Notice

@@ -14,9 +14,10 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import DEFAULT_SCOPES, KeyScope
-from contract.wire.feeds import FeedTime, FeedWish
+from contract.wire.feeds import FeedWish
 from contract.wire.rendering import CutRequest, ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
 from intrasplat.live.state import FeedState
+from intrasplat.live.times import LIVE, FeedTime
 from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
@@ -229,11 +230,11 @@ def test_files_that_are_left_are_not_denied(service: ServiceUnderTest) -> None:
 @pytest.mark.parametrize(
     ("t", "moment", "shown_s"),
     [
-        (None, FeedTime(before_live_s=0), 60),
-        ("live", FeedTime(before_live_s=0), 60),
-        ("-12.5", FeedTime(before_live_s=12.5), 47.5),
-        ("31.4", FeedTime(source_s=31.4), 31.4),
-        ("2023-11-14T22:13:30Z", FeedTime(at_s=BEGAN_S + 10), 10),
+        (None, LIVE, 60),
+        ("live", LIVE, 60),
+        ("-12.5", FeedTime.before_live(12.5), 47.5),
+        ("31.4", FeedTime.of_source(31.4), 31.4),
+        ("2023-11-14T22:13:30Z", FeedTime.at(BEGAN_S + 10), 10),
     ],
 )
 def test_a_render_shows_a_moment_and_how_fresh_it_is(
@@ -263,7 +264,7 @@ def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
         response = service.http.get(f"/scenes/{feed_id}/{path}", params=query)
         assert response.status_code == 200, response.text
     assert [type(each) for each in worker.asked] == [RecordedRequest, MeasureRequest, ExportRequest]
-    assert {each.moment.before_live_s for each in worker.asked} == {1}
+    assert {each.moment for each in worker.asked} == {FeedTime.before_live(1.0)}
     assert service.http.get("/render", params={"scene": scene, "t": "0.5"}).content == b"png"
     assert len(worker.asked) == 3
     assert len(service.painter.requests) == 1
