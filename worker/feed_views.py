@@ -11,7 +11,7 @@ from contract.wire.feeds import FeedShown
 from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest, SceneRequest
 from intrasplat.errors import SceneError
 from intrasplat.formats import EXPORT_FORMATS
-from intrasplat.live.looking import FeedView
+from intrasplat.live.looking import FeedMoment
 from intrasplat.live.times import LIVE
 from intrasplat.live.window import RIGHT_EYE
 from intrasplat.machine.parts import Parts, whole
@@ -37,7 +37,7 @@ class FeedViews:
         self._shown: TrainedScene | None = None  # the scene that was shown last
         self._replies = ReplyCache()  # of that scene
         self._exports = OpenExports()
-        self._exported: OrderedDict[str, FeedView] = OrderedDict()
+        self._exported: OrderedDict[str, FeedMoment] = OrderedDict()
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
         """As answer_in_parts, in one call."""
@@ -72,7 +72,7 @@ class FeedViews:
         """End exports that their callers abandoned. Call it regularly."""
         self._exports.forget()
 
-    def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedView:
+    def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedMoment:
         """The moment that a request is for; that of an export stays that of its first part."""
         if isinstance(request, ExportRequest) and request.part > 0:
             if request.export_id not in self._exported:
@@ -91,7 +91,7 @@ class FeedViews:
         """Whether the newest moment is later than the one that the caller has."""
         return request.newer_than_s is None or self._hosted.newest_s > request.newer_than_s
 
-    def _rendered(self, view: FeedView, request: RenderRequest, level: int) -> Parts[Reply]:
+    def _rendered(self, view: FeedMoment, request: RenderRequest, level: int) -> Parts[Reply]:
         if request.newer_than_s is not None and view.source_s <= request.newer_than_s:
             return Reply(b"", MEDIA_TYPE_OF_BYTES, view.t, is_untimed=True)
         if view.scene is not self._shown:
@@ -104,7 +104,7 @@ class FeedViews:
             replies.keep(wanted, reply)
         return reply
 
-    def _other(self, view: FeedView, request: ExportRequest | RecordedRequest | MeasureRequest) -> Reply:
+    def _other(self, view: FeedMoment, request: ExportRequest | RecordedRequest | MeasureRequest) -> Reply:
         if isinstance(request, RecordedRequest):
             index, picture = pictured_frame(view.scene, view.t, request.eye, request.masks)
             media_type = MEDIA_TYPES[ImageFormat.PNG if request.masks is RecordedMasks.ONLY else ImageFormat.JPEG]
@@ -117,7 +117,7 @@ class FeedViews:
             request = request.model_copy(update={"options": options})
         return export_reply(self._exports, view.scene, request, self._device)
 
-    def _of(self, view: FeedView) -> FeedShown:
+    def _of(self, view: FeedMoment) -> FeedShown:
         return FeedShown(
             state=self._hosted.state,
             source_s=view.source_s,

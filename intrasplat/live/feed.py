@@ -12,7 +12,7 @@ from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
-from intrasplat.live.looking import FeedView, find_view, range_of
+from intrasplat.live.looking import FeedMoment, find_view, range_of
 from intrasplat.live.model import FeedModel
 from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
@@ -137,7 +137,7 @@ class Feed:
             segment=self._source.segment,
         )
 
-    def view_of(self, when: FeedTime = LIVE) -> FeedView | None:
+    def view_of(self, when: FeedTime = LIVE) -> FeedMoment | None:
         """The moment of a time, to be rendered; None: nothing is known yet.
 
         Raises:

@@ -15,7 +15,7 @@ from intrasplat.intake.calibration.text import checked_calibration
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.feed import Feed, FeedSettings
-from intrasplat.live.looking import FeedView
+from intrasplat.live.looking import FeedMoment
 from intrasplat.live.spec import FeedLayout, RecordingSpec, SourceSpec
 from intrasplat.live.state import FeedReport
 from intrasplat.live.times import FeedTime
@@ -55,7 +55,7 @@ class LiveScene:
         """Wait until there is something to show. False: not in time; report() says why."""
         return self.feed.wait_for_newer(float("-inf"), timeout_s) is not None
 
-    def moment(self, t: str | float = "live") -> FeedView:
+    def moment(self, t: str | float = "live") -> FeedMoment:
         """The moment of a time, with its age and source time; raises as view()."""
         found = self.feed.view_of(FeedTime.parse(t))
         if found is None:
