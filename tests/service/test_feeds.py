@@ -111,7 +111,10 @@ def test_options_that_cannot_be_used_are_refused(service: ServiceUnderTest, opti
 
 @pytest.mark.parametrize(
     "calibration",
-    [("a.json", b"{}"), ("a.json", b"not json"), ("a.yaml", b"<!DOCTYPE x>"), ("a.exe", b"{}"), ("a.json", b"\0\1\2")],
+    [
+        *(("a.json", b"{}"), ("a.json", b"not json"), ("a.json", b"\0\1\2"), ("a.yaml", b"<!DOCTYPE x>")),
+        *(("a.exe", b"{}"), ("a.xml", RECTIFIED.encode())),
+    ],
 )
 def test_a_calibration_that_is_none_is_refused(service: ServiceUnderTest, calibration: tuple[str, bytes]) -> None:
     assert_problem(posted(service, calibration=calibration), 422, "calibration")
