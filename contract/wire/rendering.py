@@ -33,6 +33,8 @@ from intrasplat.picture import (
 from intrasplat.pose import MatrixPose, OrbitPose
 
 MAX_PUSH_BYTES = 48 * 1024
+PUSH_REPLACED = "push"
+"""The field of the error to a PushRequest whose push has ended, or in whose place another one came."""
 GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
 
