@@ -49,7 +49,7 @@ class FeedViews:
         Raises:
             SceneError: it is a request for another feed or scene, or for what a feed does not have.
             NotYetError: there is nothing to show now.
-            InputError: the moment lies before the past that is kept, or as Views.answer_in_parts.
+            InputError: the moment lies before the past that is stored, or as Views.answer_in_parts.
         """
         if request.scene_id != self._hosted.feed_id or isinstance(request, CamerasRequest):
             raise SceneError("This process follows a feed, and answers renders, exports and measurements of it alone.")

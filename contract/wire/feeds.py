@@ -103,7 +103,7 @@ class FeedRecord(BaseModel):
     calibration: str = Field(repr=False)
     """The text of the caller's file."""
     calibration_name: str
-    """calibration with the ending that names its format."""
+    """`calibration`, and the ending that names its format, such as calibration.json."""
     created_at_s: float
     wish: FeedWish = FeedWish.RUN
     owner: str | None = None
@@ -155,13 +155,13 @@ class FeedView(FeedReport):
 
 
 class FeedReceipt(BaseModel):
-    """What became of a feed that was to end."""
+    """What is left of a feed that was ended."""
 
     feed_id: str
     ended_at: str = Field(description="ISO 8601, UTC: when it was asked for")
     bytes: int = Field(description="bytes that the feed had on disk, as its worker last reported them")
     record: bool = Field(description="the queue has no record of it any more, so its worker has deleted all files")
-    verified: bool = Field(description="it was looked whether the data directory has files of it, and it has none")
+    verified: bool = Field(description="the data directory was searched for files of the feed, and has none")
 
 
 class CutRange(BaseModel):

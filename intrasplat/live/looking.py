@@ -61,7 +61,7 @@ def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_
     """The view of a time; None: nothing is known yet.
 
     Raises:
-        InputError: the time lies before all that is kept.
+        InputError: the time lies before the past that is stored.
     """
     newest = None if window is None else KeptSegment.of(WINDOW, window)
     while spans := _spans(newest, past):
@@ -122,7 +122,7 @@ def _side(shown: float, wanted: float) -> str:
 
 def _too_early(asked: FeedTime, spans: list[KeptSegment]) -> InputError:
     first, last = spans[0], spans[-1]
-    problem = "it lies before the past that is kept."
+    problem = "it lies before the past that is stored."
     if asked.kind is FeedTimeKind.UNIX:
         remedy = f"Ask for a time after {_utc(first.arrived_at[0])}."
     elif asked.kind is FeedTimeKind.BEFORE_LIVE:
