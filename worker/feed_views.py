@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections import OrderedDict
 
 from contract.wire.cameras import CamerasRequest
 from contract.wire.feeds import FeedShown
@@ -22,7 +21,7 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.encode import FOR_EYES
 from intrasplat.view.recorded import pictured_frame
 from worker.answer_cache import ReplyCache
-from worker.exports import MAX_OPEN, OpenExports
+from worker.exports import OpenExports
 from worker.hosted_feed import HostedFeed
 from worker.rendered import MEDIA_TYPE_OF_BYTES, cost_of, export_reply, measured_reply, rendered, typical_cost
 from worker.reply import NotYetError, Reply
@@ -37,7 +36,7 @@ class FeedViews:
         self._shown: TrainedScene | None = None  # the scene that was shown last
         self._replies = ReplyCache()  # of that scene
         self._exports = OpenExports()
-        self._exported: OrderedDict[str, FeedMoment] = OrderedDict()
+        self._exported: dict[str, FeedMoment] = {}  # the moments of the exports in progress
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
         """As answer_in_parts, in one call."""
@@ -71,6 +70,7 @@ class FeedViews:
     def forget_idle(self) -> None:
         """End exports that their callers abandoned. Call it regularly."""
         self._exports.forget()
+        self._drop_ended()
 
     def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedMoment:
         """The moment that a request is for; that of an export stays that of its first part."""
@@ -83,8 +83,6 @@ class FeedViews:
             raise NotYetError("The feed shows nothing yet.")
         if isinstance(request, ExportRequest):
             self._exported[request.export_id] = view
-            while len(self._exported) > MAX_OPEN:
-                self._exported.popitem(last=False)
         return view
 
     def _is_newer(self, request: RenderRequest) -> bool:
@@ -115,7 +113,14 @@ class FeedViews:
         if known is not None and "t" in known.options and request.options.t is None and request.options.view is None:
             options = request.options.model_copy(update={"t": view.t})
             request = request.model_copy(update={"options": options})
-        return export_reply(self._exports, view.scene, request, self._device)
+        try:
+            return export_reply(self._exports, view.scene, request, self._device)
+        finally:
+            self._drop_ended()
+
+    def _drop_ended(self) -> None:
+        """Drop the moments of exports that have ended, with their scenes."""
+        self._exported = {name: view for name, view in self._exported.items() if self._exports.is_open(name)}
 
     def _of(self, view: FeedMoment) -> FeedShown:
         return FeedShown(
