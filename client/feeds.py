@@ -26,12 +26,12 @@ def add_feeds(commands: Commands) -> None:
     opened.add_argument(
         "source", metavar="SOURCE", nargs="?", help="rtsp://, tcp://, udp://, http://, a file, a device; none: a push"
     )
-    opened.add_argument("--calibration", type=Path, required=True, metavar="F", help="JSON, OpenCV YAML or XML, or ini")
+    opened.add_argument("--calibration", type=Path, required=True, metavar="F", help="JSON, OpenCV YAML or ini")
     opened.add_argument("--layout", choices=("auto", "sbs", "tb", "two"), help="how two eyes arrive (default: auto)")
     opened.add_argument("--label", metavar="TEXT", help=f"a text to find the feed by. {NO_NAMES}")
     opened.add_argument("--keep-s", type=positive, metavar="S", help="seconds of the past that can be viewed and cut")
     opened.add_argument("--width", type=count, metavar="PX", help="of the pictures that the model learns")
-    opened.add_argument("--camera", choices=("fixed", "moving"), help="moving: tell its motion from the tissue's")
+    opened.add_argument("--camera", choices=("fixed", "moving"), help="moving: separate its motion from the tissue's")
     listed = add_command(own, "list", "list the open feeds, newest first", _list)
     pause = add_command(own, "pause", "stop reading and recording now", _pause)
     resume = add_command(own, "resume", "go on after a pause", _resume)

@@ -23,6 +23,7 @@ from contract.wire.feeds import CutJob, CutRange, FeedRecord, GivenCut
 from contract.wire.labels import parse_labels
 from contract.wire.rendering import CutRequest
 from intrasplat.errors import InputError, LimitError, UnavailableError
+from intrasplat.live.times import LIVE, FeedTimeKind
 from intrasplat.options import JobOptions, parse_options
 from service.bodies import CUT_BODY
 from service.deps import AnyCaller, Deps, Services, owned_feed
@@ -118,22 +119,21 @@ def _at_s(field: str, asked: float | str, feed: FeedRecord) -> float:
         moment = moment_of(asked)
     except InputError as error:
         raise InputError(field, error.problem, error.remedy) from None
-    if moment.at_s is not None:
-        return moment.at_s
+    if moment.kind is FeedTimeKind.UNIX:
+        return moment.seconds
     report = feed.report
     newest_s = None if report is None else report.last_frame_at_s or report.ends_s
     if report is None or newest_s is None:
         remedy = f"Wait until it is live: GET /feeds/{feed.feed_id}/events."
         raise Problem(409, "The feed has recorded nothing yet.", field="feed_id", remedy=remedy)
-    if moment.is_live:
+    if moment == LIVE:
         return max(newest_s, min(time.time(), newest_s + REPORTED_WITHIN_S))
-    if moment.before_live_s is not None:
-        return newest_s - moment.before_live_s
-    assert moment.source_s is not None
+    if moment.kind is FeedTimeKind.BEFORE_LIVE:
+        return newest_s - moment.seconds
     if report.ends_s is None or report.source_ends_s is None:
         remedy = "Give seconds before live, or a time of RFC 3339."
         raise Problem(409, "The feed has no model yet that knows its seconds.", field=field, remedy=remedy)
-    return report.ends_s - (report.source_ends_s - moment.source_s)
+    return report.ends_s - (report.source_ends_s - moment.seconds)
 
 
 async def _fetch(services: Deps, request: CutRequest, folder: Path, received: Received) -> CutRange:

@@ -37,7 +37,7 @@ from service.sockets import FAULT, GONE, MALFORMED, NOT_ALLOWED, NOT_TEXT, Entra
 router = APIRouter(prefix="/feeds", tags=["feeds"])
 
 KEY_PERIOD_S = 2.0
-"""How often it is looked whether the key of whoever pushes is still valid."""
+"""How often the key of a push is checked again."""
 MAX_PICTURE_BYTES = 8 * 2**20
 FRAMING_REMEDY = "Send for each picture its time (float64), its length (uint32), both little-endian, and its bytes."
 

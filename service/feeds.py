@@ -166,7 +166,7 @@ def _options(services: Deps, text: str) -> FeedOptions:
         return options
     if "keep_s" not in options.model_fields_set:
         return options.model_copy(update={"keep_s": most_s})
-    problem = f"{options.keep_s:g} is longer than the {most_s:g} seconds that a feed's past is kept here."
+    problem = f"{options.keep_s:g} is longer than the {most_s:g} seconds that a feed's past is stored here."
     raise InputError(f"{FIELD_PREFIX}.keep_s", problem, f"Ask for {most_s:g} or less, or leave it out.")
 
 

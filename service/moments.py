@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from contract.wire.feeds import LIVE, T_REMEDY, FeedTime, feed_time
 from intrasplat.errors import InputError
+from intrasplat.live.times import LIVE, REMEDY, FeedTime
 
 MAX_T = 1e6
 SCENE_T_REMEDY = f"Give a number in [0, {MAX_T:g}]: 0 is the first frame, 1 the end of the clip."
@@ -22,11 +22,9 @@ def _checked(asked: float | str | None) -> float | str | None:
     """Refuse a text that is a time of neither. Raises InputError, so that the answer has its remedy."""
     if isinstance(asked, str):
         try:
-            feed_time(asked)
+            FeedTime.parse(asked)
         except InputError:
-            raise InputError(
-                "t", f"{asked[:40]!r} is no time.", f"{SCENE_T_REMEDY} Of a live feed: {T_REMEDY}"
-            ) from None
+            raise InputError("t", f"{asked[:40]!r} is no time.", f"{SCENE_T_REMEDY} Of a live feed: {REMEDY}") from None
     return asked
 
 
@@ -56,9 +54,7 @@ def moment_of(asked: float | str | None) -> FeedTime:
     Raises:
         InputError: it names no moment.
     """
-    if asked is None:
-        return feed_time(LIVE)
-    return feed_time(asked if isinstance(asked, str) else f"{asked:.9f}")
+    return LIVE if asked is None else FeedTime.parse(asked)
 
 
 def moment_text(at_s: float) -> str:

@@ -10,7 +10,7 @@ from types import TracebackType
 
 from starlette.concurrency import run_in_threadpool
 
-from contract.wire.rendering import MAX_PUSH_BYTES, PushRequest, ReplyError
+from contract.wire.rendering import MAX_PUSH_BYTES, PUSH_REPLACED, PushRequest, ReplyError
 from intrasplat.errors import UnavailableError
 from service.deps import Deps
 from service.problems import Problem
@@ -22,8 +22,6 @@ RETRY_S = 0.2
 END_TIMEOUT_S = 2.0
 MPEG_TS = 0x47
 """The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
-REPLACED = "push"
-"""The field of the worker's error to a push in whose place another one came."""
 
 
 class Push:
@@ -43,7 +41,7 @@ class Push:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._services.metrics.pushes.dec()
-        if isinstance(error, Problem) and error.field == REPLACED:
+        if isinstance(error, Problem) and error.field == PUSH_REPLACED:
             return
         last = self._request.model_copy(update={"is_last": True})
         with contextlib.suppress(UnavailableError, TimeoutError):  # a feed without a process has nothing to end
@@ -97,6 +95,8 @@ class Push:
 
 
 def _problem_of(error: ReplyError) -> Problem:
-    if error.kind == "input" and error.field == REPLACED:
-        return Problem(409, error.problem, field=REPLACED, remedy=error.remedy or "Push over one connection at a time.")
+    if error.kind == "input" and error.field == PUSH_REPLACED:
+        return Problem(
+            409, error.problem, field=PUSH_REPLACED, remedy=error.remedy or "Push over one connection at a time."
+        )
     return problem_of_reply(error)

@@ -32,6 +32,7 @@ from contract.runtime import traces
 from contract.wire.job import JobState
 from contract.wire.rendering import PictureCamera
 from intrasplat.live.state import FeedState
+from intrasplat.live.times import LIVE
 from intrasplat.notices import Notice
 from service.access import AccessRefusal
 from service.connection import Answer
@@ -176,7 +177,7 @@ class _Viewer:
         with traces.span("view of /stream", traces.NEW, kind=SpanKind.SERVER):
             shown = await find_shown(self._services, caller, message.scene, with_feeds=True)
             request = request_of(message, shown, self._services.settings)
-            if message.follow and not (request.moment is not None and request.moment.is_live):
+            if message.follow and request.moment != LIVE:
                 raise Problem(422, "Only t=live of a feed can be followed.", field="follow", remedy="Leave it out.")
             if newer_than_s is not None:
                 request = request.model_copy(update={"newer_than_s": newer_than_s})

@@ -86,7 +86,7 @@ SCENE_FORM = Form(
 
 CALIBRATION_PART = "calibration"
 FEED_FORM = Form(
-    {CALIBRATION_PART: SUFFIXES[CALIBRATION_PART]},
+    {CALIBRATION_PART: tuple(each for each in SUFFIXES[CALIBRATION_PART] if each != ".xml")},
     (OPTIONS,),
     "Send multipart/form-data with calibration, and options, JSON such as "
     '{"source": "rtsp://camera.example.org/1", "keep_s": 300}.',

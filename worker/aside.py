@@ -16,7 +16,7 @@ from intrasplat.errors import SceneError, UnavailableError
 from worker.reply import Reply
 
 MAX_WAITING = 32
-"""Requests of a kind that wait at most; MAX_PUSH_BYTES each."""
+"""Most requests of a kind that wait. A push has at most MAX_PUSH_BYTES."""
 
 Answer = Callable[[Any, bytes], Reply]
 

@@ -57,6 +57,10 @@ class OpenExports:
         export.next_part, export.used_s = request.part + 1, self._clock()
         return content, True
 
+    def is_open(self, export_id: str) -> bool:
+        """Whether this export is in progress."""
+        return export_id in self._open
+
     def forget(self, is_gone: Callable[[str, int | None], bool] = lambda scene_id, attempt: False) -> None:
         """End the exports of scenes that were removed, and those that their callers abandoned."""
         now_s = self._clock()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from contract.wire.rendering import PushRequest
+from contract.wire.rendering import PUSH_REPLACED, PushRequest
 from intrasplat.errors import InputError, SceneError
 from worker.hosted_feed import HostedFeed
 from worker.rendered import MEDIA_TYPE_OF_BYTES
@@ -33,7 +33,8 @@ class FeedPushes:
         if request.scene_id != self._hosted.feed_id:
             raise SceneError("This process follows another feed.")
         if request.push_id in self._ended:
-            raise InputError("push", "it has ended, or another one has taken its place.", "Begin the push anew.")
+            problem = "it has ended, or another one has taken its place."
+            raise InputError(PUSH_REPLACED, problem, "Begin the push anew.")
         if request.push_id != self._push_id:
             self._end()
             self._hosted.expect(pictures=request.pictures)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections import OrderedDict
 
 from contract.wire.cameras import CamerasRequest
 from contract.wire.feeds import FeedShown
-from contract.wire.feeds import FeedTime as AskedTime
 from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest, SceneRequest
 from intrasplat.errors import SceneError
 from intrasplat.formats import EXPORT_FORMATS
-from intrasplat.live.looking import FeedView
+from intrasplat.live.looking import FeedMoment
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.state import FeedState
-from intrasplat.live.times import LIVE, FeedTime
+from intrasplat.live.times import LIVE
 from intrasplat.live.window import RIGHT_EYE
 from intrasplat.machine.parts import Parts, whole
 from intrasplat.names import Eye
@@ -26,7 +24,7 @@ from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.encode import FOR_EYES
 from intrasplat.view.recorded import frame_of_feed, pictured_frame
 from worker.answer_cache import ReplyCache
-from worker.exports import MAX_OPEN, OpenExports
+from worker.exports import OpenExports
 from worker.hosted_feed import HostedFeed
 from worker.rendered import MEDIA_TYPE_OF_BYTES, cost_of, export_reply, measured_reply, rendered, typical_cost
 from worker.reply import NotYetError, Reply
@@ -41,8 +39,8 @@ class FeedViews:
         self._shown: TrainedScene | None = None  # the scene that was shown last
         self._replies = ReplyCache()  # of that scene
         self._exports = OpenExports()
-        self._exported: OrderedDict[str, FeedView] = OrderedDict()
         self._picture: tuple[tuple[int, Eye], bytes] | None = None  # the newest that was asked for
+        self._exported: dict[str, FeedMoment] = {}  # the moments of the exports in progress
 
     def answer(self, request: SceneRequest, level: int = 0) -> Reply:
         """As answer_in_parts, in one call."""
@@ -54,7 +52,7 @@ class FeedViews:
         Raises:
             SceneError: it is a request for another feed or scene, or for what a feed does not have.
             NotYetError: there is nothing to show now.
-            InputError: the moment lies before the past that is kept, or as Views.answer_in_parts.
+            InputError: the moment lies before the past that is stored, or as Views.answer_in_parts.
         """
         if request.scene_id != self._hosted.feed_id or isinstance(request, CamerasRequest):
             raise SceneError("This process follows a feed, and answers renders, exports and measurements of it alone.")
@@ -82,27 +80,26 @@ class FeedViews:
     def forget_idle(self) -> None:
         """End exports that their callers abandoned. Call it regularly."""
         self._exports.forget()
+        self._drop_ended()
 
-    def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedView:
+    def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedMoment:
         """The moment that a request is for; that of an export stays that of its first part."""
         if isinstance(request, ExportRequest) and request.part > 0:
             if request.export_id not in self._exported:
                 raise SceneError(f"The export of feed {request.scene_id} has ended.")
             return self._exported[request.export_id]
-        view = self._hosted.feed.view_of(_looked_at(request.moment))
+        view = self._hosted.feed.view_of(request.moment or LIVE)
         if view is None:
             raise NotYetError("The feed shows nothing yet.")
         if isinstance(request, ExportRequest):
             self._exported[request.export_id] = view
-            while len(self._exported) > MAX_OPEN:
-                self._exported.popitem(last=False)
         return view
 
     def _is_newer(self, request: RenderRequest) -> bool:
         """Whether the newest moment is later than the one that the caller has."""
         return request.newer_than_s is None or self._hosted.newest_s > request.newer_than_s
 
-    def _rendered(self, view: FeedView, request: RenderRequest, level: int) -> Parts[Reply]:
+    def _rendered(self, view: FeedMoment, request: RenderRequest, level: int) -> Parts[Reply]:
         if request.newer_than_s is not None and view.source_s <= request.newer_than_s:
             return Reply(b"", MEDIA_TYPE_OF_BYTES, view.t, is_untimed=True)
         if view.scene is not self._shown:
@@ -115,7 +112,7 @@ class FeedViews:
             replies.keep(wanted, reply)
         return reply
 
-    def _other(self, view: FeedView, request: ExportRequest | RecordedRequest | MeasureRequest) -> Reply:
+    def _other(self, view: FeedMoment, request: ExportRequest | RecordedRequest | MeasureRequest) -> Reply:
         if isinstance(request, RecordedRequest):
             index, picture = pictured_frame(view.scene, view.t, request.eye, request.masks)
             media_type = MEDIA_TYPES[ImageFormat.PNG if request.masks is RecordedMasks.ONLY else ImageFormat.JPEG]
@@ -126,7 +123,10 @@ class FeedViews:
         if known is not None and "t" in known.options and request.options.t is None and request.options.view is None:
             options = request.options.model_copy(update={"t": view.t})
             request = request.model_copy(update={"options": options})
-        return export_reply(self._exports, view.scene, request, self._device)
+        try:
+            return export_reply(self._exports, view.scene, request, self._device)
+        finally:
+            self._drop_ended()
 
     def _pictured(self, pair: FeedPair, eye: Eye) -> Reply:
         """One eye of a pair as it came in, not rectified."""
@@ -143,7 +143,11 @@ class FeedViews:
         )
         return Reply(self._picture[1], MEDIA_TYPES[ImageFormat.JPEG], 0.0, is_untimed=True, feed=shown)
 
-    def _of(self, view: FeedView) -> FeedShown:
+    def _drop_ended(self) -> None:
+        """Drop the moments of exports that have ended, with their scenes."""
+        self._exported = {name: view for name, view in self._exported.items() if self._exports.is_open(name)}
+
+    def _of(self, view: FeedMoment) -> FeedShown:
         return FeedShown(
             state=self._hosted.state,
             source_s=view.source_s,
@@ -155,18 +159,7 @@ class FeedViews:
 
 def _is_of_now(request: RecordedRequest) -> bool:
     """Whether the newest picture is asked for, rather than one that the model knows, or its mask."""
-    return (request.moment is None or request.moment.is_live) and request.masks is not RecordedMasks.ONLY
-
-
-def _looked_at(moment: AskedTime | None) -> FeedTime:
-    if moment is None or moment.is_live:
-        return LIVE
-    if moment.before_live_s is not None:
-        return FeedTime.before_live(moment.before_live_s)
-    if moment.source_s is not None:
-        return FeedTime.of_source(moment.source_s)
-    assert moment.at_s is not None
-    return FeedTime.at(moment.at_s)
+    return request.moment in (None, LIVE) and request.masks is not RecordedMasks.ONLY
 
 
 def _right_eye(scene: TrainedScene) -> RightEye | None:

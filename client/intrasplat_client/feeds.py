@@ -46,7 +46,7 @@ class FeedCalls:
             is pushed to feed.links["video"] or, picture by picture, to feed.links["pictures"].
         layout: how two eyes arrive; auto finds it. keep_s: seconds of the past that can be viewed and cut out.
         width: of the pictures that the model learns; None: what the machine keeps up with.
-        camera: moving, if the endoscope's motion is to be told from the tissue's.
+        camera: moving, if the endoscope's motion is to be separated from the tissue's.
         label: a text to find the feed by; write no names of persons into it.
         idempotency_key: the same key with the same options and calibration is the same feed.
 

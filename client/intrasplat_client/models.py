@@ -354,7 +354,7 @@ class FeedOptions(Model):
 
 
 class FeedReceipt(Model):
-    """What became of a feed that was to end."""
+    """What is left of a feed that was ended."""
 
     feed_id: str
     ended_at: str
@@ -364,7 +364,7 @@ class FeedReceipt(Model):
     record: bool
     """the queue has no record of it any more, so its worker has deleted all files"""
     verified: bool
-    """it was looked whether the data directory has files of it, and it has none"""
+    """the data directory was searched for files of the feed, and has none"""
 
 
 class FeedView(Model):

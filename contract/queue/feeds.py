@@ -51,10 +51,9 @@ class Feeds(Protocol):
     def claim_feed(self, owner: str, *, to_end: bool = False) -> FeedRecord | None:
         """Claim the oldest feed that nobody follows, for FEED_LEASE_S, in a new epoch; None: there is none.
 
-        to_end: of those alone that are to end, as a worker without a free place can do that, too.
-
-        Feeds that are to end are claimed, too: their worker deletes what it has of them. An owner whose name before
-        the last dot is the same takes a feed over at once: a worker has one process of its name.
+        Feeds that are to end are claimed, too: their worker deletes what it has of them. to_end: claim only such a
+        feed, which needs no free place. An owner whose name before the last dot is the same takes a feed over at once:
+        a worker has one process of its name.
         """
         ...
 

@@ -147,7 +147,7 @@ class Settings(BaseModel):
     feed_keep_s: float = Field(default=3600.0, gt=0, le=MAX_KEEP_S)
     """Longest past of a feed."""
     feed_disk_bytes: int = Field(default=8 * GIB, gt=0)
-    """Most bytes of one feed's recording; the oldest go first."""
+    """Most bytes of one feed: half for its recording, half for the past of its model; the oldest go first."""
 
     # renders
     max_render_pixels: int = Field(default=4096 * 2160, gt=0)

@@ -3,26 +3,17 @@ a view may show."""
 
 from __future__ import annotations
 
-import re
-from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.job import LOCAL_TENANT, TENANT_PATTERN, Forecast, JobRecord, JobView
 from contract.wire.labels import LABEL_ABOUT, Label
 from intrasplat.codes import known_code
-from intrasplat.errors import InputError
 from intrasplat.live.spec import MAX_KEEP_S, MAX_URL_CHARACTERS, without_user
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.names import JOB_ID_PATTERN
-
-LIVE = "live"
-_NUMBER = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
-T_REMEDY = (
-    "Give live, seconds before live (-12.5), seconds of the source (31.4), or a time such as 2026-05-04T10:20:30Z."
-)
 
 
 class FeedWish(StrEnum):
@@ -112,7 +103,7 @@ class FeedRecord(BaseModel):
     calibration: str = Field(repr=False)
     """The text of the caller's file."""
     calibration_name: str
-    """calibration with the ending that names its format."""
+    """`calibration`, and the ending that names its format, such as calibration.json."""
     created_at_s: float
     wish: FeedWish = FeedWish.RUN
     owner: str | None = None
@@ -164,13 +155,13 @@ class FeedView(FeedReport):
 
 
 class FeedReceipt(BaseModel):
-    """What became of a feed that was to end."""
+    """What is left of a feed that was ended."""
 
     feed_id: str
     ended_at: str = Field(description="ISO 8601, UTC: when it was asked for")
     bytes: int = Field(description="bytes that the feed had on disk, as its worker last reported them")
     record: bool = Field(description="the queue has no record of it any more, so its worker has deleted all files")
-    verified: bool = Field(description="it was looked whether the data directory has files of it, and it has none")
+    verified: bool = Field(description="the data directory was searched for files of the feed, and has none")
 
 
 class CutRange(BaseModel):
@@ -196,7 +187,7 @@ class GivenCut(BaseModel):
         union_mode="left_to_right",
         description="a moment as t has it: -30, seconds of the source, or a time of RFC 3339",
     )
-    to: float | str = Field(default=LIVE, union_mode="left_to_right", description="the same; live: until now")
+    to: float | str = Field(default="live", union_mode="left_to_right", description="the same; live: until now")
     options: dict[str, object] = Field(default={}, description="as POST /reconstruct has them")
     label: str | None = Field(default=None, description=LABEL_ABOUT)
     metadata: dict[str, object] | None = Field(default=None, description="as POST /reconstruct has it")
@@ -214,32 +205,6 @@ class CutJob(JobView):
         return cls(**JobView.of(record, forecast).model_dump(), cut=cut)
 
 
-class FeedTime(BaseModel):
-    """The moment of a feed that is asked for: exactly one of these.
-
-    before_live_s  seconds before the newest moment that the model knows; 0: that one
-    source_s       seconds of the source since the feed's first pair
-    at_s           UNIX time, s, of the arrival of a pair
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    before_live_s: float | None = Field(default=None, ge=0, le=MAX_KEEP_S)
-    source_s: float | None = Field(default=None, ge=0, le=1e9)
-    at_s: float | None = Field(default=None, ge=0, le=1e11)
-
-    @model_validator(mode="after")
-    def _one(self) -> FeedTime:
-        if sum(each is not None for each in (self.before_live_s, self.source_s, self.at_s)) != 1:
-            raise ValueError("give exactly one of before_live_s, source_s and at_s")
-        return self
-
-    @property
-    def is_live(self) -> bool:
-        """Whether the newest moment is asked for."""
-        return self.before_live_s == 0
-
-
 class FeedShown(BaseModel):
     """The moment of a feed that an answer shows, and how fresh it is."""
 
@@ -250,24 +215,3 @@ class FeedShown(BaseModel):
     captured_at_s: float = Field(description="UNIX time at which its pair arrived")
     age_s: float = Field(description="seconds from then until the answer")
     is_newest: bool = Field(description="whether it is the newest moment that the model knew")
-
-
-def feed_time(text: str) -> FeedTime:
-    """The moment that a caller's t names.
-
-    Raises:
-        InputError: it names none.
-    """
-    if text == LIVE:
-        return FeedTime(before_live_s=0)
-    if _NUMBER.fullmatch(text):
-        seconds = float(text)
-        if seconds >= -MAX_KEEP_S:
-            return FeedTime(before_live_s=-seconds) if text.startswith("-") else FeedTime(source_s=seconds)
-    try:
-        moment = datetime.fromisoformat(text)
-        if moment.tzinfo is not None and moment.timestamp() >= 0:
-            return FeedTime(at_s=moment.timestamp())
-    except (ValueError, OverflowError):
-        pass
-    raise InputError("t", f"{text[:40]!r} is no moment of a feed.", T_REMEDY)

@@ -15,8 +15,9 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
-from contract.wire.feeds import CutRange, FeedShown, FeedTime
+from contract.wire.feeds import CutRange, FeedShown
 from intrasplat.formats import ExportOptions
+from intrasplat.live.times import FeedTime
 from intrasplat.measuring import MAX_POINTS, Point
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
 from intrasplat.notices import Notice
@@ -32,6 +33,8 @@ from intrasplat.picture import (
 from intrasplat.pose import MatrixPose, OrbitPose
 
 MAX_PUSH_BYTES = 48 * 1024
+PUSH_REPLACED = "push"
+"""The field of the error to a PushRequest whose push has ended, or in whose place another one came."""
 GAUSSIAN_PIXELS = 100_000
 """So many pixels take as long as moving and projecting the Gaussians (estimated from bm_raster)."""
 

@@ -1,4 +1,4 @@
-"""`intrasplat live`: follow a live source on this machine, and print what becomes of it."""
+"""`intrasplat live`: follow a live source on this machine, and print its state every second."""
 
 from __future__ import annotations
 
@@ -33,13 +33,17 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         help="rtsp://, tcp://HOST:PORT, udp://ADDRESS:PORT, http://, a file, which plays in real time, or a device",
     )
     parser.add_argument("--calibration", type=Path, required=True, metavar="F", help="of both eyes, as for reconstruct")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="record there and keep the past there: goes on, too")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="record and store the past there, and continue what is there"
+    )
     parser.add_argument("--layout", choices=LAYOUTS, default="auto", help="how both eyes lie in the pictures")
     parser.add_argument("--width", type=count, metavar="PX", help="of the model's pictures (default: what keeps up)")
     parser.add_argument("--keep", type=positive, default=120.0, metavar="S", help="seconds of the past (default: 120)")
     parser.add_argument("--camera", choices=("fixed", "moving"), default="fixed", help="whether the endoscope moves")
     parser.add_argument("--seconds", type=positive, metavar="S", help="end after so long (default: with Ctrl-C)")
-    parser.add_argument("--cut", type=positive, metavar="S", help=f"in the end, the last seconds as FOLDER/{CUT}")
+    parser.add_argument(
+        "--cut", type=positive, metavar="S", help=f"at the end, write the last S seconds to FOLDER/{CUT}"
+    )
     parser.add_argument("--json", action="store_true", help="print each report as a line of JSON")
     add_device(parser, "auto")
 

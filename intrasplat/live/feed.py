@@ -13,7 +13,7 @@ from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
 from intrasplat.live.kept import KeptSegment
-from intrasplat.live.looking import FeedView, find_view, range_of
+from intrasplat.live.looking import FeedMoment, find_view, range_of
 from intrasplat.live.model import FeedModel
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.parts import Part
@@ -33,16 +33,16 @@ MAX_MEMORY_BYTES = 512 << 20
 
 @dataclass(frozen=True)
 class FeedSettings:
-    """How a feed is followed, and what of it is kept. The SourceSpec says what is recorded.
+    """How a feed is followed, and what of it is stored. The SourceSpec says what is recorded.
 
     width        of the model's pictures, px; None: what the machine keeps up with
     camera       as in FollowSettings
-    keep_s       seconds that can be looked back
+    keep_s       seconds of the past that can be viewed
     segments     folder of the past, of this feed alone; None: it is in memory, and ends with the feed
     max_bytes    of the past on disk; in memory, MAX_MEMORY_BYTES if that is less
     max_age_s    a feed whose model is older is behind, and its newest moment is stale
     budget_s     seconds for each pair; None: chosen by size and device
-    finds_tissue whether nothing is learnt, shown or kept while the pictures show no tissue
+    finds_tissue whether nothing is learnt, shown or stored while the pictures show no tissue
     follow       the other settings of the follower; its width, camera and keep_s are not used
     """
 
@@ -61,7 +61,7 @@ class FeedSettings:
         return replace(self.follow, eyes=replace(self.follow.eyes, width=self.width), camera=self.camera)
 
     def of_past(self) -> PastSpec:
-        """What is kept of the model."""
+        """What is stored of the model."""
         max_bytes = self.max_bytes if self.segments else min(self.max_bytes, MAX_MEMORY_BYTES)
         return PastSpec(self.segments, self.keep_s, max_bytes)
 
@@ -117,7 +117,11 @@ class Feed:
         if state in (FeedState.LIVE, FeedState.BEHIND):
             trouble = self._model.trouble
             if self._watch is not None and self._watch.is_out:
-                state, reason, text = FeedState.NO_TISSUE, None, "the pictures show no tissue: nothing is kept of them"
+                state, reason, text = (
+                    FeedState.NO_TISSUE,
+                    None,
+                    "the pictures show no tissue: nothing of them is stored",
+                )
             elif trouble is not None:
                 state, reason, text = FeedState.STALLED, trouble.reason, trouble.text
             elif age_s is None or not self._model.has_begun:
@@ -143,11 +147,11 @@ class Feed:
             segment=self._source.segment,
         )
 
-    def view_of(self, when: FeedTime = LIVE) -> FeedView | None:
+    def view_of(self, when: FeedTime = LIVE) -> FeedMoment | None:
         """The moment of a time, to be rendered; None: nothing is known yet.
 
         Raises:
-            InputError: the time lies before the past that is kept; its field is "t".
+            InputError: the time lies before the past that is stored; its field is "t".
         """
         return find_view(when, self._model.scene(), self._past, self.settings.max_age_s)
 
@@ -188,7 +192,7 @@ class Feed:
         return self._source.cut(from_s, to_s, path)
 
     def pause(self) -> None:
-        """Read, learn and keep nothing from now on; what is known stays."""
+        """Read, learn and store nothing from now on; what is known stays."""
         self._source.pause()
 
     def resume(self) -> None:

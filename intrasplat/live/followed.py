@@ -15,7 +15,7 @@ from intrasplat.intake.calibration.text import checked_calibration
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.feed import Feed, FeedSettings
-from intrasplat.live.looking import FeedView
+from intrasplat.live.looking import FeedMoment
 from intrasplat.live.spec import FeedLayout, RecordingSpec, SourceSpec
 from intrasplat.live.state import FeedReport
 from intrasplat.live.times import FeedTime
@@ -31,7 +31,7 @@ RECORDING, SEGMENTS = "recording", "segments"
 
 
 class LiveScene:
-    """A live source that a model follows, to be shown at any moment that is kept. `follow` returns it.
+    """A live source that a model follows, to be shown at any moment that is stored. `follow` returns it.
 
     feed: the feed itself, for all that is not here (intrasplat/live/feed.py)
     """
@@ -55,7 +55,7 @@ class LiveScene:
         """Wait until there is something to show. False: not in time; report() says why."""
         return self.feed.wait_for_newer(float("-inf"), timeout_s) is not None
 
-    def moment(self, t: str | float = "live") -> FeedView:
+    def moment(self, t: str | float = "live") -> FeedMoment:
         """The moment of a time, with its age and source time; raises as view()."""
         found = self.feed.view_of(FeedTime.parse(t))
         if found is None:
@@ -80,7 +80,7 @@ class LiveScene:
             pose, width, height, intrinsics, detail: as for Scene.render.
 
         Raises:
-            InputError: the time lies before what is kept, nothing is known yet, or the pose or the size cannot be used.
+            InputError: the time lies before the stored past, nothing is known yet, or the pose or size cannot be used.
         """
         found = self.moment(t)
         scene, pose_mm = found.scene, world_from_camera_of(found.scene, pose)
@@ -99,7 +99,7 @@ class LiveScene:
         return self.feed.cut(from_s, to_s, Path(path))
 
     def pause(self) -> None:
-        """Read, learn and keep nothing from now on."""
+        """Read, learn and store nothing from now on."""
         self.feed.pause()
 
     def resume(self) -> None:
@@ -128,14 +128,14 @@ def follow(
     Args:
         source: a URL, a file that is played in real time, or a capture device (docs/live.md).
         calibration: of both eyes: a file, or the values of our JSON (docs/input.md).
-        out: folder in which the video is recorded and the past is kept, and from which an earlier run's goes on; None:
+        out: folder in which the video is recorded and the past is stored; an earlier run's is continued. None:
             the past is in memory, and nothing is recorded.
         layout: how the two eyes lie in the pictures.
         width: of the model's pictures, px; None: as large as the machine keeps up with.
-        keep_s: seconds that can be looked back and cut.
-        camera: "moving": the endoscope's motion is told from the tissue's.
+        keep_s: seconds of the past that can be viewed and cut out.
+        camera: "moving": the endoscope's motion is separated from the tissue's.
         device: auto, cpu or cuda.
-        finds_tissue: whether nothing is learnt, shown or kept while the pictures show no tissue.
+        finds_tissue: whether nothing is learnt, shown or stored while the pictures show no tissue.
 
     Raises:
         InputError: the source or the calibration cannot be used.

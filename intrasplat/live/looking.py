@@ -26,7 +26,7 @@ Axis = Literal["source_s", "arrived_at"]
 
 
 @dataclass(frozen=True, eq=False)
-class FeedView:
+class FeedMoment:
     """A moment of a feed, to be rendered.
 
     scene, t     the scene and its model time
@@ -57,11 +57,11 @@ def range_of(window: KeptSegment | None, past: Past) -> PastRange | None:
     return PastRange(first.source_s[0], last.source_s[1], first.arrived_at[0], last.arrived_at[1])
 
 
-def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedView | None:
+def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedMoment | None:
     """The view of a time; None: nothing is known yet.
 
     Raises:
-        InputError: the time lies before all that is kept.
+        InputError: the time lies before the past that is stored.
     """
     newest = None if window is None else KeptSegment.of(WINDOW, window)
     while spans := _spans(newest, past):
@@ -98,7 +98,7 @@ def _chosen(spans: list[KeptSegment], axis: Axis, wanted: float) -> KeptSegment:
 
 def _view(
     asked: FeedTime, scene: TrainedScene, axis: Axis, wanted: float, newest_s: float, max_age_s: float
-) -> FeedView:
+) -> FeedMoment:
     times = {"source_s": np.asarray(scene.frame_times_s), "arrived_at": arrivals(scene)}
     frames, along = np.arange(scene.frame_count), times[axis]
     place = float(np.interp(wanted, along, frames))
@@ -113,7 +113,7 @@ def _view(
         notices = (Notice.warning(NoticeCode.TIME_IN_GAP, text),)
     age_s, is_live = time.time() - captured_at, source_s >= newest_s
     t = place / scene.frame_count
-    return FeedView(scene, t, source_s, captured_at, age_s, is_live, is_live and age_s > max_age_s, notices)
+    return FeedMoment(scene, t, source_s, captured_at, age_s, is_live, is_live and age_s > max_age_s, notices)
 
 
 def _side(shown: float, wanted: float) -> str:
@@ -122,7 +122,7 @@ def _side(shown: float, wanted: float) -> str:
 
 def _too_early(asked: FeedTime, spans: list[KeptSegment]) -> InputError:
     first, last = spans[0], spans[-1]
-    problem = "it lies before the past that is kept."
+    problem = "it lies before the past that is stored."
     if asked.kind is FeedTimeKind.UNIX:
         remedy = f"Ask for a time after {_utc(first.arrived_at[0])}."
     elif asked.kind is FeedTimeKind.BEFORE_LIVE:

@@ -77,7 +77,7 @@ class FeedModel:
     ) -> None:
         """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device.
 
-        watch: learns what shows tissue; pairs without it are not learnt. None: all are.
+        watch: is given what each pair shows; pairs without tissue are not learnt. None: all are.
         """
         self._watch = watch
         self._source, self._calibration, self._settings, self._past = source, calibration, settings, past

@@ -26,8 +26,9 @@ NAME = re.compile(r"(\d{8})-(\d+)-(-?\d+)-(-?\d+)-(\d+)-(\d+)\.mp4", re.ASCII)
 MICRO = 1_000_000
 MAX_DIGITS = 18
 MAX_UNJUDGED_S = 60.0
-"""A part of which nobody has said for longer whether it may be kept is deleted."""
+"""A part that is not judged for longer is deleted."""
 Keeps = Callable[[float, float], bool | None]
+"""Whether the recording of a range of source times, s, may be stored; None: not known yet."""
 MAX_AHEAD_S = 60.0
 """A part that arrives later than now by more is none of ours."""
 
@@ -74,9 +75,10 @@ class Parts:
     def __init__(self, spec: RecordingSpec, keeps: Keeps | None = None) -> None:
         """Find the parts of earlier runs.
 
-        keeps: whether a range of source times may be kept; None: not known yet. Without it all is kept.
+        keeps: judges each part before it is published; without it all are.
 
-        OSError: the folder cannot be made or read.
+        Raises:
+            OSError: the folder cannot be made or read.
         """
         self._spec, self._keeps = spec, keeps
         self._lock = threading.Lock()
@@ -86,7 +88,7 @@ class Parts:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         found = (read_part(path) for path in self._folder.iterdir())
         self._parts = sorted((each for each in found if each is not None), key=lambda each: each.number)
-        if keeps is None:  # else nobody can say whether what an earlier run left there may be kept
+        if keeps is None:  # else nothing can judge what an earlier run left there
             self.adopt()
         self._clear_incoming(is_all=True)
 

@@ -1,4 +1,4 @@
-"""The past of a feed's model: its segments, in memory and on disk, as long as they are to be kept.
+"""The past of a feed's model: its segments, in memory and on disk, until they are too old or too many.
 
 A thread writes segments to disk, so that a slow disk holds up no model. What is on disk is loaded when it is looked at.
 """
@@ -31,7 +31,7 @@ CLOSE_S = 10.0
 
 @dataclass(frozen=True)
 class PastSpec:
-    """How the past is kept.
+    """How the past is stored.
 
     folder       of this feed alone; None: in memory
     keep_s       a segment is deleted this long after its last frame came in
@@ -101,7 +101,7 @@ class Past:
         self._queue.put((segment, scene))
 
     def load(self, segment: KeptSegment) -> TrainedScene | None:
-        """The segment's scene; None: it is gone meanwhile, or damaged, and is not kept any more."""
+        """The segment's scene; None: it is gone meanwhile, or damaged, and is deleted."""
         with self._lock:
             if segment.number in self._scenes:
                 self._scenes.move_to_end(segment.number)

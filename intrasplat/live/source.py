@@ -141,11 +141,11 @@ class Source:
         return FeedPair(pair.left, pair.right, pair.source_s, pair.arrived_at, pair.sequence)
 
     def pause(self) -> None:
-        """Read, decode and keep nothing from now on. It returns when the reading process has ended."""
+        """Read, decode and store nothing from now on. It returns when the reading process has ended, or at resume()."""
         with self._changed:
             self._paused = True
             self._changed.notify_all()
-            while self._status.state not in (FeedState.PAUSED, FeedState.ENDED) and not self._closed:
+            while self._paused and self._status.state not in (FeedState.PAUSED, FeedState.ENDED) and not self._closed:
                 self._changed.wait(0.1)
 
     def resume(self) -> None:

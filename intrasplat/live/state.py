@@ -16,9 +16,9 @@ class FeedState(StrEnum):
     STALLED = "stalled"
     """No pair comes in, or the model cannot use those that do; it is tried again."""
     PAUSED = "paused"
-    """Nothing is read, decoded or kept."""
+    """Nothing is read, decoded or stored."""
     NO_TISSUE = "no_tissue"
-    """Pairs come in, but show no tissue: nothing of them is learnt, shown or kept."""
+    """Pairs come in, but show no tissue: nothing of them is learnt, shown or stored."""
     ENDED = "ended"
 
 

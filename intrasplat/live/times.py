@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import math
+import re
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 
 from intrasplat.errors import InputError
+from intrasplat.live.spec import MAX_KEEP_S
 
 REMEDY = "Give live, -12.5 (seconds before live), 73.2 (seconds of the source), or 2026-11-29T08:15:00.5Z (RFC 3339)."
 FIELD = "t"
+_NUMBER = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
 
 
 class FeedTimeKind(StrEnum):
@@ -50,22 +52,22 @@ class FeedTime:
 
     @classmethod
     def parse(cls, value: str | float) -> FeedTime:
-        """live, seconds before live (below 0), seconds of the source, or RFC 3339.
+        """live, seconds before live (below 0, or -0), seconds of the source, or a time of RFC 3339 with its zone.
 
         Raises:
-            InputError: it is none of these.
+            InputError: it is none of these, or more than MAX_KEEP_S before live.
         """
-        text = str(value).strip()
+        text = value.strip() if isinstance(value, str) else f"{value:.9f}"
         if text == FeedTimeKind.LIVE:
             return LIVE
-        try:
-            seconds = float(text)
-        except ValueError:
+        if not _NUMBER.fullmatch(text):
             return cls.at(_unix_s(text))
-        if not math.isfinite(seconds):
+        seconds = float(text)
+        if seconds < -MAX_KEEP_S:
             raise _no_time(text)
-        is_before = seconds < 0 or text.startswith("-")
-        return cls.before_live(-seconds) if is_before else cls.of_source(seconds)
+        if not text.startswith("-"):
+            return cls.of_source(seconds)
+        return cls.before_live(-seconds) if seconds else LIVE
 
 
 LIVE = FeedTime()
@@ -74,11 +76,14 @@ LIVE = FeedTime()
 def _unix_s(text: str) -> float:
     try:
         moment = datetime.fromisoformat(text)
-    except ValueError:
+        unix_s = moment.timestamp() if moment.tzinfo is not None else 0.0
+    except (ValueError, OverflowError):
         raise _no_time(text) from None
     if moment.tzinfo is None:
         raise InputError(FIELD, f"{text[:40]!r} has no time zone.", "Append Z, or an offset such as +01:00.")
-    return moment.timestamp()
+    if unix_s < 0:
+        raise _no_time(text)
+    return unix_s
 
 
 def _no_time(text: str) -> InputError:

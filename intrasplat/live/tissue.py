@@ -1,4 +1,4 @@
-"""Whether a feed shows tissue: outside the body, nothing of it may be learnt, shown or kept.
+"""Whether a feed shows tissue: outside the body, nothing of it may be learnt, shown or stored.
 
 Blood absorbs green light, so tissue is red, and not yellow as skin, wood and warm light are.
 """
@@ -30,7 +30,7 @@ OUT_S = 2.0
 BACK_PAIRS = 2
 """Pairs with the colours of tissue in turn, after which the endoscope may be back."""
 NEAR_S = 0.5
-"""What was recorded so soon after tissue was seen is kept, until the endoscope proves to be out."""
+"""What is recorded so soon after tissue was seen is stored; it is deleted if the endoscope proves to be out."""
 REMEMBERED = 64
 """Stretches without tissue that are remembered: as long as parts may wait to be judged."""
 
@@ -65,7 +65,7 @@ class TissueWatch:
         self._back = 0
 
     def see(self, source_s: float, *, is_tissue: bool) -> bool:
-        """Note what the pair of a source time shows. Whether the endoscope went out with it."""
+        """Note what the pair of a source time, s, shows. True: it is the one at which the endoscope counts as out."""
         with self._lock:
             self._has_ended = False
             if is_tissue:
@@ -97,7 +97,7 @@ class TissueWatch:
         self._has_ended = True
 
     def keeps(self, from_s: float, to_s: float) -> bool | None:
-        """Whether what was recorded in a range of source times may be kept; None: that is not known yet."""
+        """Whether what was recorded in a range of source times may be stored; None: not known yet."""
         with self._lock:
             if any(begins_s < to_s and from_s < ends_s for begins_s, ends_s in self._out):
                 return False

@@ -35,7 +35,7 @@ class Trusted:
         self._wrong = np.sqrt(REMEMBERED) * self._wrong + wrong
 
     def forget(self, columns: NDArray[np.intp]) -> None:
-        """Other Gaussians have these columns now, which the newest frame showed."""
+        """Start anew for the Gaussians of these columns [M], which now show other tissue of the newest frame."""
         self._seen[:, columns] = self._looks[:, None]
         self._on_tissue[columns] = self._wrong[columns] = (
             1.0  # of errors between right and wrong, until it is looked at

@@ -19,6 +19,7 @@ from contract.wire.feeds import CutRange, FeedOptions, FeedRecord, FeedReport, F
 from contract.wire.rendering import MeasureRequest, RecordedRequest, RenderRequest, WorkerAddress
 from intrasplat.errors import InputError
 from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.live.times import LIVE, FeedTimeKind
 from intrasplat.notices import NoticeCode
 from tests.client.local_service import CLIP
 from tests.client.page import CAMERA, Page, Site
@@ -141,7 +142,7 @@ class LivePainter(FeedWorker):
         with self._lock:
             self.renders = [*self.renders, request][-200:]
         newest_s = self.newest(self.model_lag_s)
-        at_s = newest_s if request.moment is None or request.moment.is_live else self._at(request.moment, newest_s)
+        at_s = newest_s if request.moment in (None, LIVE) else self._at(request.moment, newest_s)
         shown = self._shown(at_s, newest_s)
         if request.newer_than_s is not None and shown.source_s <= request.newer_than_s + 1e-6:
             return Reply(b"", "image/jpeg", 0.0, feed=shown)
@@ -152,7 +153,7 @@ class LivePainter(FeedWorker):
         return Reply(picture, "image/jpeg", 0.0, warnings, camera=camera, feed=shown)
 
     def _at(self, moment: Any, newest_s: float) -> float:
-        at_s = moment.at_s if moment.at_s is not None else newest_s - (moment.before_live_s or 0.0)
+        at_s = moment.seconds if moment.kind is FeedTimeKind.UNIX else newest_s - moment.seconds
         if at_s < self.began_s:
             raise InputError("t", "This is before the feed's past.", "Give a later moment.")
         return min(newest_s, round(at_s * FPS) / FPS)

@@ -13,6 +13,7 @@ from selenium import webdriver
 from client.page import DASHBOARD
 from contract.wire.job import JobState
 from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.live.times import FeedTimeKind
 from tests.client.live_feed import PAST_S, READ_TIME, LivePage, LivePainter, live_painter, opened_feed
 from tests.client.page import Site
 from tests.client.words import LANGUAGES, say, table
@@ -200,8 +201,8 @@ def test_a_frozen_moment_is_measured_with_its_interval(site: Site, page: LivePag
     assert page.text("#measured").count("±") == 1
     measured = painter.measured[-1]
     assert measured.moment is not None
-    assert measured.moment.at_s is not None
-    assert abs(measured.moment.at_s * 1000 % 2**24 - found["ms"]) <= 2
+    assert measured.moment.kind is FeedTimeKind.UNIX
+    assert abs(measured.moment.seconds * 1000 % 2**24 - found["ms"]) <= 2
     assert [round(x) for point in measured.points for x in point] == [160, 192, 240, 192]
     page.script(PRESS, "Escape")
     page.until(lambda: page.script("return document.getElementById('measured').hidden"))

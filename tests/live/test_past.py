@@ -50,6 +50,9 @@ def scene(begins_s: float, *, step_s: float = 0.2, frames: int = 4, ago_s: float
         ("live", FeedTimeKind.LIVE, 0.0),
         ("-12.5", FeedTimeKind.BEFORE_LIVE, 12.5),
         (-2, FeedTimeKind.BEFORE_LIVE, 2.0),
+        ("-0", FeedTimeKind.LIVE, 0.0),
+        ("0", FeedTimeKind.SOURCE, 0.0),
+        (1e-7, FeedTimeKind.SOURCE, 1e-7),
         ("73.25", FeedTimeKind.SOURCE, 73.25),
         ("1970-01-01T00:01:00.5Z", FeedTimeKind.UNIX, 60.5),
         ("1970-01-01T01:01:00+01:00", FeedTimeKind.UNIX, 60.0),
@@ -59,7 +62,13 @@ def test_a_time_is_read_in_every_form(text: str | float, kind: FeedTimeKind, sec
     assert FeedTime.parse(text) == FeedTime(kind, seconds)
 
 
-@pytest.mark.parametrize("text", ["", "now", "nan", "-inf", "1970-01-01T00:00:00", "12 s"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "now", "nan", "-inf", "1e9", "1_0", "-9999999", "12 s"),
+        *("1970-01-01T00:00:00", "1960-01-01T00:00:00Z", "0001-01-01T00:00:00+01:00"),
+    ],
+)
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(InputError) as refused:
         FeedTime.parse(text)

@@ -211,6 +211,21 @@ def test_a_pause_ends_the_process_and_keeps_nothing(opened: Open, recording: Rec
         assert after.source_s - pair.source_s == pytest.approx(after.arrived_at - pair.arrived_at, abs=0.7)
 
 
+def test_a_pause_ends_when_another_thread_resumes(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, wait = opened(), threading.Condition.wait
+    pausing = threading.Thread(target=source.pause, daemon=True)
+
+    def resumed_first(condition: threading.Condition, timeout: float | None = None) -> bool:
+        if threading.current_thread() is pausing:
+            source.resume()
+        return wait(condition, timeout)
+
+    monkeypatch.setattr(threading.Condition, "wait", resumed_first)
+    pausing.start()
+    pausing.join(5)
+    assert not pausing.is_alive()
+
+
 def test_a_push_whose_process_is_killed_must_begin_anew(opened: Open) -> None:
     source, stream = opened(), Stream("mp4")
     for index in in_real_time(40):

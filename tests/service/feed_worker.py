@@ -23,6 +23,7 @@ from contract.wire.rendering import (
 )
 from intrasplat.errors import InputError, UnavailableError
 from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.live.times import FeedTimeKind
 from tests.answers import at_once
 from tests.measurements import measurement_reply
 from worker.aside import Aside
@@ -126,13 +127,13 @@ class FeedWorker:
 
     def _second_of(self, request: Any) -> float:
         moment = request.moment
-        if moment.source_s is not None:
-            return float(moment.source_s)
-        if moment.at_s is not None:
-            return float(moment.at_s) - BEGAN_S
-        if moment.before_live_s > self.newest_s:
+        if moment.kind is FeedTimeKind.SOURCE:
+            return float(moment.seconds)
+        if moment.kind is FeedTimeKind.UNIX:
+            return float(moment.seconds) - BEGAN_S
+        if moment.seconds > self.newest_s:
             raise InputError("t", "This is before the feed's past.", "Give a later moment.")
-        return float(self.newest_s - moment.before_live_s)
+        return float(self.newest_s - moment.seconds)
 
     def _answer_aside(self, request: CutRequest | PushRequest, content: bytes) -> Reply:
         self.asked.append(request)

@@ -14,9 +14,10 @@ import pytest
 
 from contract.access.audit import AUDIT_FILE
 from contract.access.keys import DEFAULT_SCOPES, KeyScope
-from contract.wire.feeds import FeedTime, FeedWish
-from contract.wire.rendering import CutRequest, ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
+from contract.wire.feeds import FeedWish
+from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
 from intrasplat.live.state import FeedState
+from intrasplat.live.times import LIVE, FeedTime
 from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
@@ -110,7 +111,10 @@ def test_options_that_cannot_be_used_are_refused(service: ServiceUnderTest, opti
 
 @pytest.mark.parametrize(
     "calibration",
-    [("a.json", b"{}"), ("a.json", b"not json"), ("a.yaml", b"<!DOCTYPE x>"), ("a.exe", b"{}"), ("a.json", b"\0\1\2")],
+    [
+        *(("a.json", b"{}"), ("a.json", b"not json"), ("a.json", b"\0\1\2"), ("a.yaml", b"<!DOCTYPE x>")),
+        *(("a.exe", b"{}"), ("a.xml", RECTIFIED.encode())),
+    ],
 )
 def test_a_calibration_that_is_none_is_refused(service: ServiceUnderTest, calibration: tuple[str, bytes]) -> None:
     assert_problem(posted(service, calibration=calibration), 422, "calibration")
@@ -229,11 +233,11 @@ def test_files_that_are_left_are_not_denied(service: ServiceUnderTest) -> None:
 @pytest.mark.parametrize(
     ("t", "moment", "shown_s"),
     [
-        (None, FeedTime(before_live_s=0), 60),
-        ("live", FeedTime(before_live_s=0), 60),
-        ("-12.5", FeedTime(before_live_s=12.5), 47.5),
-        ("31.4", FeedTime(source_s=31.4), 31.4),
-        ("2023-11-14T22:13:30Z", FeedTime(at_s=BEGAN_S + 10), 10),
+        (None, LIVE, 60),
+        ("live", LIVE, 60),
+        ("-12.5", FeedTime.before_live(12.5), 47.5),
+        ("31.4", FeedTime.of_source(31.4), 31.4),
+        ("2023-11-14T22:13:30Z", FeedTime.at(BEGAN_S + 10), 10),
     ],
 )
 def test_a_render_shows_a_moment_and_how_fresh_it_is(
@@ -263,7 +267,7 @@ def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
         response = service.http.get(f"/scenes/{feed_id}/{path}", params=query)
         assert response.status_code == 200, response.text
     assert [type(each) for each in worker.asked] == [RecordedRequest, MeasureRequest, ExportRequest]
-    assert {each.moment.before_live_s for each in worker.asked} == {1}
+    assert {each.moment for each in worker.asked} == {FeedTime.before_live(1.0)}
     assert service.http.get("/render", params={"scene": scene, "t": "0.5"}).content == b"png"
     assert len(worker.asked) == 3
     assert len(service.painter.requests) == 1
@@ -337,57 +341,6 @@ def test_the_events_of_a_feed_are_its_states_until_its_end(
     ]
     assert {each["id"] for each in events} == {feed_id}
     assert_problem(service.http.get(f"/feeds/{feed_id}/events"), 404, "feed_id")
-
-
-def test_a_cut_becomes_a_job_with_the_calibration(service: ServiceUnderTest, worker: FeedWorker) -> None:
-    feed_id = followed(service, options='{"layout": "sbs"}')
-    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
-    given = {"from": -30, "to": "2023-11-14T22:14:20Z", "options": {"budget_s": 20}, "label": "the bleeding"}
-    response = service.http.post(f"/feeds/{feed_id}/cut", json=given)
-    assert response.status_code == 202, response.text
-    job = response.json()
-    assert response.headers["location"] == f"/jobs/{job['id']}"
-    assert (job["state"], job["label"], job["options"]["layout"]) == ("queued", "the bleeding", "sbs")
-    assert job["cut"] == {"from_s": BEGAN_S + 30, "to_s": BEGAN_S + 60, "frames": 900, "is_whole": True}
-    requests = [each for each in worker.asked if isinstance(each, CutRequest)]
-    assert {(each.from_s, each.to_s) for each in requests} == {(BEGAN_S + 30, BEGAN_S + 60)}
-    assert [each.part for each in requests] == [0, 1, 2]
-    folder = service.store.spool_folder(job["id"])
-    assert (folder / "clip.mp4").read_bytes() == CLIP
-    assert (folder / "calibration.json").read_text() == RECTIFIED
-    assert ("feed-cut", feed_id) in actions(service)
-
-
-def test_a_cut_until_live_ends_with_the_newest_pairs(service: ServiceUnderTest, worker: FeedWorker) -> None:
-    feed_id = followed(service)
-    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
-    response = service.http.post(f"/feeds/{feed_id}/cut", json={"from": 20})
-    assert response.status_code == 202, response.text
-    (asked,) = {(each.from_s, each.to_s) for each in worker.asked if isinstance(each, CutRequest)}
-    assert asked[0] == BEGAN_S + 20
-    assert 60 <= asked[1] - BEGAN_S < 65
-
-
-@pytest.mark.parametrize(
-    ("given", "status", "field"),
-    [
-        ({"from": "then"}, 422, "from"),
-        ({"from": -10, "to": -20}, 422, "from"),
-        ({"from": -10, "to": "then"}, 422, "to"),
-        ({"from": 0, "to": "2027-01-01T00:00:00Z"}, 413, "from"),
-        ({"from": -100, "to": -1}, 422, "from"),  # before the recording: its worker says so
-        ({"from": -10, "to": -1, "options": {"preset": "best"}}, 422, "options.preset"),
-        ({"from": -10, "to": -1, "label": "x" * 100}, 422, "label"),
-        ({}, 422, "from"),
-    ],
-)
-def test_a_cut_of_nothing_is_refused(
-    service: ServiceUnderTest, worker: FeedWorker, given: dict[str, Any], status: int, field: str
-) -> None:
-    feed_id = followed(service)
-    wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
-    assert_problem(service.http.post(f"/feeds/{feed_id}/cut", json=given), status, field)
-    assert not service.spooled()
 
 
 def test_the_metrics_tell_of_feeds_without_their_labels(service: ServiceUnderTest, worker: FeedWorker) -> None:

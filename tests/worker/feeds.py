@@ -13,15 +13,15 @@ import zmq
 from contract.runtime.settings import Settings
 from contract.store.feed_files import FeedFiles
 from contract.store.shelf import new_job_id
-from contract.wire.feeds import FeedOptions, FeedRecord, FeedReport, FeedTime
+from contract.wire.feeds import FeedOptions, FeedRecord, FeedReport
 from contract.wire.rendering import FeedRequest, RenderRequest, WorkerReply, WorkerRequest
 from intrasplat.intake.calibration.types import RawCalibration, RectifiedCalibration
+from intrasplat.live.times import LIVE, FeedTime
 from tests.memory_queue import MemoryQueue
 from worker.feeds import FEED_COMMAND, FeedHost, endpoints_of
 
 FEED_STANDIN = (sys.executable, str(Path(__file__).with_name("feed_standin.py")))
 WIDTH = 128
-LIVE = FeedTime(before_live_s=0)
 WAIT_S = 40.0
 
 

@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 
 from contract.runtime.settings import Settings
-from contract.wire.feeds import FeedRecord, FeedTime, FeedWish
+from contract.wire.feeds import FeedRecord, FeedWish
 from contract.wire.rendering import CutRequest, ExportRequest, PushRequest, RecordedRequest, WorkerReply
+from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.picture import RecordedMasks
 from lab.phantom import Phantom, PhantomSettings, make_phantom
 from tests.live.senders import PhantomSender
-from tests.worker.feeds import LIVE, Asker, Hosted, eventually, feed_record, render_request
+from tests.worker.feeds import Asker, Hosted, eventually, feed_record, render_request
 from tests.worker.test_supervisor import WorkerProcesses
 from worker.feeds import following
 
@@ -74,14 +75,14 @@ def test_a_feed_is_shown_cut_paused_killed_and_ended(tmp_path: Path, sender: Pha
         assert (again.error, body) == (None, b"")
         assert again.feed is not None
 
-        before = shown(asker.ask(render_request(feed_id, FeedTime(before_live_s=1.0), eye="right")))
+        before = shown(asker.ask(render_request(feed_id, FeedTime.before_live(1.0), eye="right")))
         assert before.feed is not None
         assert not before.feed.is_newest
-        moment = FeedTime(source_s=before.feed.source_s)
+        moment = FeedTime.of_source(before.feed.source_s)
         same = shown(asker.ask(render_request(feed_id, moment, layer="depth")))
         assert same.feed is not None
         assert same.feed.captured_at_s == pytest.approx(before.feed.captured_at_s, abs=0.05)
-        refused, _ = asker.ask(render_request(feed_id, FeedTime(before_live_s=3600)))
+        refused, _ = asker.ask(render_request(feed_id, FeedTime.before_live(3600)))
         assert refused.error is not None
         assert (refused.error.kind, refused.error.field) == ("input", "t")
         recorded, picture = asker.ask(RecordedRequest(scene_id=feed_id, t=0, moment=moment))
