@@ -140,7 +140,11 @@ class _Wishes:
 
     def _obey(self) -> None:
         while True:
-            self._hosted.wish(self._wishes.get())
+            try:
+                self._hosted.wish(self._wishes.get())
+            except Exception as error:  # a pause that is not obeyed would record what nobody wants recorded
+                logger.error("a wish could not be obeyed: %s; another process begins with it", type(error).__name__)
+                os._exit(1)
 
 
 @contextlib.contextmanager

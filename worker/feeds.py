@@ -133,8 +133,12 @@ class FeedHost:
             return
         logger.info("a feed is claimed", extra={"job_id": record.feed_id})
         name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id[:8]}"
-        folder, endpoints = self._files.make(record.feed_id), self._endpoints(name)
-        child = FeedChild(record, folder, endpoints, self._command, self._environment)
+        try:
+            folder = self._files.make(record.feed_id)
+        except UnavailableError:
+            self._queue.release_feed(claim)  # another worker's disk may take it
+            raise
+        child = FeedChild(record, folder, self._endpoints(name), self._command, self._environment)
         followed = _Followed(claim, record, child)
         followed.announcing.enter_context(announced(self._queue, name, lambda: child.address(name)))
         self._followed[record.feed_id] = followed

@@ -76,7 +76,7 @@ class HostedFeed:
         """The feed, to which a video or pictures are pushed from now on: it begins anew for the other of the two."""
         with self._changing:
             if pictures != self._pictures and self._record.options.source is None and self._feed is not None:
-                self._pictures, before = pictures, self._feed
+                before, self._pictures, self._feed = self._feed, pictures, None
                 before.close()
                 self._feed = self._made()
         return self.feed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -19,9 +20,11 @@ from intrasplat.errors import UnavailableError
 from intrasplat.intake.limits import MAX_CALIBRATION_BYTES
 from intrasplat.live.state import FeedReason, FeedState
 from tests.worker.feeds import FEED_STANDIN, Hosted, eventually, feed_record
-from worker import feed_child
+from worker import feed_child, feed_process
 from worker.feed_child import FeedChild
+from worker.feed_orders import WishFeed
 from worker.feeds import endpoints_of, following
+from worker.orders import line_of
 
 Start = Callable[..., Hosted]
 
@@ -228,3 +231,36 @@ def test_a_process_that_reads_no_orders_yet_does_not_hold_up_the_others(tmp_path
         assert not looking.is_alive()
     finally:
         child.kill()
+
+
+def test_a_feed_whose_folder_the_disk_refuses_is_left_to_other_workers(
+    started: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hosted = started()
+    hosted.queue._feeds._lease_s = 600.0  # without a release nobody could claim the feed again
+    refused: list[str] = []
+
+    def refuse(feed_id: str) -> Path:
+        refused.append(feed_id)
+        raise UnavailableError("The disk is read-only.", "Mount it again.")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(hosted.files), "make", lambda _, feed_id: refuse(feed_id))
+        record = hosted.open(feed_record(None))
+        eventually(lambda: len(refused) >= 2)
+    eventually(lambda: hosted.state(record.feed_id) == "live")
+
+
+def test_a_wish_that_cannot_be_obeyed_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    codes: list[int] = []
+    monkeypatch.setattr(os, "_exit", codes.append)
+
+    class Refusing:
+        def wish(self, wish: FeedWish) -> None:
+            raise OSError(f"the disk refuses to {wish}")
+
+        def close(self) -> None:
+            pass
+
+    feed_process._Wishes(io.BytesIO(line_of(WishFeed(wish=FeedWish.PAUSE))), Refusing())  # type: ignore[arg-type]
+    eventually(lambda: 1 in codes)
