@@ -22,6 +22,9 @@ RAYS_A_SIDE = 5
 BEHIND = 1e-6
 """A ray whose direction has less than this share along a frame's axis meets no surface ahead."""
 
+WIDEST = 1e6
+"""Largest tangent of the angle between a ray and the axis: more is 90 degrees."""
+
 
 class Aside(NamedTuple):
     """Medians over a view's rays, each against the frame and eye that is nearest in angle.
@@ -63,6 +66,8 @@ def aside(scene: TrainedScene, pose: NDArray[np.float64], lens: Intrinsics) -> A
 def _rays(lens: Intrinsics) -> NDArray[np.float64]:
     """[K, 3] unit directions of a grid of rays in a camera's axes."""
     share = (np.arange(RAYS_A_SIDE) + 0.5) / RAYS_A_SIDE
-    x, y = np.meshgrid((share * lens.width - lens.cx) / lens.fx, (share * lens.height - lens.cy) / lens.fy)
+    with np.errstate(over="ignore"):
+        across, down = (share * lens.width - lens.cx) / lens.fx, (share * lens.height - lens.cy) / lens.fy
+    x, y = np.meshgrid(np.clip(across, -WIDEST, WIDEST), np.clip(down, -WIDEST, WIDEST))
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))

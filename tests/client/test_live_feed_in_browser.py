@@ -62,6 +62,7 @@ def test_a_feed_is_watched_frozen_measured_kept_and_ended(
         page.until_text("#kept", say("live.kept_open"))
         page.click("#pause")
         page.until_text("#word", say("live.word_paused"))
+        page.until(lambda: page.script("return !document.getElementById('pause').disabled"))
         page.click("#pause")
         page.until(lambda: page.state not in ("paused", "connecting"))
         page.click("#end")

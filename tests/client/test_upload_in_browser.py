@@ -254,7 +254,7 @@ def test_a_job_that_was_watched_is_found_again_after_a_reload(site: Site, page: 
     page.send(CLIP)
     page.until_text("#jobs", "waiting")
     page.driver.refresh()
-    page.until_text("#sent", "waiting")
+    page.until_text("#stage-message", "The scene opens here")
     claim = site.claim()
     site.train(claim, 20, 24.0)
     page.until_state("training")  # it opened by itself
