@@ -108,7 +108,7 @@ class Detail:
 
         Args:
             depth_mm: [H, W] camera z of the view; 0 where nothing is solid.
-            highlights: whether to add what one of two eyes misses alone.
+            highlights: whether to add light that one of two eyes misses alone.
 
         Raises:
             SceneError: the recorded pictures are missing or damaged.
@@ -122,8 +122,10 @@ class Detail:
         shared = np.exp(np.minimum.reduce(angles) / np.float32(-2 * np.deg2rad(SHARED_DEG) ** 2))
         nearest = int(np.argmax([float(each.mean()) for each in own]))
         is_own = float(own[nearest].min()) > 1 - NEGLIGIBLE
-        if not highlights and len(poses) > 1:
-            own, is_own = [np.zeros_like(each) for each in own], False
+        is_dimmed = not highlights and len(poses) > 1
+        if is_dimmed and is_own:  # the other eye tells only what both miss
+            own = [each if eye == nearest else np.zeros_like(each) for eye, each in enumerate(own)]
+            is_own = False
         used = [nearest] if is_own else range(len(own)) if float(shared.max()) > NEGLIGIBLE else ()
         totals = {eye: np.zeros((*depth_mm.shape, 4), np.float32) for eye in used}
         neighbours = self._neighbours(t) if used else []
@@ -144,7 +146,11 @@ class Detail:
         if not used:
             return Added.nothing(depth_mm.shape)
         found = {eye: (total[..., :3], total[..., 3]) for eye, total in totals.items()}
-        rgb, seen = found[nearest] if is_own else _together(found, list(map(view.finer, own)), view.finer(shared))
+        rgb, seen = (
+            found[nearest]
+            if is_own
+            else _together(found, list(map(view.finer, own)), view.finer(shared), is_dimmed=is_dimmed)
+        )
         return Added(rgb, float(seen.sum()) / max(int(np.count_nonzero(depth_mm)), 1))
 
     def _eye_pose(self, eye: int, t: float) -> Pose:
@@ -246,12 +252,15 @@ def _centres_mm(renderer: SceneRenderer, t: float) -> Floats:
     return np.ascontiguousarray(renderer.means_mm(t).T, np.float32)
 
 
-def _together(means: dict[int, tuple[Floats, Floats]], own: list[Floats], shared: Floats) -> tuple[Floats, Floats]:
+def _together(
+    means: dict[int, tuple[Floats, Floats]], own: list[Floats], shared: Floats, *, is_dimmed: bool = False
+) -> tuple[Floats, Floats]:
     """R G B [H, W, 3], times weight, and weight [H, W] of all eyes together.
 
     Args:
         means: the same of each eye.
         own, shared: [H, W] weights of what each eye misses alone, and of what both miss.
+        is_dimmed: add nothing brighter that one eye misses alone.
     """
     if len(means) == 1:
         ((rgb, weight),) = means.values()
@@ -263,7 +272,8 @@ def _together(means: dict[int, tuple[Floats, Floats]], own: list[Floats], shared
     near = own[0] + own[1]
     scale = 1 / np.maximum(near, 1)
     alone = [(each * scale)[..., None] * (rgb - common) for each, rgb in zip(own, (left, right), strict=True)]
-    rgb = np.maximum(shared, np.minimum(near, 1))[..., None] * common + alone[0] + alone[1]
+    lone = alone[0] + alone[1]
+    rgb = np.maximum(shared, np.minimum(near, 1))[..., None] * common + (np.minimum(lone, 0) if is_dimmed else lone)
     weight = np.maximum(shared * alike * both, scale * (own[0] * left_weight + own[1] * right_weight))
     return rgb, weight
 

@@ -118,7 +118,7 @@ def test_render_leaves_out_highlights_that_two_eyes_told_apart(
     scene: Path, scene_of_two_eyes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def rendered(folder: Path, highlights: str) -> np.ndarray:
-        view = ["--t", "0", "--highlights", highlights, "--detail", "off", "--out", str(tmp_path / "view.npy")]
+        view = ["--t", "0", "--highlights", highlights, "--out", str(tmp_path / "view.npy")]
         assert main(["render", str(folder), *view]) == ExitCode.OK
         return np.load(tmp_path / "view.npy").astype(int)
 

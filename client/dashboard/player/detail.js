@@ -227,7 +227,7 @@ export class Detail {
    * @param {number} t
    * @param {Matrix} pose
    * @param {import("./camera.js").Intrinsics} lens
-   * @param {boolean} highlights whether to add what one of two eyes misses alone
+   * @param {boolean} highlights whether to add light that one of two eyes misses alone
    * @returns {WebGLTexture | null} red, green and blue [H, W]; null: nothing
    */
   add(t, pose, lens, highlights) {
@@ -236,7 +236,7 @@ export class Detail {
     const view = { pose, lens, known: this.drawing.blended[1], centres: this.drawing.states[0] };
     const poses = this.pictures.eyes.map((_, eye) => this.eyePose(eye, t));
     const depth = points.depthInCells(view.known);
-    const { eyes, nearest, isOwn, weights } = weightsOf(this.cameras, poses, view, depth, points.cells, highlights);
+    const { eyes, nearest, isOwn, isDimmed, weights } = weightsOf(this.cameras, poses, view, depth, points.cells, highlights);
     const neighbours = this.neighbours(t);
     if (eyes.length === 0 || neighbours.length === 0) return null;
     gl.bindTexture(gl.TEXTURE_2D, points.weights);
@@ -255,7 +255,8 @@ export class Detail {
       programs.ALIKE.use({ left, right }, {});
       fillTarget(gl, sumTarget, lens.width, lens.height);
     }
-    programs.TOGETHER.use({ left, right, sums, weights: points.weights }, { eyes: ["1i", isOwn ? 0 : eyes.length] });
+    const counts = { eyes: ["1i", isOwn ? 0 : eyes.length], isDimmed: ["1i", isDimmed ? 1 : 0] };
+    programs.TOGETHER.use({ left, right, sums, weights: points.weights }, counts);
     fillTarget(gl, addedTarget, lens.width, lens.height);
     return added;
   }

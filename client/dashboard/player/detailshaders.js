@@ -353,7 +353,7 @@ void main() {
 /** What the view gets. eyes: 0: the left texture as it is; 1: weighted; 2: of both eyes together. */
 export const TOGETHER = `${TOOLS}
 uniform sampler2D left, right, sums, weights;   // weights: of what each eye misses alone, and of what both miss
-uniform int eyes;
+uniform int eyes, isDimmed;
 layout(location = 0) out vec4 added;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy), size = textureSize(left, 0);
@@ -370,5 +370,6 @@ void main() {
   vec3 both = alike * l.a * r.a / 2.0 * (l.rgb + r.rgb);
   float near = weight.x + weight.y, scale = 1.0 / max(near, 1.0);
   vec3 alone = scale * (weight.x * (l.rgb - both) + weight.y * (r.rgb - both));
+  if (isDimmed == 1) alone = min(alone, 0.0);
   added = vec4(max(weight.z, min(near, 1.0)) * both + alone, 1.0);
 }`;

@@ -13,8 +13,9 @@ const mean = (values) => values.reduce((sum, each) => sum + each, 0) / values.le
 
 /**
  * eyes: those that count at all. nearest: the one whose residuals tell most. isOwn: that one alone is shown.
+ * isDimmed: nothing brighter that one eye misses alone is added.
  * weights: of each cell, first row first: what the first and the last eye miss alone, what both miss, and depth.
- * @typedef {{eyes: number[], nearest: number, isOwn: boolean, weights: Float32Array}} Weights
+ * @typedef {{eyes: number[], nearest: number, isOwn: boolean, isDimmed: boolean, weights: Float32Array}} Weights
  */
 
 /**
@@ -23,7 +24,7 @@ const mean = (values) => values.reduce((sum, each) => sum + each, 0) / values.le
  * @param {{pose: import("./camera.js").Matrix, lens: import("./camera.js").Intrinsics}} view
  * @param {Float32Array} depth in the middles of the view's cells; 0 where nothing is solid
  * @param {[number, number]} cells across and down
- * @param {boolean} highlights whether to add what one of two eyes misses alone
+ * @param {boolean} highlights whether to add light that one of two eyes misses alone
  * @returns {Weights}
  */
 export function weightsOf(cameras, poses, { pose, lens }, depth, [across], highlights) {
@@ -47,13 +48,14 @@ export function weightsOf(cameras, poses, { pose, lens }, depth, [across], highl
   });
   const means = own.map(mean);
   const nearest = means.indexOf(Math.max(...means));
-  const isShared = !highlights && poses.length > 1;
-  const isOwn = !isShared && own[nearest].every((each) => each > 1 - NEGLIGIBLE);
-  if (isShared) own.forEach((each) => each.fill(0));
+  const isDimmed = !highlights && poses.length > 1;
+  const isNearest = own[nearest].every((each) => each > 1 - NEGLIGIBLE);
+  const isOwn = isNearest && !isDimmed;
+  if (isNearest && isDimmed) own[1 - nearest].fill(0); // the other eye tells only what both miss
   const all = shared.some((each) => each > NEGLIGIBLE) ? poses.map((_, eye) => eye) : [];
   const weights = new Float32Array(4 * filled.length);
   filled.forEach((d, at) => weights.set([own[0][at], own.at(-1)[at], shared[at], d], 4 * at));
-  return { eyes: isOwn ? [nearest] : all, nearest, isOwn, weights };
+  return { eyes: isOwn ? [nearest] : all, nearest, isOwn, isDimmed, weights };
 }
 
 /** Squared angles, radians, at places of a view between the rays to an eye and to another one. @returns {Float64Array} */
