@@ -1,4 +1,4 @@
-// Server-sent events of one job, read with fetch, because EventSource can send no key.
+// Server-sent events, read with fetch, because EventSource can send no key.
 
 import { request } from "./api.js";
 import { pause } from "./pause.js";
@@ -35,22 +35,38 @@ export function parseEvents(text) {
   return [events.filter((event) => event.data), rest];
 }
 
-/**
- * Follows a job until its end or until it is told to stop; comes again after a lost connection where it was. The end is
- * where the service has nothing more (204): a job that was tried again had ended before, too.
- */
-export class JobEvents {
+/** Reads events until it is told to stop; comes again after a lost connection. */
+export class ServerEvents {
   /**
-   * @param {string} id
-   * @param {(job: import("./api.js").Job) => void} onJob
+   * @param {string} path
+   * @param {{retryMs: number, silenceMs: number}} limits pause before it comes again; longest time without a piece
    */
-  constructor(id, onJob) {
-    this.id = id;
-    this.onJob = onJob;
+  constructor(path, { retryMs, silenceMs } = { retryMs: RETRY_MS, silenceMs: SILENCE_MS }) {
+    Object.assign(this, { path, retryMs, silenceMs, isOver: false });
     this.controller = new AbortController();
-    this.lastId = "";
-    this.isOver = false;
-    this.#follow();
+  }
+
+  /** Headers of the next request. @returns {Record<string, string>} */
+  headers() {
+    return {};
+  }
+
+  /** @param {ServerEvent[]} _events that came together */
+  take(_events) {}
+
+  /** @param {Error} _error that ended a connection */
+  fail(_error) {}
+
+  async start() {
+    while (!this.isOver) {
+      try {
+        await this.#readOnce();
+      } catch (error) {
+        this.fail(error);
+        if (!(error instanceof Problem || error.name === "AbortError")) console.error(error); // a fault of this page
+      }
+      if (!this.isOver) await pause(this.retryMs, this.controller.signal).catch(() => {});
+    }
   }
 
   stop() {
@@ -58,21 +74,8 @@ export class JobEvents {
     this.controller.abort();
   }
 
-  async #follow() {
-    while (!this.isOver) {
-      try {
-        await this.#readOnce();
-      } catch (error) {
-        if (error.status === 404 || error.status === 403) this.isOver = true;
-        if (!(error instanceof Problem || error.name === "AbortError")) console.error(error); // a fault of this page
-      }
-      if (!this.isOver) await pause(RETRY_MS, this.controller.signal).catch(() => {});
-    }
-  }
-
   async #readOnce() {
-    const headers = this.lastId ? { "Last-Event-ID": this.lastId } : {};
-    const response = await request(`/jobs/${this.id}/events`, { headers, signal: this.controller.signal });
+    const response = await request(this.path, { headers: this.headers(), signal: this.controller.signal });
     if (response.status === NO_CONTENT) {
       this.isOver = true;
       return;
@@ -81,27 +84,52 @@ export class JobEvents {
     let text = "";
     try {
       while (true) {
-        const { value, done } = await soon(reader);
+        const { value, done } = await soon(reader, this.silenceMs);
         if (done) return;
         const [events, rest] = parseEvents(text + value);
         text = rest;
-        for (const event of events) this.#take(event);
+        this.take(events);
       }
     } finally {
       reader.cancel().catch(() => {}); // else the connection stays open beside the next one
     }
   }
+}
 
-  /** @param {ServerEvent} event */
-  #take(event) {
-    if (event.id) this.lastId = event.id;
-    if (event.type !== "job" || this.isOver) return;
-    this.onJob(JSON.parse(event.data));
+/**
+ * Follows a job until its end or until it is told to stop, from where a lost connection was. The end is where the service
+ * has nothing more (204): a job that was tried again had ended before, too.
+ */
+export class JobEvents extends ServerEvents {
+  /**
+   * @param {string} id
+   * @param {(job: import("./api.js").Job) => void} onJob
+   */
+  constructor(id, onJob) {
+    super(`/jobs/${id}/events`);
+    this.onJob = onJob;
+    this.lastId = "";
+    this.start();
+  }
+
+  headers() {
+    return this.lastId ? { "Last-Event-ID": this.lastId } : {};
+  }
+
+  take(events) {
+    for (const event of events) {
+      if (event.id) this.lastId = event.id;
+      if (event.type === "job" && !this.isOver) this.onJob(JSON.parse(event.data));
+    }
+  }
+
+  fail(error) {
+    if (error.status === 404 || error.status === 403) this.isOver = true;
   }
 }
 
 /** The next piece; a Problem if the line is lost, or silent, as a dead one is. */
-export async function soon(reader) {
+export async function soon(reader, silenceMs = SILENCE_MS) {
   let timer;
   const silence = new Promise((_, reject) => (timer = setTimeout(() => reject(connectionLost()), SILENCE_MS)));
   try {

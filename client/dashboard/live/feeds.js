@@ -1,9 +1,7 @@
 // The service's routes of live feeds, as this screen uses them. What goes wrong is thrown as a Problem.
 
 import { bodyOf, request } from "../api.js";
-import { parseEvents } from "../events.js";
-import { pause } from "../pause.js";
-import { connectionLost, Problem } from "../problem.js";
+import { ServerEvents } from "../events.js";
 
 /**
  * A feed as the service shows it. Moments are UNIX times, s.
@@ -73,66 +71,26 @@ export async function getLivePicture(id) {
 }
 
 /** Follows what a feed says of itself until it has ended; comes again after a lost connection. */
-export class FeedEvents {
+export class FeedEvents extends ServerEvents {
   /**
    * @param {string} id
    * @param {(feed: Feed) => void} onFeed
    * @param {() => void} onGone the feed is no more, or not this key's
    */
   constructor(id, onFeed, onGone) {
-    Object.assign(this, { id, onFeed, onGone, isOver: false });
-    this.controller = new AbortController();
-    this.#follow();
+    super(`/feeds/${id}/events`, { retryMs: RETRY_MS, silenceMs: SILENCE_MS });
+    Object.assign(this, { onFeed, onGone });
+    this.start();
   }
 
-  stop() {
-    this.isOver = true;
-    this.controller.abort();
+  take(events) {
+    const last = events.findLast(({ type }) => type === "feed");
+    if (last && !this.isOver) this.onFeed(JSON.parse(last.data));
   }
 
-  async #follow() {
-    while (!this.isOver) {
-      try {
-        await this.#readOnce();
-      } catch (error) {
-        if (error.status === GONE && !this.isOver) {
-          this.stop();
-          this.onGone();
-        }
-        if (!(error instanceof Problem || error.name === "AbortError")) console.error(error); // a fault of this page
-      }
-      if (!this.isOver) await pause(RETRY_MS, this.controller.signal).catch(() => {});
-    }
-  }
-
-  async #readOnce() {
-    const response = await request(`/feeds/${this.id}/events`, { signal: this.controller.signal });
-    const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
-    let text = "";
-    try {
-      while (!this.isOver) {
-        const { value, done } = await within(reader.read(), SILENCE_MS);
-        if (done) return;
-        const [events, rest] = parseEvents(text + value);
-        text = rest;
-        const last = events.findLast(({ type }) => type === "feed");
-        if (last && !this.isOver) this.onFeed(JSON.parse(last.data));
-      }
-    } finally {
-      reader.cancel().catch(() => {}); // else the connection stays open beside the next one
-    }
-  }
-}
-
-/** What a promise brings; a Problem if it fails, or takes longer. */
-async function within(promise, ms) {
-  let timer;
-  const late = new Promise((_, reject) => (timer = setTimeout(() => reject(connectionLost()), ms)));
-  try {
-    return await Promise.race([promise, late]);
-  } catch (error) {
-    throw error instanceof Problem || error.name === "AbortError" ? error : connectionLost();
-  } finally {
-    clearTimeout(timer);
+  fail(error) {
+    if (error.status !== GONE || this.isOver) return;
+    this.stop();
+    this.onGone();
   }
 }
