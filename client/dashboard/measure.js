@@ -1,18 +1,16 @@
-// The tool "Measure": two points of the tissue, their distance in mm with its uncertainty, followed in time. Points are
-// chosen by clicks, or by Enter at a cross that the arrow keys move; Escape ends. For research alone, as it says.
+// The tool "Measure": two points of the tissue, their distance in mm with its uncertainty, followed in time. For
+// research alone, as it says.
 
 import { getMeasurement } from "./api.js";
 import { drawDistances, markTime } from "./distances.js";
 import { figure, language, languageEvents, words } from "./messages.js";
 import { Overlay } from "./overlay.js";
-import { isMeasurable, queryOf, sameView, toPicture } from "./places.js";
+import { isMeasurable, queryOf, sameView } from "./places.js";
+import { PointPicker } from "./pointpicker.js";
 import { readingOf } from "./probe.js";
 
 /** A pointer that moves less between down and up has clicked, and turns nothing. */
 const CLICK_PX = 6;
-const STEP_PX = 10;
-const FINE_STEP_PX = 1;
-const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 export class Measure {
   /**
@@ -25,6 +23,16 @@ export class Measure {
     this.parts = parts;
     this.overlay = new Overlay(parts.over, parts.canvas);
     this.isOn = false;
+    this.picker = new PointPicker(parts, {
+      clickPx: CLICK_PX,
+      isOn: () => this.isOn,
+      camera: () => this.viewer.shown?.camera ?? null,
+      isPicture: (target) => target === parts.stage || target.tagName === "CANVAS",
+      onPoint: (point) => this.choose(point),
+      onOutside: () => this.#tell("measure.outside"),
+      onCross: () => this.#draw(),
+      onEnd: () => this.end(),
+    });
     this.#clear();
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.end());
@@ -33,8 +41,8 @@ export class Measure {
     parts.button.addEventListener("click", () => this.toggle());
     parts.panel.querySelector(".again").addEventListener("click", () => this.start());
     parts.panel.querySelector(".end").addEventListener("click", () => this.end());
-    this.#listenToPointer();
-    document.addEventListener("keydown", (event) => this.#key(event), { capture: true });
+    const notTwice = (event) => this.isOn && event.stopImmediatePropagation();
+    parts.stage.addEventListener("dblclick", notTwice, { capture: true });
   }
 
   toggle() {
@@ -69,7 +77,7 @@ export class Measure {
     this.chosen = []; // points of the picture of this.view
     this.view = null; // in which they were chosen
     this.found = null; // the distance of both
-    this.cross = null; // of the keys, in shares of the picture, whose size may change
+    this.picker.forget();
     this.asked = {}; // replaced by each question: earlier answers are for nobody
     this.#say();
   }
@@ -167,58 +175,7 @@ export class Measure {
     if (now) this.overlay.line(shown.camera, now.places, words("measure.distance", { mm: figure(now.mm, 1), sigma: figure(now.sigma, 1) }));
     else if (!this.found && shown?.camera && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
     else this.overlay.clear();
-    if (shown?.camera && this.cross) this.overlay.cross(shown.camera, this.#crossIn(shown.camera));
-  }
-
-  /** Clicks choose; what moves farther goes on to whoever turns the view. */
-  #listenToPointer() {
-    const { stage, canvas } = this.parts;
-    let began = null;
-    const isNear = ({ clientX, clientY }) => began && Math.hypot(clientX - began[0], clientY - began[1]) < CLICK_PX;
-    const first = { capture: true };
-    stage.addEventListener("pointerdown", (event) => {
-      const isPicture = event.target === stage || event.target.tagName === "CANVAS";
-      began = this.isOn && event.isPrimary && event.button === 0 && isPicture ? [event.clientX, event.clientY] : null;
-    }, first);
-    stage.addEventListener("pointermove", (event) => {
-      if (isNear(event)) event.stopImmediatePropagation();
-      else if (event.buttons !== 0) began = null;
-    }, first);
-    stage.addEventListener("pointerup", (event) => {
-      const { shown } = this.viewer;
-      const isClick = this.isOn && isNear(event);
-      began = null;
-      if (!isClick) return;
-      const point = shown?.camera ? toPicture(canvas, shown.camera, [event.clientX, event.clientY]) : null;
-      if (point) this.choose(point);
-      else this.#tell("measure.outside");
-    }, first);
-    stage.addEventListener("dblclick", (event) => this.isOn && event.stopImmediatePropagation(), first);
-  }
-
-  #key(event) {
-    if (!this.isOn || event.ctrlKey || event.metaKey || event.altKey) return;
-    const { shown } = this.viewer;
-    if (document.querySelector("dialog[open]")) return;
-    if (event.key === "Escape") this.end();
-    else if (event.target !== this.parts.stage || !shown?.camera) return;
-    else if (event.key === "Enter") this.choose(this.#crossIn(shown.camera));
-    else if (STEPS[event.key]) this.#moveCross(shown.camera, STEPS[event.key], event.shiftKey ? FINE_STEP_PX : STEP_PX);
-    else return;
-    event.preventDefault();
-    event.stopImmediatePropagation();
-  }
-
-  #crossIn({ width, height }) {
-    const [x, y] = (this.cross ??= [0.5, 0.5]);
-    return [x * width, y * height];
-  }
-
-  #moveCross(camera, [right, down], step) {
-    const [x, y] = this.#crossIn(camera);
-    const held = (value, size) => Math.min(Math.max(value, 0.5), size - 0.5);
-    const moved = [held(x + right * step, camera.width), held(y + down * step, camera.height)];
-    this.cross = [moved[0] / camera.width, moved[1] / camera.height];
-    this.#draw();
+    const cross = shown?.camera && this.picker.crossIn(shown.camera);
+    if (cross) this.overlay.cross(shown.camera, cross);
   }
 }

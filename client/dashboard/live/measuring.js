@@ -1,18 +1,15 @@
-// Two points of the frozen moment, and their distance in mm. Points are chosen by clicks, or by Enter at a cross that the
-// arrow keys move; Escape ends.
+// Two points of the frozen moment, and their distance in mm.
 
 import { getMeasurement } from "../api.js";
 import { setText } from "../element.js";
 import { figure, languageEvents, words } from "../messages.js";
 import { Overlay } from "../overlay.js";
-import { queryOf, toPicture } from "../places.js";
+import { queryOf } from "../places.js";
+import { PointPicker } from "../pointpicker.js";
 import { readingOf } from "../probe.js";
 
 /** A pointer that moves less between down and up has clicked, and turns nothing. */
 const CLICK_PX = 8;
-const STEP_PX = 10;
-const FINE_STEP_PX = 1;
-const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 export class LiveMeasure {
   /**
@@ -23,13 +20,19 @@ export class LiveMeasure {
   constructor(parts, look, model) {
     Object.assign(this, { parts, look, model, isOn: false });
     this.overlay = new Overlay(parts.over, parts.canvas);
+    this.picker = new PointPicker(parts, {
+      clickPx: CLICK_PX,
+      isOn: () => this.isOn,
+      camera: () => this.model.shown?.camera ?? null,
+      onPoint: (point) => this.#choose(point),
+      onCross: () => this.#draw(),
+      onEnd: () => this.end(),
+    });
     this.#clear();
     look.addEventListener("changed", () => look.mode !== "frozen" && this.end());
     model.addEventListener("shown", () => this.#follow());
     languageEvents.addEventListener("changed", () => this.#say());
     window.addEventListener("resize", () => this.#draw());
-    this.#listenToPointer();
-    document.addEventListener("keydown", (event) => this.#key(event), { capture: true });
   }
 
   toggle() {
@@ -59,7 +62,7 @@ export class LiveMeasure {
     this.chosen = [];
     this.found = null; // {mm, sigma, places}
     this.of = null; // the view in which they were chosen
-    this.cross = null; // of the keys, in shares of the picture
+    this.picker.forget();
     this.asked = {}; // replaced by each question: earlier answers are for nobody
     this.told = null;
     this.#say();
@@ -136,52 +139,7 @@ export class LiveMeasure {
     if (!shown?.camera) return;
     if (this.found) this.overlay.line(shown.camera, this.found.places, `${figure(this.found.mm, 1)} mm`);
     else this.overlay.points(shown.camera, this.chosen);
-    if (this.cross) this.overlay.cross(shown.camera, this.#crossIn(shown.camera));
-  }
-
-  /** Clicks choose; what moves farther goes on to whoever turns the view. */
-  #listenToPointer() {
-    const { stage, canvas } = this.parts;
-    let began = null;
-    const isNear = ({ clientX, clientY }) => began && Math.hypot(clientX - began[0], clientY - began[1]) < CLICK_PX;
-    const first = { capture: true };
-    stage.addEventListener("pointerdown", (event) => {
-      began = this.isOn && event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
-    }, first);
-    stage.addEventListener("pointermove", (event) => {
-      if (isNear(event)) event.stopImmediatePropagation();
-      else if (event.buttons !== 0) began = null;
-    }, first);
-    stage.addEventListener("pointerup", (event) => {
-      const { shown } = this.model;
-      const isClick = this.isOn && isNear(event);
-      began = null;
-      const point = isClick && shown?.camera && toPicture(canvas, shown.camera, [event.clientX, event.clientY]);
-      if (point) this.#choose(point);
-    }, first);
-  }
-
-  #key(event) {
-    if (!this.isOn || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
-    const { shown } = this.model;
-    if (event.key === "Escape") this.end();
-    else if (event.target !== this.parts.stage || !shown?.camera) return;
-    else if (event.key === "Enter") this.#choose(this.#crossIn(shown.camera));
-    else if (STEPS[event.key]) this.#moveCross(shown.camera, STEPS[event.key], event.shiftKey ? FINE_STEP_PX : STEP_PX);
-    else return;
-    event.preventDefault();
-    event.stopImmediatePropagation();
-  }
-
-  #crossIn({ width, height }) {
-    const [x, y] = (this.cross ??= [0.5, 0.5]);
-    return [x * width, y * height];
-  }
-
-  #moveCross(camera, [right, down], step) {
-    const [x, y] = this.#crossIn(camera);
-    const within = (value, size) => Math.min(Math.max(value, 0.5), size - 0.5) / size;
-    this.cross = [within(x + right * step, camera.width), within(y + down * step, camera.height)];
-    this.#draw();
+    const cross = this.picker.crossIn(shown.camera);
+    if (cross) this.overlay.cross(shown.camera, cross);
   }
 }
