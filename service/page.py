@@ -22,8 +22,8 @@ VERSIONED = "v"
 HASH_DIGITS = 16
 FOREVER = "public, max-age=31536000, immutable"
 REVALIDATE = "no-cache"
-REFERENCE = re.compile(r'((?:href|src)=")([^"/:#]+")')
-"""A file beside the index."""
+REFERENCE = re.compile(r'((?:href|src)=")(\w[^":#]*")')
+"""A file of the page, named relative to the index; links begin with a dot."""
 MIN_COMPRESSED_BYTES = 1000
 
 

@@ -1,43 +1,43 @@
 // The page: wires form, jobs, picture, curve and report together.
 
-import { Address } from "./address.js";
-import { Announcer } from "./announce.js";
-import { getCurve, getReport } from "./api.js";
-import { stepBackWhileIdle } from "./awake.js";
-import { nameOf } from "./card.js";
-import { Compare } from "./compare.js";
-import { drawCurve, pointsOfCsv } from "./curve.js";
-import { Downloads } from "./downloads.js";
-import { Drawers } from "./drawers.js";
-import { setText } from "./element.js";
-import { baselinesOf } from "./figures.js";
-import { ClipForm } from "./form.js";
-import { prepareFullScreen, ScreenLight } from "./fullscreen.js";
-import { prepareHelp, toggleHelp } from "./help.js";
-import { SceneImport } from "./importing.js";
-import { JobList } from "./joblist.js";
-import { Jobs } from "./jobs.js";
-import { currentKey, keyEvents, showKeyForm } from "./key.js";
-import { listenToKeys, onKeys } from "./keys.js";
-import { TimesLeft } from "./left.js";
-import { Legend } from "./legend.js";
-import { drawStrip } from "./lightstrip.js";
+import { Address } from "./base/address.js";
+import { getCurve, getReport } from "./base/api.js";
+import { closeBanner, prepareBanners } from "./base/banners.js";
+import { Drawers } from "./base/drawers.js";
+import { setText } from "./base/element.js";
+import { prepareFullScreen, ScreenLight } from "./base/fullscreen.js";
+import { prepareHelp, toggleHelp } from "./base/help.js";
+import { currentKey, keyEvents, showKeyForm } from "./base/key.js";
+import { listenToKeys, onKeys } from "./base/keys.js";
+import { figure, languageEvents, showWords, words } from "./base/messages.js";
+import { pause } from "./base/pause.js";
+import { failureOf } from "./base/problem.js";
+import { Scopes } from "./base/scopes.js";
+import { ClipForm } from "./form/form.js";
+import { Announcer } from "./library/announce.js";
+import { nameOf } from "./library/card.js";
+import { drawCurve, pointsOfCsv } from "./library/curve.js";
+import { Downloads } from "./library/downloads.js";
+import { baselinesOf } from "./library/figures.js";
+import { SceneImport } from "./library/importing.js";
+import { JobList } from "./library/joblist.js";
+import { Jobs } from "./library/jobs.js";
+import { progressOf, shareOf, shareOfSending } from "./library/progress.js";
+import { showReport } from "./library/report.js";
+import { Shelf } from "./library/shelf.js";
+import { TimesLeft } from "./library/timeleft.js";
 import { listOpenFeeds } from "./live/links.js";
-import { Measure } from "./measure.js";
-import { figure, languageEvents, showWords, words } from "./messages.js";
-import { hush, prepareNews } from "./news.js";
-import { pause } from "./pause.js";
-import { failureOf } from "./problem.js";
-import { Probe } from "./probe.js";
-import { progressOf, shareOf, shareOfSending } from "./progress.js";
-import { showReport } from "./report.js";
-import { Scale } from "./scale.js";
-import { Scopes } from "./scopes.js";
-import { Shelf } from "./shelf.js";
-import { steer } from "./steer.js";
-import { Verdict } from "./verdict.js";
-import { Viewer } from "./viewer.js";
-import { Waiting } from "./waiting.js";
+import { Measure } from "./measure/measure.js";
+import { Probe } from "./measure/probe.js";
+import { Compare } from "./stage/compare.js";
+import { stepBackWhileIdle } from "./stage/idle.js";
+import { Legend } from "./stage/legend.js";
+import { drawStrip } from "./stage/lightstrip.js";
+import { Scale } from "./stage/scale.js";
+import { steer } from "./stage/steer.js";
+import { Verdict } from "./stage/verdict.js";
+import { Viewer } from "./stage/viewer.js";
+import { Waiting } from "./stage/waiting.js";
 
 const get = (id) => document.getElementById(id);
 
@@ -110,7 +110,7 @@ function view(id, message) {
   reported = null;
   if (id === null || id !== waiting.job) waiting.end();
   tell("");
-  hush(get("jobs-message"));
+  closeBanner(get("jobs-message"));
   viewer.open(id, message);
   compare.open(id);
   address.note();
@@ -319,8 +319,8 @@ keyEvents.addEventListener("changed", () => {
   view(null, words(currentKey() ? "page.choose" : "page.key_forgotten")); // another key may not see the same
   if (currentKey()) if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so
 });
-prepareNews(get("news"));
-get("upload").addEventListener("submit", () => hush(get("jobs-message")));
+prepareBanners(get("news"));
+get("upload").addEventListener("submit", () => closeBanner(get("jobs-message")));
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
 
 const showHelp = () => toggleHelp(get("help"));

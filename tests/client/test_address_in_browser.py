@@ -103,7 +103,7 @@ def test_the_link_is_copied(page: Page, scene: str) -> None:
 
 KEYS = """
 const done = arguments[0];
-const address = new URL("keys.js", document.scripts[0].src);
+const address = new URL("base/keys.js", document.scripts[0].src);
 import(address).then(({ keyRows }) => done(keyRows().flatMap(({ keys }) => Object.keys(keys))));
 """
 

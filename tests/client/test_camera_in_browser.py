@@ -96,7 +96,7 @@ def test_a_scene_that_is_watched_from_its_first_picture_on_is_played_as_soon_as_
 
 PLAYED = """
 const [speed, ms, done] = arguments;
-import(new URL("timeline.js", document.scripts[0].src)).then(async ({ Timeline }) => {
+import(new URL("stage/timeline.js", document.scripts[0].src)).then(async ({ Timeline }) => {
   const { viewer } = await import(document.scripts[0].src);
   const parts = Object.fromEntries(["play", "loop", "loopStart", "loopEnd", "loopAll", "timeValue"].map((name) =>
     [name, document.createElement("button")]));

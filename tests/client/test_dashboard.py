@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import get_args
@@ -14,11 +15,13 @@ from client.page import DASHBOARD
 from intrasplat.options import JobOptions
 from tests.client.words import table
 
+SERVER_PROJECT = DASHBOARD.parents[1] / "service" / "pyproject.toml"
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
 INDEX, ALONE, LIVE = DASHBOARD / "index.html", DASHBOARD / "file" / "alone.html", DASHBOARD / "live.html"
 pages = pytest.mark.parametrize("path", [INDEX, ALONE, LIVE], ids=lambda path: path.name)
 """The page of a service, the page of a file without one, and the live screen."""
-FOLDERS = {INDEX: "dashboard", ALONE: "file", LIVE: "live"}
+PARTS = {"base", "form", "library", "measure", "stage"}
+FOLDERS = {INDEX: {"dashboard", *PARTS}, ALONE: {"file"}, LIVE: {"live"}}
 """Where the scripts are that look for elements of each page."""
 
 
@@ -88,7 +91,7 @@ def test_the_player_knows_nothing_of_the_page() -> None:
 
 @pages
 def test_every_element_that_a_script_asks_for_is_on_the_page(path: Path) -> None:
-    page, scripts = Page(path), [each for each in SCRIPTS if each.parent.name == FOLDERS[path]]
+    page, scripts = Page(path), [each for each in SCRIPTS if each.parent.name in FOLDERS[path]]
     asked = {each for script in scripts for each in re.findall(r'(?<!\.)\bget\("([^"]+)"\)', script.read_text())}
     assert asked <= set(page.ids)
     assert len(page.ids) == len(set(page.ids))
@@ -104,7 +107,7 @@ def test_the_types_and_limits_are_what_contract_wire_generates() -> None:
 
 
 def test_the_form_has_words_for_each_choice_and_a_field_for_options_alone() -> None:
-    page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "options.js").read_text()
+    page, script = (DASHBOARD / "index.html").read_text(), (DASHBOARD / "form/options.js").read_text()
     (listed,) = re.findall(r"const OPTIONS = \[(.*?)\n\];", script, re.DOTALL)
     named = set()
     for name in re.findall(r'"(\w+)"', listed):
@@ -112,3 +115,11 @@ def test_the_form_has_words_for_each_choice_and_a_field_for_options_alone() -> N
         choices = get_args(JobOptions.model_fields[name].annotation)
         named |= {f"{name}_{each}" for each in choices if isinstance(each, str)}
     assert set(table("en")["choice"]) == named
+
+
+def test_the_server_package_has_every_file_of_the_page() -> None:
+    """Patterns of setuptools' package data, which match files alone."""
+    project = tomllib.loads(SERVER_PROJECT.read_text())
+    patterns = project["tool"]["setuptools"]["package-data"]["client"]
+    packaged = {path for pattern in patterns for path in DASHBOARD.parent.glob(pattern) if path.is_file()}
+    assert {path for path in DASHBOARD.rglob("*") if path.is_file()} <= packaged

@@ -40,7 +40,7 @@ Object.defineProperty(HTMLCanvasElement.prototype, "width", {
 """
 MAPS = """
 const done = arguments[0];
-import(new URL("jobs.js", document.scripts[0].src)).then(async ({ Jobs }) => {
+import(new URL("library/jobs.js", document.scripts[0].src)).then(async ({ Jobs }) => {
   const jobs = new Jobs(() => {}, () => {}, () => true);
   window.known = () => [jobs.byId.size, jobs.scores.size, jobs.told.size, jobs.followed.size];
   done();

@@ -217,7 +217,7 @@ def test_a_click_on_the_picture_of_a_scene_opens_it(site: Site, page: Page) -> N
 
 
 def test_files_are_named_as_the_service_names_them() -> None:
-    source = (DASHBOARD / "downloads.js").read_text(encoding="utf-8")
+    source = (DASHBOARD / "library/downloads.js").read_text(encoding="utf-8")
     (text,) = re.findall(r"const GROUPS = \{(.*?)\n\};", source, re.DOTALL)
     suffixes = dict(re.findall(r'"?([\w-]+)"?: "([^"]+)"', text))
     assert suffixes == {name: each.suffix for name, each in EXPORT_FORMATS.items()}

@@ -65,7 +65,7 @@ def test_the_strip_and_the_report_say_in_words_what_light_and_smoke_did(site: Si
     view(site, page, LIGHT)
     page.driver.execute_async_script(
         "const [code, done] = arguments;"
-        "import(new URL('messages.js', document.scripts[0].src))"
+        "import(new URL('base/messages.js', document.scripts[0].src))"
         ".then(({ setLanguage }) => { setLanguage(code); done() })",
         language,
     )

@@ -228,7 +228,7 @@ def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: Liv
     page.until_text("#kept", say("live.kept_open"))
     (job,) = site.queue.records()
     assert page.script("return document.querySelector('#kept a').hash") == f"#/scene/{job.job_id}"
-    asked = f"import('/api.js').then(({{ getJob }}) => getJob('{job.job_id}'))"
+    asked = f"import('/base/api.js').then(({{ getJob }}) => getJob('{job.job_id}'))"
     label = page.script(f"return {asked}.then(({{ label }}) => label)")
     assert label.startswith("liver")
     assert job.state is JobState.QUEUED

@@ -16,7 +16,7 @@ from tests.measurements import DEPTH_MM, RANGE_MM, UNCERTAINTY_MM, stretch
 
 MM_A_PIXEL = DEPTH_MM / CAMERA.fx
 PLACES = """
-const { placeInPicture } = await import(new URL("pointer.js", document.scripts[0].src));
+const { placeInPicture } = await import(new URL("measure/pointer.js", document.scripts[0].src));
 const { viewer } = await import(document.scripts[0].src);
 const { u, v, scale } = placeInPicture(document.querySelector("#picture"), viewer.shown.camera, 0, 0);
 return [u, v, scale, viewer.shown.camera.width, viewer.shown.camera.height];
@@ -57,7 +57,7 @@ def distance_of(page: Page) -> float:
 
 
 def test_the_pages_colours_are_the_workers(page: Page) -> None:
-    found = page.script("return (async () => [...(await import('/colours.js')).COLOURS])()")
+    found = page.script("return (async () => [...(await import('/stage/colours.js')).COLOURS])()")
     assert bytes(found) == COLOUR_TABLE
 
 

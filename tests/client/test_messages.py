@@ -77,14 +77,14 @@ def test_scripts_and_page_ask_for_words_that_are_there_and_for_all_of_them() -> 
     source += "".join(page.read_text(encoding="utf-8") for page in DASHBOARD.rglob("*.html"))
     asked = set(re.findall(rf'"((?:{sections})\.[a-z_0-9:]+)"', source))
     beginnings = tuple(set(re.findall(rf"`((?:{sections})\.[a-z_]*)\$\{{", source)))
-    endings = re.findall(r'\["(\w+)", ', (DASHBOARD / "figures.js").read_text(encoding="utf-8"))
+    endings = re.findall(r'\["(\w+)", ', (DASHBOARD / "library/figures.js").read_text(encoding="utf-8"))
     assert {f"figure.{each}" for each in endings} <= known
     assert asked - known == set()
     assert [place for place in known - asked if not place.startswith(beginnings)] == []
 
 
 def test_a_warning_of_every_code_has_one_weight_in_the_traffic_light() -> None:
-    source = (DASHBOARD / "light.js").read_text(encoding="utf-8")
+    source = (DASHBOARD / "library/trustlight.js").read_text(encoding="utf-8")
     (weights,) = re.findall(r"const WEIGHTS = \{(.*?)\};", source, re.DOTALL)
     weighed = re.findall(r'"(\w+)"(?!:)', weights)
     of_warnings = re.findall(r"^\| `(\w+)` \| (?:warning|either) \|", NOTICES, re.MULTILINE)

@@ -126,7 +126,7 @@ def test_the_choice_is_kept_and_can_be_taken_back_in_two_languages(site: Site, p
     page.until(lambda: page.shown.get("way") == "stream")
     page.driver.execute_async_script(
         "const done = arguments[0]; "
-        "import(new URL('messages.js', document.scripts[0].src))"
+        "import(new URL('base/messages.js', document.scripts[0].src))"
         ".then(({ setLanguage }) => { setLanguage('de'); done() })"
     )
     page.until_text("#way", say("way.why_never", "de"))

@@ -13,7 +13,7 @@ LANGUAGES = ("en", "de")
 @cache
 def table(language: str) -> dict[str, dict[str, str]]:
     """The page's words, by section and code."""
-    text = (DASHBOARD / f"messages.{language}.js").read_text(encoding="utf-8")
+    text = (DASHBOARD / "base" / f"messages.{language}.js").read_text(encoding="utf-8")
     found: dict[str, dict[str, str]] = json.loads(text[text.index("{") : text.rindex("}") + 1])
     return found
 

@@ -176,9 +176,9 @@ def script_of_page(service: ServiceUnderTest) -> str:
 
 def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_changes_with_them(tmp_path: Path) -> None:
     folder = tmp_path / "page"
-    folder.mkdir()
-    (folder / "index.html").write_text('<script type="module" src="main.js"></script>')
-    script = folder / "main.js"
+    (folder / "parts").mkdir(parents=True)
+    (folder / "index.html").write_text('<script type="module" src="parts/main.js"></script><a href="./live.html">')
+    script = folder / "parts" / "main.js"
     script.write_text("// first" + " " * 2000)
     for service in running_service(tmp_path / "data", dashboard_dir=folder):
         address = script_of_page(service)
@@ -190,7 +190,8 @@ def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_ch
         assert script_of_page(service) != address
         late = service.http.get(address)  # of a page that was loaded before
         assert (late.text, late.headers["Cache-Control"]) == ("// second", "no-store")
-        assert service.http.get("/main.js").headers["Cache-Control"] == "no-store"
+        assert service.http.get("/parts/main.js").headers["Cache-Control"] == "no-store"
+        assert 'href="./live.html"' in service.http.get("/").text
         assert_problem(service.http.get("/v/0/../../data"), 404)
 
 

@@ -1,8 +1,8 @@
 // A file that shows one scene without a service: the player of the page, with a few controls. The scene lies in the file.
 
-import { dateTime, element, setText } from "../element.js";
-import { listenToGestures } from "../gestures.js";
-import { figure, noticeWords, showWords, words } from "../messages.js";
+import { dateTime, element, setText } from "../base/element.js";
+import { listenToGestures } from "../base/gestures.js";
+import { figure, noticeWords, showWords, words } from "../base/messages.js";
 import { Player } from "../player/player.js";
 import { graphics } from "../player/support.js";
 

@@ -1,7 +1,7 @@
 // The service's routes of live feeds, as this screen uses them. What goes wrong is thrown as a Problem.
 
-import { bodyOf, request } from "../api.js";
-import { ServerEvents } from "../events.js";
+import { bodyOf, request } from "../base/api.js";
+import { ServerEvents } from "../base/events.js";
 
 /**
  * A feed as the service shows it. Moments are UNIX times, s.
@@ -52,7 +52,7 @@ export function openFeed(options, calibration) {
  * Make a job of a part of the recording.
  * @param {string} id
  * @param {{from: number | string, to: number | string, label?: string}} part
- * @returns {Promise<import("../api.js").Job & {cut: {from_s: number, to_s: number}}>}
+ * @returns {Promise<import("../base/api.js").Job & {cut: {from_s: number, to_s: number}}>}
  */
 export function cutFeed(id, part) {
   const key = [...crypto.getRandomValues(new Uint32Array(4))].map((number) => number.toString(16)).join("-");

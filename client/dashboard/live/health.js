@@ -1,7 +1,7 @@
 // How the feed does, in words and numbers: what comes in, what the model learns of it, and whether it is recorded.
 
-import { element, setText } from "../element.js";
-import { figure, hasWords, words } from "../messages.js";
+import { element, setText } from "../base/element.js";
+import { figure, hasWords, words } from "../base/messages.js";
 
 /** States in which pairs come in and are recorded, unless `recording` says why not. */
 const RECORDED = ["live", "behind"];

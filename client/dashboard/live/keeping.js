@@ -1,12 +1,12 @@
 // "Keep last 30 s": a part of the recording becomes a clip, and a scene in the background. A line says how far it is.
 
-import { getJob } from "../api.js";
-import { clockTime, element, setText } from "../element.js";
-import { TimesLeft } from "../left.js";
-import { figure, languageEvents, words } from "../messages.js";
-import { pause } from "../pause.js";
-import { failureOf } from "../problem.js";
-import { progressOf } from "../progress.js";
+import { getJob } from "../base/api.js";
+import { clockTime, element, setText } from "../base/element.js";
+import { figure, languageEvents, words } from "../base/messages.js";
+import { pause } from "../base/pause.js";
+import { failureOf } from "../base/problem.js";
+import { progressOf } from "../library/progress.js";
+import { TimesLeft } from "../library/timeleft.js";
 import { cutFeed } from "./feeds.js";
 
 export const KEPT_S = 30;
@@ -30,7 +30,7 @@ export class Keeping {
   forget() {
     this.visit += 1;
     this.isCutting = false;
-    /** @type {{fromS: number, toS: number, job: import("../api.js").Job} | null} */
+    /** @type {{fromS: number, toS: number, job: import("../base/api.js").Job} | null} */
     this.kept = null;
     /** @type {Error | null} */
     this.problem = null;

@@ -1,7 +1,7 @@
 // Links to the live screens of feeds.
 
-import { element } from "../element.js";
-import { hasWords, language, words } from "../messages.js";
+import { element } from "../base/element.js";
+import { hasWords, language, words } from "../base/messages.js";
 import { listFeeds } from "./feeds.js";
 
 const LOOK_MS = 500;

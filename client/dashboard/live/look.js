@@ -1,7 +1,7 @@
 // What the model shows: which moment of the feed, from where. It follows the endoscope until somebody freezes it, looks
 // back, or turns it.
 
-import { Orbit } from "../orbit.js";
+import { Orbit } from "../stage/orbit.js";
 
 const ROCK_DEG = 8;
 const ROCK_PERIOD_MS = 4000;

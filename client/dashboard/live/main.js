@@ -1,15 +1,15 @@
 // The live screen: the endoscope's picture beside the model of it, one word on top, the past below, five actions.
 
-import { clockTime, setText } from "../element.js";
-import { prepareFullScreen, ScreenLight } from "../fullscreen.js";
-import { listenToGestures } from "../gestures.js";
-import { keyEvents, showKeyForm } from "../key.js";
-import { listenToKeys, onKeys } from "../keys.js";
-import { lightMark, trustOf } from "../light.js";
-import { figure, language, languageEvents, noticeWords, setLanguage, showWords, words } from "../messages.js";
-import { hush } from "../news.js";
-import { placeInPicture } from "../pointer.js";
-import { Scopes } from "../scopes.js";
+import { closeBanner } from "../base/banners.js";
+import { clockTime, setText } from "../base/element.js";
+import { prepareFullScreen, ScreenLight } from "../base/fullscreen.js";
+import { listenToGestures } from "../base/gestures.js";
+import { keyEvents, showKeyForm } from "../base/key.js";
+import { listenToKeys, onKeys } from "../base/keys.js";
+import { figure, language, languageEvents, noticeWords, setLanguage, showWords, words } from "../base/messages.js";
+import { Scopes } from "../base/scopes.js";
+import { lightMark, trustOf } from "../library/trustlight.js";
+import { placeInPicture } from "../measure/pointer.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
 import { headlineOf, headlineOfPicture } from "./headline.js";
@@ -96,7 +96,7 @@ function view(id) {
   clock.forget();
   tape.forget();
   keeping.forget();
-  hush(get("message"));
+  closeBanner(get("message"));
   look.open(id);
   picture.open(id);
   events = id && new FeedEvents(id, take, end);
@@ -216,7 +216,7 @@ function showTrust() {
 
 async function act(button, work) {
   button.disabled = true;
-  hush(get("message"));
+  closeBanner(get("message"));
   try {
     const told = await work();
     if (told?.state && told.id === feedId) take(told);

@@ -1,12 +1,12 @@
 // Two points of the frozen moment, and their distance in mm.
 
-import { getMeasurement } from "../api.js";
-import { setText } from "../element.js";
-import { figure, languageEvents, words } from "../messages.js";
-import { Overlay } from "../overlay.js";
-import { queryOf } from "../places.js";
-import { PointPicker } from "../pointpicker.js";
-import { readingOf } from "../probe.js";
+import { getMeasurement } from "../base/api.js";
+import { setText } from "../base/element.js";
+import { figure, languageEvents, words } from "../base/messages.js";
+import { Overlay } from "../measure/overlay.js";
+import { queryOf } from "../measure/places.js";
+import { PointPicker } from "../measure/pointpicker.js";
+import { readingOf } from "../measure/probe.js";
 
 /** A pointer that moves less between down and up has clicked, and turns nothing. */
 const CLICK_PX = 8;

@@ -1,15 +1,15 @@
 // The model's picture over /stream. A view that moves is asked for again and again, the newest wish alone; one that rests
 // at the newest moment is followed: the service sends each newer moment by itself.
 
-import { askForKey, currentKey } from "../key.js";
-import { Problem, wrongKeyWords } from "../problem.js";
-import { unpack } from "../stream.js";
+import { askForKey, currentKey } from "../base/key.js";
+import { Problem, wrongKeyWords } from "../base/problem.js";
+import { unpack } from "../stage/stream.js";
 
 /** @typedef {{scene: string, t: string, pose?: string, follow?: true}} Wish of a view */
 /**
  * What came. image: of the view. capturedAtS: the moment of the feed. asked: the wish that it answers.
- * @typedef {{asked: Wish, capturedAtS: number, camera: import("../stream.js").Camera | null, unseen: number,
- *   warnings: import("../wire.js").Notice[]}} ModelShown
+ * @typedef {{asked: Wish, capturedAtS: number, camera: import("../stage/stream.js").Camera | null, unseen: number,
+ *   warnings: import("../base/wire.js").Notice[]}} ModelShown
  */
 
 const RECONNECT_MS = 500;

@@ -1,8 +1,8 @@
 // The list of open feeds, and the form that opens another: from an address, or from a capture device of this browser.
 
-import { setText } from "../element.js";
-import { languageEvents, words } from "../messages.js";
-import { showProblem } from "../problem.js";
+import { setText } from "../base/element.js";
+import { languageEvents, words } from "../base/messages.js";
+import { showProblem } from "../base/problem.js";
 import { listFeeds, openFeed } from "./feeds.js";
 import { showFeeds } from "./links.js";
 import { canCapture, openCapture } from "./push.js";
@@ -38,7 +38,7 @@ export class Opening {
     this.timer = setInterval(() => this.#list(), LOOK_MS);
   }
 
-  /** @param {import("../scopes.js").Scopes} scopes */
+  /** @param {import("../base/scopes.js").Scopes} scopes */
   allow(scopes) {
     this.parts.form.hidden = !scopes.has("feeds");
   }

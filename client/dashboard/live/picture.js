@@ -1,7 +1,7 @@
 // The endoscope's own picture, asked for again as soon as one has come, ten times a second at most: the newest wins, and
 // nothing waits in a line.
 
-import { pause } from "../pause.js";
+import { pause } from "../base/pause.js";
 import { getLivePicture } from "./feeds.js";
 
 const PERIOD_MS = 100;

@@ -1,8 +1,8 @@
 // Sends the pictures of a capture device of this browser to a feed: both eyes in one picture, as JPEG over a WebSocket.
 // At most two are on their way, so a slow line skips pictures and delays none.
 
-import { currentKey } from "../key.js";
-import { Pace } from "../pace.js";
+import { currentKey } from "../base/key.js";
+import { Pace } from "../stage/rate.js";
 
 const PERIOD_MS = 1000 / 15;
 const MAX_UNANSWERED = 2;

@@ -1,7 +1,7 @@
 // The past that can be looked at, now at its right edge: drag back, and the model shows that moment.
 
-import { clockTime, draw, setText } from "../element.js";
-import { figure, words } from "../messages.js";
+import { clockTime, draw, setText } from "../base/element.js";
+import { figure, words } from "../base/messages.js";
 
 /** Lengths of the tape, s: the shortest that holds the past. */
 const SPANS_S = [30, 60, 120, 300, 600, 1200, 1800, 3600];

@@ -1,0 +1,110 @@
+// The page's address: #/scene/ID?t=&pose=&layer= names a view, so that it survives a reload and can be sent to others.
+// #/live/ID leads to the live screen of a feed.
+
+import { addressOf } from "../live/links.js";
+import { words } from "./messages.js";
+
+/** @typedef {{scene: string, t: number, pose: string | null, layer: string}} Place pose: as GET /render spells it, or RIGHT_EYE */
+
+/** Not a pose of the service's: the endoscope's right eye, wherever it is at t. */
+export const RIGHT_EYE = "right";
+const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
+const LIVE = /^#\/live\/([0-9a-f]{32})$/;
+const ID = /^[0-9a-f]{32}$/;
+const POSE = /^(right|orbit:[-\d.e]+(,[-\d.e]+){2}((,[-\d.e]+){3})?|[-\d.e]+(,[-\d.e]+){11})$/;
+const WRITE_AFTER_MS = 400;
+const TOLD_MS = 6000;
+
+/**
+ * @param {string} hash of an address
+ * @param {string[]} layers there are
+ * @returns {{place: Place | null, wrong: string}} wrong: what cannot be read, in words; the rest of the place stands
+ */
+export function placeOf(hash, layers) {
+  if (hash === "" || hash === "#" || hash === "#/") return { place: null, wrong: "" };
+  const found = SCENE.exec(hash);
+  if (!found) return { place: null, wrong: words("address.unknown") };
+  if (!ID.test(found[1])) return { place: null, wrong: words("address.scene") };
+  const query = new URLSearchParams(found[2] ?? "");
+  const wrong = [];
+  const read = (name, isGood, otherwise) => {
+    const text = query.get(name);
+    if (text === null || isGood(text)) return text ?? otherwise;
+    wrong.push(words(`address.${name}`));
+    return otherwise;
+  };
+  const t = Number(read("t", (text) => text.trim() !== "" && Number(text) >= 0 && Number(text) <= 1, "0"));
+  const pose = read("pose", (text) => POSE.test(text), null);
+  const layer = read("layer", (text) => layers.includes(text), layers[0]);
+  return { place: { scene: found[1], t, pose, layer }, wrong: wrong.join(" ") };
+}
+
+/** @param {Place} place @param {string} usual the layer that needs no name @returns {string} the hash */
+export function hashOf({ scene, t, pose, layer }, usual) {
+  const parts = [];
+  if (t > 0) parts.push(`t=${Number(t.toFixed(4))}`);
+  if (pose !== null) parts.push(`pose=${pose.trim().replace(/[,\s]+/g, ",")}`);
+  if (layer !== usual) parts.push(`layer=${layer}`);
+  return `#/scene/${scene}${parts.length ? `?${parts.join("&")}` : ""}`;
+}
+
+/** Keeps the address true while the view changes. */
+export class Address {
+  /**
+   * @param {import("../stage/viewer.js").Viewer} viewer
+   * @param {HTMLSelectElement} layer
+   * @param {(place: Place) => void} go there: somebody followed or typed an address
+   * @param {(text: string, isBad?: boolean) => void} tell
+   */
+  constructor(viewer, layer, go, tell) {
+    Object.assign(this, { viewer, layer, go, tell });
+    this.timer = 0;
+    addEventListener("hashchange", () => this.follow());
+    viewer.addEventListener("shown", () => this.note());
+    viewer.addEventListener("refused", () => tell(words("address.pose")));
+  }
+
+  get #layers() {
+    return [...this.layer.options].map((each) => each.value);
+  }
+
+  /** Go where the address says. @returns {boolean} whether it names a scene */
+  follow() {
+    const [, feed] = LIVE.exec(location.hash) ?? [];
+    if (feed) location.replace(addressOf(feed));
+    if (feed) return true;
+    const { place, wrong } = placeOf(location.hash, this.#layers);
+    this.tell("");
+    if (place) this.go(place);
+    if (wrong) this.tell(wrong);
+    return place !== null;
+  }
+
+  /** Say soon where the page is: not at every frame, not while it plays, and not in the history. */
+  note() {
+    this.timer ||= setTimeout(() => {
+      this.timer = 0;
+      if (!this.viewer.timeline.isPlaying) this.write();
+    }, WRITE_AFTER_MS);
+  }
+
+  /** Say it now. */
+  write() {
+    const { scene, timeline, orbit } = this.viewer;
+    const place = { scene, t: timeline.t, pose: orbit.place, layer: this.layer.value };
+    const hash = scene ? hashOf(place, this.#layers[0]) : "";
+    if (hash !== location.hash) history.replaceState(null, "", hash || location.pathname);
+  }
+
+  /** Put the address where it can be pasted from, and say so. */
+  async copy() {
+    this.write();
+    try {
+      await navigator.clipboard.writeText(location.href);
+      this.tell(words("address.copied"), false);
+      setTimeout(() => this.tell(""), TOLD_MS);
+    } catch {
+      this.tell(words("address.copy_by_hand", { link: location.href }), false); // pages without HTTPS have no clipboard
+    }
+  }
+}

@@ -1,0 +1,53 @@
+// Points, line and cross over the picture, at places of the tissue or points of the picture.
+
+import { draw } from "../base/element.js";
+import { project, toScreen } from "./places.js";
+
+const ARM_PX = 9;
+
+export class Overlay {
+  /** @param {HTMLElement} over an element that covers the stage, with an svg @param {HTMLElement} canvas of the picture */
+  constructor(over, canvas) {
+    this.over = over;
+    this.canvas = canvas;
+    this.svg = over.querySelector("svg");
+  }
+
+  clear() {
+    this.svg.replaceChildren();
+  }
+
+  /** @param {import("../stage/stream.js").Camera} camera @param {number[][]} points of the picture */
+  points(camera, points) {
+    this.clear();
+    for (const point of points) this.#mark("point", this.#at(camera, point));
+  }
+
+  /** @param {import("../stage/stream.js").Camera} camera @param {number[][]} places two, in mm @param {string} text */
+  line(camera, places, text) {
+    this.clear();
+    const ends = places.map((place) => project(camera, place)).map((each) => each && this.#at(camera, each));
+    if (ends.includes(null)) return;
+    const [[x1, y1], [x2, y2]] = ends;
+    for (const name of ["under", "line"]) draw(this.svg, "line", { class: name, x1, y1, x2, y2 });
+    for (const end of ends) this.#mark("point", end);
+    const [x, y] = [(x1 + x2) / 2, (y1 + y2) / 2 - ARM_PX];
+    draw(this.svg, "text", { x, y }, text);
+  }
+
+  /** @param {import("../stage/stream.js").Camera} camera @param {number[]} point of the picture, besides what is there */
+  cross(camera, point) {
+    this.#mark("cross", this.#at(camera, point));
+  }
+
+  #at(camera, point) {
+    const [x, y] = toScreen(this.canvas, camera, point);
+    const { left, top } = this.over.getBoundingClientRect();
+    return [x - left, y - top];
+  }
+
+  #mark(name, [x, y]) {
+    const arms = `M${x - ARM_PX} ${y}H${x + ARM_PX}M${x} ${y - ARM_PX}V${y + ARM_PX}`;
+    for (const each of ["under", name]) draw(this.svg, "path", { class: each, d: arms });
+  }
+}

@@ -1,0 +1,145 @@
+// Where pictures come from: the stream, and one by one from GET /render while there is no stream.
+
+import { bodyOf, request } from "../base/api.js";
+import { keyEvents } from "../base/key.js";
+import { noticeWords, words } from "../base/messages.js";
+import { Stream } from "./stream.js";
+
+/** @typedef {import("./stream.js").View} View */
+/** @typedef {import("./stream.js").Picture} Picture */
+
+/** Longer than the service waits for a worker (render_timeout_s). */
+const ANSWER_MS = 25000;
+const FIRST_RETRY_MS = 1000;
+const MAX_RETRY_MS = 15000;
+
+/** Not a layer of the model, but what the endoscope saw, with the masked parts marked. */
+const RECORDED = "recorded";
+
+/** A smaller share of a view is no hatch that anybody sees. The service warns from 0.05 on. */
+const LEAST_UNSEEN = 0.005;
+const GUESSES = ["pose_far", "time_outside_clip"];
+/** What a view itself says; all other notices are of its scene. */
+const OF_VIEW = [...GUESSES, "unseen", "hardly_seen", "enlarged"];
+
+/** @param {string} path @param {AbortSignal} signal @returns {Promise<Picture>} */
+async function askOnce(path, signal) {
+  const response = await request(path, { signal });
+  const header = (name) => response.headers.get(`X-Intrasplat-${name}`);
+  const total = /total;dur=([\d.]+)/.exec(response.headers.get("Server-Timing") ?? "");
+  return {
+    blob: await bodyOf(response, "blob"),
+    scene: header("Scene"),
+    state: header("State"),
+    t: Number(header("T")),
+    iteration: header("Iteration") === null ? null : Number(header("Iteration")),
+    unseen: Number(header("Unseen")),
+    codes: header("Warning-Codes")?.split(", ") ?? [],
+    totalMs: total ? Number(total[1]) : NaN,
+    camera: JSON.parse(header("Camera") ?? "null"),
+    depthRangeMm: header("Depth-Range-Mm")?.split(" ").map(Number) ?? null,
+    way: "single",
+  };
+}
+
+/**
+ * Whether a notice says that a picture shows a guess. What is hatched is none, and at the endoscope's own pose the clip
+ * saw what is shown, hardly or well.
+ * @param {string} code @param {View} view
+ */
+function isGuess(code, view) {
+  if (code === "unseen") return view.unseen === "guess";
+  if (code === "hardly_seen") return view.pose !== undefined;
+  return GUESSES.includes(code);
+}
+
+const withViewFirst = (codes) => [true, false].flatMap((isOfView) => codes.filter((code) => OF_VIEW.includes(code) === isOfView));
+
+/** What to know of a view, in the page's words. @param {string} code @param {View} view */
+const wordsOf = (code, view) =>
+  code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" });
+
+/**
+ * What to know of a picture: of this view first, then of its scene.
+ * @param {string[]} codes of the picture @param {View} view
+ * @param {{code: string, text: string}[]} reasons for care with the scene, in words
+ * @returns {string}
+ */
+export function warningOf(codes, view, reasons) {
+  const own = codes.filter((code) => !reasons.some((reason) => reason.code === code));
+  const sentences = [...withViewFirst(own).map((code) => wordsOf(code, view)), ...reasons.map(({ text }) => text)];
+  return [...new Set(sentences)].filter(Boolean).join(" ");
+}
+
+/** Note of a picture of a view what its codes mean. @param {Picture} picture @param {View} view @returns {Picture} */
+export function judged(picture, view) {
+  const isUnseen = picture.unseen >= LEAST_UNSEEN && !picture.codes.includes("unseen");
+  if (isUnseen) picture.codes = [...picture.codes, "unseen"]; // what is hatched, or guessed, is named
+  picture.isRecorded = view.layer === RECORDED;
+  picture.isExtrapolated = picture.codes.some((code) => isGuess(code, view));
+  return picture;
+}
+
+/** @param {View} view */
+const pathOf = (view) =>
+  view.layer === RECORDED ? `/scenes/${view.scene}/recorded?t=${view.t}` : `/render?${new URLSearchParams(view)}`;
+
+export class Pictures {
+  constructor() {
+    this.stream = new Stream();
+    this.retryMs = FIRST_RETRY_MS;
+    this.retryAt = 0;
+    this.controller = new AbortController();
+    keyEvents.addEventListener("changed", () => {
+      this.stream.close();
+      this.retryAt = 0;
+    });
+  }
+
+  /** Wait no more for what was asked. */
+  giveUp() {
+    this.controller.abort();
+    this.stream.giveUp();
+  }
+
+  /**
+   * The picture of a view; one at a time.
+   * @param {View} view
+   * @returns {Promise<Picture>}
+   */
+  async ask(view) {
+    this.#keepOpen();
+    const isStreamed = this.stream.isOpen && view.layer !== RECORDED;
+    const picture = isStreamed ? await this.#fromStream(view) : await this.#fromPath(pathOf(view));
+    if (picture.scene !== view.scene) throw new Error(words("page.other_scene"));
+    return picture;
+  }
+
+  /** Have the stream back for the next picture. @returns {boolean} whether it would come another way than the last */
+  prepare(way) {
+    this.#keepOpen();
+    return way === "single" && this.stream.isOpen;
+  }
+
+  #keepOpen() {
+    if (this.stream.isOpen) this.retryMs = FIRST_RETRY_MS;
+    if (this.stream.isOpen || this.stream.isConnecting || performance.now() < this.retryAt) return;
+    this.retryAt = performance.now() + this.retryMs;
+    this.retryMs = Math.min(MAX_RETRY_MS, this.retryMs * 2);
+    this.stream.connect();
+  }
+
+  async #fromPath(path) {
+    this.controller = new AbortController();
+    return askOnce(path, AbortSignal.any([this.controller.signal, AbortSignal.timeout(ANSWER_MS)]));
+  }
+
+  async #fromStream(view) {
+    const timer = setTimeout(() => this.stream.close(), ANSWER_MS); // a connection that is silent for this long is dead
+    try {
+      return await this.stream.ask(view);
+    } finally {
+      clearTimeout(timer);
+    }
+  }
+}
