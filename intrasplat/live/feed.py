@@ -192,8 +192,9 @@ class Feed:
         return self._source.cut(from_s, to_s, path)
 
     def pause(self) -> None:
-        """Read, learn and store nothing from now on; what is known stays."""
+        """Read, learn and store nothing more once this returns; what is known stays."""
         self._source.pause()
+        self._model.settle()
 
     def resume(self) -> None:
         """Go on at the source's present."""

@@ -83,6 +83,7 @@ class FeedModel:
         self._source, self._calibration, self._settings, self._past = source, calibration, settings, past
         self._device, self._budget_s = device, budget_s
         self.changed = threading.Condition()
+        self._learning = threading.Lock()
         self._follower: Follower | None = None
         self._trouble: Trouble | None = None
         self._closed = False
@@ -145,6 +146,11 @@ class FeedModel:
         camera, steps = found[1].clip.intrinsics, float(median([*self._steps] or [0]))
         return ModelNumbers(follower.iteration, follower.gaussians, camera.width, camera.height, steps)
 
+    def settle(self) -> None:
+        """Wait until the pair that is being learnt is known. Of a source that is paused, none follows."""
+        with self._learning:
+            pass
+
     def close(self) -> None:
         """End. What the model knows becomes a segment."""
         self._closed = True
@@ -164,8 +170,9 @@ class FeedModel:
                     self._rest(IDLE_S)
                     continue
                 after = pair.sequence
-                if self._is_tissue(pair):
-                    self._take(pair)
+                with self._learning:
+                    if self._source.state is not FeedState.PAUSED and self._is_tissue(pair):
+                        self._take(pair)
                 failures = 0
             except Exception as error:
                 failures += 1
