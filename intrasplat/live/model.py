@@ -41,6 +41,11 @@ JUDGED_PAIRS = 12
 """Pairs over which the steps are counted before a width is chosen."""
 WANTED_STEPS = 10.0
 """Steps a pair that a larger width must leave."""
+PERIOD_S, LARGE_PERIOD_S, GPU_PERIOD_S = 0.19, 0.31, 0.035
+"""From one used pair to the next: of pictures up to LARGE_FROM px wide, of wider ones, and on a GPU."""
+LARGE_FROM = 400
+LEAST_BUDGET_SHARE = 0.4
+"""Of the period, for reading and training, however long the rest takes."""
 NO_SCENE_S = 3.0
 """Without a used pair for longer the feed is stalled."""
 FIRST_BACK_OFF_S, MOST_BACK_OFF_S = 0.5, 8.0
@@ -75,7 +80,8 @@ class FeedModel:
         budget_s: float | None = None,
         watch: TissueWatch | None = None,
     ) -> None:
-        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: chosen by size and device.
+        """settings.eyes.width: None: it is chosen. budget_s: seconds for each pair; None: what size and device
+        want, less what its look at the trained model takes.
 
         watch: is given what each pair shows; pairs without tissue are not learnt. None: all are.
         """
@@ -90,6 +96,7 @@ class FeedModel:
         self._used = self._given = 0
         self._used_at: deque[float] = deque()
         self._steps: deque[int] = deque(maxlen=JUDGED_PAIRS)
+        self._over_s: deque[float] = deque(maxlen=JUDGED_PAIRS)
         self._width = settings.eyes.width
         self._has_chosen = settings.eyes.width is not None
         self._began_s = self._last_used_at = time.monotonic()
@@ -183,8 +190,8 @@ class FeedModel:
     def _take(self, pair: FeedPair) -> None:
         """Learn a pair."""
         follower = self._follower or self._begun()
-        before = follower.iteration
-        became = follower.add(pair, self._budget())
+        before, budget_s, start_s = follower.iteration, self._budget(), time.perf_counter()
+        became = follower.add(pair, budget_s)
         if became is not Added.NO_SCENE or self._used:  # without a scene so far, the calibration may be wrong
             self._saw(pair, is_tissue=became not in (Added.NO_TISSUE, Added.NO_SCENE))
         if became not in (Added.FIRST, Added.FOLLOWED, Added.RESTARTED):
@@ -195,6 +202,7 @@ class FeedModel:
             self._used_at.append(self._last_used_at)
             if became is Added.FOLLOWED:
                 self._steps.append(follower.iteration - before)
+                self._over_s.append(time.perf_counter() - start_s - budget_s)
             self._trouble = None
             self.changed.notify_all()
         self._choose_width(pair.left.shape[1])
@@ -231,8 +239,10 @@ class FeedModel:
         if self._budget_s is not None:
             return self._budget_s
         if self._device.kind != CPU.kind:
-            return 0.03
-        return 0.165 if (self._width or FIRST_WIDTH) <= 400 else 0.28
+            period_s = GPU_PERIOD_S
+        else:
+            period_s = PERIOD_S if (self._width or FIRST_WIDTH) <= LARGE_FROM else LARGE_PERIOD_S
+        return max(LEAST_BUDGET_SHARE * period_s, period_s - median([*self._over_s] or [0.0]))
 
     def _choose_width(self, recorded_width: int) -> None:
         """Once, after some pairs, the width that the machine keeps up with; later a smaller one if it does not."""
@@ -245,6 +255,7 @@ class FeedModel:
         if chosen != width:
             self._width = chosen
             self._steps.clear()
+            self._over_s.clear()
             self._end_follower()
 
     def _end_follower(self) -> None:
