@@ -31,11 +31,18 @@ WEIGHTS = np.array([1.0, -1.37, -0.48])
 lab.benchmarks.bm_confidence --fit` finds them."""
 BIAS = -8.7
 TEXTURE_SIDE_PX = 7
+DETAIL_WEIGHT, DETAIL_BIAS = 0.9, -0.3
+"""Of the weight with which recorded frames of two eyes reach a pixel: where they do, they bear the model out, too."""
 
 
-def confidence(found: NDArray[np.float32]) -> Image:
-    """[H, W] confidence in (0, 1) from the evidence [3, H, W]."""
+def confidence(found: NDArray[np.float32], detail: Image | None = None) -> Image:
+    """[H, W] confidence in (0, 1) from the evidence [3, H, W].
+
+    detail: [H, W] in [0, 1], weight of the recorded frames in a view's detail; None: it has none, or of one eye alone.
+    """
     odds = np.tensordot(WEIGHTS.astype(np.float32), found, axes=1) + np.float32(BIAS)
+    if detail is not None:
+        odds += np.float32(DETAIL_WEIGHT) * detail + np.float32(DETAIL_BIAS)
     return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
 
 

@@ -69,17 +69,21 @@ Residuals = dict[tuple[int, int], Residual]
 class Added:
     """What a view gets from the recorded frames.
 
-    rgb    [H, W, 3] to be added to its colours, in the model's steady light
-    share  of the view's solid pixels that get something
+    rgb     [H, W, 3] to be added to its colours, in the model's steady light
+    weight  [H, W] in [0, 1], how much of what the recorded frames show of a pixel reaches it
     """
 
     rgb: Floats
-    share: float
+    weight: Floats
 
     @classmethod
     def nothing(cls, size: tuple[int, ...]) -> Added:
         """For a view of size [H, W]."""
-        return cls(np.zeros((*size, 3), np.float32), 0.0)
+        return cls(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32))
+
+    def share(self, depth_mm: Floats) -> float:
+        """Of the solid pixels of a view [H, W] with that depth, the share that gets something."""
+        return float(self.weight.sum()) / max(int(np.count_nonzero(depth_mm)), 1)
 
 
 class Detail:
@@ -146,12 +150,11 @@ class Detail:
         if not used:
             return Added.nothing(depth_mm.shape)
         found = {eye: (total[..., :3], total[..., 3]) for eye, total in totals.items()}
-        rgb, seen = (
-            found[nearest]
+        return Added(
+            *found[nearest]
             if is_own
             else _together(found, list(map(view.finer, own)), view.finer(shared), is_dimmed=is_dimmed)
         )
-        return Added(rgb, float(seen.sum()) / max(int(np.count_nonzero(depth_mm)), 1))
 
     def _eye_pose(self, eye: int, t: float) -> Pose:
         return endoscope_pose(self._scene, t) @ self._pictures.eyes[eye].left_from_eye

@@ -141,7 +141,7 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     has_detail = view.detail == "on" and not view.is_coarse and scene.pictures is not None
     with_colours = has_detail or lenses.judged == lenses.drawn
     picture = yield from _rendered(view, lenses.drawn, with_colours=with_colours, with_rgb=not has_detail)
-    detail_share, of_detail = (yield from _add_detail(view, picture)) if has_detail else (0.0, ())
+    added, of_detail = (yield from _add_detail(view, picture)) if has_detail else (None, ())
     unseen = unseen_pixels(picture.missing)
     rgb, drawn = picture.rgb, (lenses.drawn, view.pose)
     if view.smoke == "show":
@@ -156,14 +156,16 @@ def frame_in_parts(view: ViewRequest, *, with_confidence: bool = False) -> Parts
     if not view.highlights and scene.right_eye_mm is None:
         warnings = (*warnings, Notice.info(NoticeCode.HIGHLIGHTS_UNKNOWN, HIGHLIGHTS_STAY))
     yield
-    known = (yield from _confidence(view, picture)) if with_confidence else None
+    weight = None if added is None or scene.right_eye_mm is None else added.weight
+    known = (yield from _confidence(view, picture, weight)) if with_confidence else None
 
     def likely() -> NDArray[np.float32]:
-        return whole(_confidence(view, picture)) if known is None else known
+        return whole(_confidence(view, picture, weight)) if known is None else known
 
     def smoke() -> NDArray[np.float32]:
         return smoke_share(scene, view.shown_t, picture.depth_mm, drawn)
 
+    detail_share = 0.0 if added is None else added.share(picture.depth_mm)
     frame = View(rgb, picture.depth_mm, unseen, _share(unseen), detail_share, warnings, likely, smoke)
     is_as_asked = pixel_count(lenses.drawn) == pixel_count(lenses.asked)
     return frame if is_as_asked else frame.reduced(lenses.asked.width, lenses.asked.height)
@@ -236,14 +238,14 @@ def _rendered(view: ViewRequest, lens: Intrinsics, *, with_colours: bool, with_r
     return picture
 
 
-def _add_detail(view: ViewRequest, picture: _Picture) -> Parts[tuple[float, tuple[Notice, ...]]]:
+def _add_detail(view: ViewRequest, picture: _Picture) -> Parts[tuple[Added | None, tuple[Notice, ...]]]:
     """Set the picture's rgb: its colours and what they miss of the recorded frames.
 
-    Returns the share of the tissue whose detail comes from those, and a warning if they cannot be read.
+    Returns what was added, None if there are no such frames, and a warning if they cannot be read.
     """
     assert picture.colours is not None
     renderer, lens = renderer_of(view.scene, view.device), view.lenses.drawn
-    added, warnings = Added.nothing(picture.depth_mm.shape), tuple[Notice, ...]()
+    added, warnings = None, tuple[Notice, ...]()
     try:
         if (detail := renderer.detail) is not None:
             added = yield from detail.added(
@@ -256,12 +258,15 @@ def _add_detail(view: ViewRequest, picture: _Picture) -> Parts[tuple[float, tupl
     if view.light == "recorded":
         factors = EndoscopeLight(view.scene, view.shown_t, view.pose, lens).factors(picture.depth_mm)
     light = np.broadcast_to(np.float32(1) if factors is None else factors, picture.rgb.shape)
-    run(in_levels, picture.colours, added.rgb, light, picture.rgb)
-    return added.share, warnings
+    missed = (added or Added.nothing(picture.depth_mm.shape)).rgb
+    run(in_levels, picture.colours, missed, light, picture.rgb)
+    return added, warnings
 
 
-def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float32]]:
+def _confidence(view: ViewRequest, picture: _Picture, detail: NDArray[np.float32] | None) -> Parts[NDArray[np.float32]]:
     """[H, W] the confidence of a view's picture; 0 where nothing solid is drawn or trust is 0.
+
+    detail: as in confidence(), of the picture's size.
 
     If the picture has more pixels than it is judged in, it is rendered again in those, and its confidence is enlarged.
     """
@@ -275,7 +280,9 @@ def _confidence(view: ViewRequest, picture: _Picture) -> Parts[NDArray[np.float3
         camera, endoscope = (lenses.judged, view.pose), (lenses.endoscope, view.endoscope_pose)
         known_rgb = seen_from_endoscope(own_rgb, judged.depth_mm, camera, endoscope)
         yield
-    likely = confidence(evidence(judged.trust, judged.colours, known_rgb))
+    if detail is not None and judged is not picture:
+        detail = cv2.resize(detail, judged.missing.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    likely = confidence(evidence(judged.trust, judged.colours, known_rgb), detail)
     likely *= np.float32(followed(view.scene, view.shown_t))
     likely = np.where(judged.trust > 0, likely, 0).astype(np.float32)
     if judged is picture:

@@ -19,6 +19,7 @@ import csv
 import dataclasses
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
 from intrasplat.quality import trust
+from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.model import model_of
 from intrasplat.scene.scene import TrainedScene
@@ -41,9 +43,9 @@ from intrasplat.view.render import render_frame
 from lab.benchmarks.recorded_confidence import recorded_errors
 from lab.evaluate.ranking import PixelErrors, rank_scores, reliability
 from lab.evaluate.rows import commit, machine
-from lab.evaluate.sources import open_source, source_of
+from lab.evaluate.sources import OpenClip, open_source, source_of
 from lab.evaluate.style import GREY, PANEL_INCHES, PNG_DPI, SETTINGS
-from lab.evaluate.truth import SceneCandidate, Truth, errors_of
+from lab.evaluate.truth import Expected, ShownView, Truth, errors_of
 
 MOTIONS = ("still", "breathing", "pull", "cut")
 FITTED_ON = ("still", "cut")
@@ -63,12 +65,17 @@ class Trained:
     truth: Truth
 
 
-def trained(motion: str, eyes: str) -> Trained:
+@contextmanager
+def trained(motion: str, eyes: str) -> Iterator[Trained]:
+    """Its views have detail until this ends."""
     opened = open_source(source_of(CLIP.format(motion)), "every8", TrainingHooks())
     options = ReconstructionOptions(iterations=ITERATIONS, eyes=eyes)  # type: ignore[arg-type]  # pydantic checks it
     with tempfile.TemporaryDirectory() as folder:
         report = reconstruct(ReconstructionRequest(opened.clip, options), Path(folder), TrainingHooks())
-        scene = load_scene(Path(folder))
+        yield _trained(opened, report, load_scene(Path(folder)), eyes)
+
+
+def _trained(opened: OpenClip, report: Report, scene: TrainedScene, eyes: str) -> Trained:
     train = [i for i in range(report.frame_count) if i not in {*report.held_out, *report.repeated}]
     assert opened.phantom is not None
     truth = Truth(opened.phantom, opened.tissue, train, report.held_out, opened.tissue_right)
@@ -78,11 +85,17 @@ def trained(motion: str, eyes: str) -> Trained:
 
 def measured(motion: str) -> Iterator[dict[str, Any]]:
     """Rows of the reliability diagram; prints the rank correlations."""
-    run = trained(motion, "both")
-    candidate = SceneCandidate(run.scene)
-    for views, expected in run.truth.expected.items():
-        errors = errors_of([candidate.view(each.frame, each.pose) for each in expected], expected)
-        yield from rows_of(f"phantom-{motion}", views, errors)
+    with trained(motion, "both") as run:
+        for views, expected in run.truth.expected.items():
+            errors = errors_of([_shown(run.scene, each) for each in expected], expected)
+            yield from rows_of(f"phantom-{motion}", views, errors)
+
+
+def _shown(scene: TrainedScene, expected: Expected) -> ShownView:
+    """The view, as the service shows it."""
+    shown = render_frame(scene, expected.frame / scene.frame_count, expected.pose)
+    rgb, is_shown = shown.rgb.astype(np.float32) / np.float32(255), ~shown.unseen
+    return ShownView(rgb, shown.depth_mm * is_shown, shown.confidence * is_shown)
 
 
 def rows_of(clip: str, views: str, errors: PixelErrors) -> list[dict[str, Any]]:
@@ -136,7 +149,8 @@ def fit() -> None:
     rng, parts = np.random.default_rng(0), []
     for motion in FITTED_ON:
         for eyes in ("both", "left"):
-            parts.append(evidence_of(trained(motion, eyes), rng))
+            with trained(motion, eyes) as run:
+                parts.append(evidence_of(run, rng))
     numbers, right = (np.concatenate(each) for each in zip(*parts, strict=True))
     weights = logistic(numbers, right)
     view = float(weights[2] * np.log(LEAST_DISAGREEMENT) + weights[3] * np.median(numbers[:, 3]))

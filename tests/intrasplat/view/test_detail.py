@@ -98,7 +98,14 @@ def test_off_shows_the_model_alone_and_on_says_how_much_is_recorded(made: Made) 
     assert off.detail_share == 0
     assert 0.5 < on.detail_share <= 1
     np.testing.assert_array_equal(on.depth_mm, off.depth_mm)
-    np.testing.assert_array_equal(on.confidence, off.confidence)
+    np.testing.assert_array_equal(on.confidence, off.confidence)  # one eye alone bears nothing out
+
+
+def test_confidence_grows_where_frames_of_two_eyes_reach_and_nowhere_else(made: Made) -> None:
+    detailed = dataclasses.replace(with_pictures(made)[0], right_eye_mm=(4.0, 0.0, 0.0))
+    for angle, (low, high) in ((0, (0.02, 0.2)), (60, (-0.2, 0.0))):
+        off, on = (render_frame(detailed, 0.4, orbit_pose(angle, 0), detail=detail) for detail in ("off", "on"))
+        assert low < on.confidence.mean() - off.confidence.mean() < high
 
 
 def test_it_fades_with_the_angle(made: Made) -> None:
