@@ -41,8 +41,8 @@ JUDGED_PAIRS = 12
 """Pairs over which the steps are counted before a width is chosen."""
 WANTED_STEPS = 10.0
 """Steps a pair that a larger width must leave."""
-PERIOD_S, LARGE_PERIOD_S, GPU_PERIOD_S = 0.19, 0.31, 0.035
-"""From one used pair to the next: of pictures up to LARGE_FROM px wide, of wider ones, and on a GPU."""
+PERIOD_S, LARGE_PERIOD_S, GPU_PERIOD_S = 0.175, 0.28, 0.035
+"""Of the work on a pair, with pictures up to LARGE_FROM px wide, with wider ones, and on a GPU."""
 LARGE_FROM = 400
 LEAST_BUDGET_SHARE = 0.4
 """Of the period, for reading and training, however long the rest takes."""
