@@ -1,7 +1,7 @@
 """How soon and how old a feed is shown: a clip is played to and fro by another process, and a Feed follows it.
 
     python -m lab.benchmarks.bm_live [--clips d4d_stereo phantom:breathing:72frames:stereo] [--width 320]
-        [--seconds 60] [--fps 30] [--views-hz 5] [--detail off] [--kill 0] [--out lab/rows/live.csv]
+        [--seconds 60] [--fps 30] [--views-hz 5] [--detail off] [--kill 0] [--feeds 1] [--out lab/rows/live.csv]
 
 The clip is encoded once (H.264, both eyes side by side in the recorded size) and sent as MPEG-TS over TCP in real time.
 The feed records it, and keeps its past on disk. A thread asks for the newest moment views-hz times a second and renders
@@ -44,7 +44,7 @@ from intrasplat.splat.backend import Device, choose_device
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.view.render import render_frame
 from lab.benchmarks.bm_follow import Played, played_of
-from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
+from lab.evaluate.rows import adding_alone, commit, machine, read_rows, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, source_of
 
 CLIPS = ("d4d_stereo", "phantom:breathing:72frames:stereo")
@@ -53,12 +53,16 @@ SETTLED_S = 10.0
 REPORT_PERIOD_S = 1.0
 KILL_PERIOD_S = 8.0
 OPTIONS = {"preset": "veryfast", "tune": "zerolatency", "crf": "18", "x264-params": "scenecut=0"}
-KEY = ("clip", "width", "fps", "seconds", "detail", "kills", "device")
+KEY = ("clip", "width", "fps", "seconds", "detail", "kills", "feeds", "device")
 FIELDS = (
     *KEY, "height", "received_fps", "used_fps", "steps", "age_p50_s", "age_p95_s", "age_early_s", "age_late_s",
     "first_s", "cores", "decode_lag_s", "rss_mib", "child_mib", "disk_mb", "past_s", "behind_share", "back_s", "load",
     "machine", "commit",
 )  # fmt: skip
+
+
+FEWEST, SUMMED = ("used_fps", "received_fps", "steps", "past_s"), ("cores", "rss_mib", "child_mib", "disk_mb")
+"""Of several feeds: the least, and the sum, in a row; of the other numbers the largest."""
 
 
 @dataclass(eq=False)
@@ -84,11 +88,41 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 encode(played, stream)
                 row = {"clip": name, "width": options.width, "fps": options.fps, "seconds": options.seconds}
                 row |= {"detail": options.detail, "kills": options.kill, "device": device.kind}
+                row["feeds"] = options.feeds
+                others = [_other(name, options, Path(folder) / f"{i}.csv") for i in range(options.feeds - 1)]
                 row |= followed(played, stream, options, device)
+                row |= together([row, *(_row_of(*other) for other in others)])
             row |= {"load": os.getloadavg()[0], "machine": machine(device.kind), "commit": commit()}
             text = texts_of(row, FIELDS)
             replace_row(options.out, FIELDS, KEY, text)
             print("  ".join(f"{field} {text[field]}" for field in FIELDS[:-2] if text[field]), flush=True)
+
+
+def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The measured numbers of feeds that were followed at the same time."""
+    measured = [field for field in FIELDS[len(KEY) : -3] if field in rows[0] and rows[0][field] is not None]
+    return {field: _over(field, [float(row[field]) for row in rows]) for field in measured}
+
+
+def _over(field: str, values: Sequence[float]) -> float:
+    return min(values) if field in FEWEST else sum(values) if field in SUMMED else max(values)
+
+
+def _other(clip: str, options: argparse.Namespace, path: Path) -> tuple[subprocess.Popen[bytes], Path]:
+    """A process that follows a feed of its own."""
+    command = [sys.executable, "-m", "lab.benchmarks.bm_live", "--clips", clip, "--out", str(path)]
+    for name in ("fps", "seconds", "views_hz", "detail", "camera", "keep_s", "device"):
+        command += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
+    if options.width is not None:
+        command += ["--width", str(options.width)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL), path
+
+
+def _row_of(process: subprocess.Popen[bytes], path: Path) -> dict[str, str]:
+    """What it measured."""
+    if process.wait():
+        raise RuntimeError("Another feed failed; see above.")
+    return read_rows(path)[-1]
 
 
 def encode(played: Played, path: Path) -> None:
@@ -242,6 +276,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--camera", choices=("fixed", "moving"), default="fixed")
     parser.add_argument("--keep-s", type=float, default=600.0)
     parser.add_argument("--kill", type=int, default=0)
+    parser.add_argument("--feeds", type=int, default=1)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu")
     parser.add_argument("--out", type=Path, default=Path("lab/rows/live.csv"))
     parser.add_argument("--send", type=Path, help=argparse.SUPPRESS)
