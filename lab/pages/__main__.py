@@ -15,6 +15,7 @@ from pathlib import Path
 from lab.pages.detail import DETAIL_CHART, detail_sections
 from lab.pages.evaluation import sections, write_readme
 from lab.pages.gpu import gpu_sections
+from lab.pages.live import live_sections
 from lab.pages.moving import moving_sections
 from lab.pages.post import post_sections
 from lab.pages.programs import (
@@ -65,6 +66,7 @@ def main() -> None:
         *stability_sections(ROWS, PICTURES),
         *moving_sections(ROWS),
         *recording_sections(ROWS),
+        *live_sections(ROWS),
         *stereo_sections(ROWS),
         *raster_sections(ROWS),
         *gpu_sections(ROWS),
