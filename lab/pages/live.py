@@ -11,7 +11,7 @@ LIVE = "live.csv"
 _INTRODUCTION = """
 ## Live feeds
 
-A clip is played to and fro in real time over MPEG-TS on loopback, and followed; somebody looks at it five times a second.
+A clip is played to and fro in real time over MPEG-TS on loopback, and followed; somebody looks five times a second.
 Age: from the arrival of the newest frame that the model knows to the rendered picture. Of several feeds at once the
 fewest used frames and the oldest ages; cores, memory and disk are of all of them
 ([definitions](../../lab/benchmarks/bm_live.py)).
