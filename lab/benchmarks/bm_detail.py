@@ -2,6 +2,7 @@
 
     python -m lab.benchmarks.bm_detail [--clips d4d_stereo phantom:pull:60frames:stereo ...] [--preset fast]
         [--iterations 300 | --budget-s 60] [--holdout every8] [--seeds 0 1 2] [--out lab/rows/detail.csv]
+        [--picture FILE.jpg]
 
 A row for each view: `left` and `right`, held-out frames of the eyes over tissue, and of a phantom at rest or with a
 fixed camera `off5` to `off20`, that many degrees beside the endoscope, over tissue that some training frame saw, and
@@ -11,7 +12,8 @@ copying (docs/conventions.md), bytes of the scene, of recorded.zip and of detail
 and milliseconds of a view without detail, with it, and with it in a clip that is played frame by frame (medians).
 
 A row is kept as its run ends, in place of an older one of the same clip, preset, limit, seed and view; then the chart
-is drawn beside them.
+is drawn beside them. --picture: a sheet of the last run, at its middle held-out frame and 0, 3, 8 and 15 degrees beside
+it: the truth of a phantom, the model alone, and with detail. Pictures of a patient do not belong into the repository.
 """
 
 from __future__ import annotations
@@ -24,13 +26,16 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip, split_frames
 from intrasplat.machine.hooks import Hooks
 from intrasplat.names import DETAIL, RECORDED
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
+from intrasplat.pose import OrbitPose, world_from_camera
 from intrasplat.report import Report
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.scene import TrainedScene
@@ -38,7 +43,9 @@ from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.train.hooks import TrainingHooks
 from intrasplat.train.request import ReconstructionRequest
 from intrasplat.train.scoring import judged_pixels
+from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
 from intrasplat.view.render import render_frame
+from lab.benchmarks.bm_off_axis import small
 from lab.evaluate.length import add_length, length_of
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, OpenClip, open_source, source_of
@@ -47,6 +54,7 @@ from lab.pages.detail import draw_detail
 
 CLIPS = ("d4d_stereo", *(f"phantom:{motion}:60frames:stereo" for motion in ("still", "breathing", "pull", "cut")))
 ANGLES_DEG = (5.0, 10.0, 15.0, 20.0)
+SHOWN_DEG = (0.0, 3.0, 8.0, 15.0)
 TIMED = 25
 KEY = ("clip", "preset", "limit", "holdout", "seed", "view")
 FIELDS = (
@@ -67,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for seed in options.seeds:
                 named = {"clip": source.name, "preset": options.preset, "limit": spelt, "holdout": options.holdout}
                 asked = ReconstructionOptions(preset=options.preset, seed=seed, holdout=options.holdout, **limit)
-                for found in measured(opened, asked):
+                for found in measured(opened, asked, options.picture):
                     row = {**named, "seed": seed, **found, "machine": machine(), "commit": commit()}
                     text = texts_of(row, FIELDS)
                     replace_row(options.out, FIELDS, KEY, text)
@@ -75,8 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     draw_detail(read_rows(options.out), options.out.parent)
 
 
-def measured(opened: OpenClip, options: ReconstructionOptions) -> Iterator[dict[str, object]]:
-    """The rows of one run."""
+def measured(
+    opened: OpenClip, options: ReconstructionOptions, picture: Path | None = None
+) -> Iterator[dict[str, object]]:
+    """The rows of one run; its sheet goes into the file `picture`."""
     with TemporaryDirectory() as folder:
         path = Path(folder)
         request = ReconstructionRequest(clip=opened.clip, options=options)
@@ -87,6 +97,23 @@ def measured(opened: OpenClip, options: ReconstructionOptions) -> Iterator[dict[
             yield _row("right", list(_recorded(scene, opened.clip, report, is_right=True)))
         if opened.phantom is not None and not opened.phantom.settings.camera:
             yield from _off_axis(scene, opened)
+        if picture is not None:
+            cv2.imwrite(str(picture), sheet(scene, opened, report)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+
+
+def sheet(scene: TrainedScene, opened: OpenClip, report: Report) -> NDArray[np.uint8]:
+    """[h, w, 3] a row for each angle beside the endoscope."""
+    frame = report.held_out[len(report.held_out) // 2]
+    pivot_mm, rows = MEDIAN_DEPTH_UNITS / scene.units_per_mm, []
+    for angle_deg in SHOWN_DEG:
+        orbit = world_from_camera(OrbitPose(yaw_deg=angle_deg, pitch_deg=0.0, zoom=1.0), pivot_mm)
+        pose = scene.world_from_camera[frame] @ np.array(orbit, np.float64)
+        shown = [render_frame(scene, frame / scene.frame_count, pose, detail=each).rgb for each in ("off", "on")]
+        if opened.phantom is not None:
+            true = np.clip(opened.phantom.render(frame, pose)[0], 0, 1) * np.float32(255)
+            shown = [true.astype(np.uint8), *shown]
+        rows.append(np.concatenate([small(each) for each in shown], axis=1))
+    return np.concatenate(rows)
 
 
 def _row(view: str, pairs: Sequence[Pair]) -> dict[str, object]:
@@ -163,6 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     add_length(parser)
     parser.add_argument("--out", type=Path, default=Path("lab/rows/detail.csv"))
+    parser.add_argument("--picture", type=Path, metavar="FILE.jpg")
     return parser
 
 

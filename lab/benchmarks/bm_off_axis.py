@@ -116,15 +116,15 @@ def pictures(opened: OpenClip, scenes: dict[Eyes, TrainedScene]) -> list[list[ND
         pivot_mm = MEDIAN_DEPTH_UNITS / scenes["both"].units_per_mm
         pose = np.array(world_from_camera(orbit, pivot_mm), np.float64)
         if opened.phantom is not None:
-            row.append(_small((np.clip(opened.phantom.render(frame, pose)[0], 0, 1) * 255).astype(np.uint8)))
+            row.append(small((np.clip(opened.phantom.render(frame, pose)[0], 0, 1) * 255).astype(np.uint8)))
         for eyes, scene in scenes.items():
             shown = render_frame(scene, frame / scene.frame_count, pose)
-            row.append(_small(shown.rgb if eyes == "left" else hatched(shown.rgb, shown.unseen)))
+            row.append(small(shown.rgb if eyes == "left" else hatched(shown.rgb, shown.unseen)))
         rows.append(row)
     return rows
 
 
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = picture.shape[:2]
     size = (PICTURE_WIDTH, round(height * PICTURE_WIDTH / width))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

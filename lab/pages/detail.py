@@ -12,7 +12,7 @@ from lab.evaluate.rows import Row, read_rows
 from lab.evaluate.style import GREY, SETTINGS, figure_of, look_of, save
 from lab.pages.markdown import origin, source, table
 
-DETAIL, DETAIL_CHART = "detail.csv", "detail.png"
+DETAIL, DETAIL_CHART, DETAIL_VIEWS = "detail.csv", "detail.png", "detail-views.jpg"
 CHARTED = "d4d-a-stereo"
 _INTRODUCTION = """
 ## Detail from the recorded frames
@@ -26,6 +26,15 @@ Hollow marks: the model alone; filled ones: with detail; the area behind a mark 
 disk.
 
 ![Decibels with and without detail against seconds from the request](detail.png)
+"""
+_VIEWS = """
+A synthetic clip at a held-out moment, from the endoscope and 3, 8 and 15 degrees beside it: the truth, the model alone,
+and with detail.
+
+![Truth, model and detail, from 0, 3, 8 and 15 degrees](detail-views.jpg)
+
+`python -m lab.benchmarks.bm_detail --clips phantom:breathing:640x512:48frames:stereo --preset instant --iterations 150
+--picture docs/results/detail-views.jpg`
 """
 _COLUMNS = {
     "model_db": ("model, dB", 2), "detail_db": ("detail, dB", 2), "detail_ssim": ("SSIM", 3),
@@ -50,8 +59,9 @@ def detail_sections(rows: Path, pictures: Path) -> list[str]:
     ]
     header = ["clip", "preset", "limit", "held out", "view", "seeds", *(name for name, _ in _COLUMNS.values())]
     chart = _CHART if (pictures / DETAIL_CHART).exists() else ""
+    views = _VIEWS if (pictures / DETAIL_VIEWS).exists() else ""
     command = source("python -m lab.benchmarks.bm_detail", DETAIL)
-    return [_INTRODUCTION, chart, command, table(header, cells), origin(found)]
+    return [_INTRODUCTION, chart, views, command, table(header, cells), origin(found)]
 
 
 def draw_detail(rows: Sequence[Row], folder: Path) -> None:
