@@ -30,6 +30,7 @@ import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure/measure.js";
 import { Probe } from "./measure/probe.js";
 import { Compare } from "./stage/compare.js";
+import { fitPicture } from "./stage/fit.js";
 import { stepBackWhileIdle } from "./stage/idle.js";
 import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
@@ -44,6 +45,7 @@ const get = (id) => document.getElementById(id);
 const scopes = new Scopes(() => showJobs());
 export const viewer = new Viewer({
   stage: get("stage"),
+  fitted: get("fitted"),
   canvas: get("picture"),
   status: get("status"),
   badge: get("badge"),
@@ -321,6 +323,7 @@ keyEvents.addEventListener("changed", () => {
 });
 prepareBanners(get("news"));
 get("upload").addEventListener("submit", () => closeBanner(get("jobs-message")));
+fitPicture(get("theatre"), get("stage"));
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
 
 const showHelp = () => toggleHelp(get("help"));

@@ -78,7 +78,7 @@ export class Viewer extends EventTarget {
       this.#tellWay();
       this.refresh(); // what is said of the picture
     });
-    new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.stage);
+    new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.fitted);
     this.#tellWay();
   }
 
@@ -234,7 +234,7 @@ export class Viewer extends EventTarget {
 
   /** In pixels of the screen. */
   get #room() {
-    const { clientWidth, clientHeight } = this.parts.stage;
+    const { clientWidth, clientHeight } = this.parts.fitted;
     return { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio };
   }
 
