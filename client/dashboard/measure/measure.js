@@ -55,6 +55,7 @@ export class Measure {
     this.isOn = true;
     this.#clear();
     this.viewer.timeline.play(false);
+    this.viewer.rock.stop();
     this.parts.panel.hidden = false;
     this.parts.button.setAttribute("aria-pressed", "true");
     this.parts.stage.toggleAttribute("data-measuring", true);
