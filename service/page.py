@@ -1,7 +1,7 @@
 """The files of the web page. They may stay in browsers' caches for good: their address has a hash of all of them.
 
-Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The same
-files are there without a hash, too, and are cached nowhere.
+Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The
+same files are there without a hash, too, and are cached nowhere.
 """
 
 from __future__ import annotations

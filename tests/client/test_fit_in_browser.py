@@ -63,7 +63,8 @@ def test_the_picture_is_free_of_controls_and_all_over_it_follows(
             page.click("#tools [data-drawer=library]")
             page.until(lambda: is_free_of(page, "#library"))
             page.script(
-                "const message = document.querySelector('#stage-message'); message.hidden = false; message.textContent = 'Why.'"
+                "const message = document.querySelector('#stage-message');"
+                "Object.assign(message, { hidden: false, textContent: 'Why.' })"
             )
             assert box_of(page, "#stage-message")[0] > box_of(page, "#library")[2]
         page.until(lambda: is_free_of(page, "#measuring"))
