@@ -34,7 +34,7 @@ export class Drawers {
 
   /** @param {string} id @param {boolean} [takesFocus] false where nobody asked for it */
   open(id, takesFocus = true) {
-    if (this.isOpen === null) this.opener = document.activeElement;
+    if (!document.activeElement?.closest(".drawer")) this.opener = document.activeElement;
     this.#show(id);
     if (takesFocus) document.getElementById(id).querySelector("[data-close]").focus();
   }
