@@ -16,9 +16,9 @@ export class Timeline {
    *   loop: HTMLElement, loopStart: HTMLButtonElement, loopEnd: HTMLButtonElement, loopAll: HTMLButtonElement}} parts
    * @param {() => void} onChange
    * @param {() => boolean} isBusy whether another picture would only have to wait
-   * @param {() => boolean} isStale whether the picture stands for want of the service: time stands with it
+   * @param {() => boolean} [isStale] whether the picture stands for want of the service: time stands with it
    */
-  constructor(parts, onChange, isBusy, isStale) {
+  constructor(parts, onChange, isBusy, isStale = () => false) {
     Object.assign(this, { parts, onChange, isBusy, isStale });
     this.t = 0;
     this.isPlaying = false;
