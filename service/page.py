@@ -1,7 +1,7 @@
 """The files of the web page. They may stay in browsers' caches for good: their address has a hash of all of them.
 
-`/` names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The same files are there
-without a hash, too, and are cached nowhere.
+Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The
+same files are there without a hash, too, and are cached nowhere.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HASH_DIGITS = 16
 FOREVER = "public, max-age=31536000, immutable"
 REVALIDATE = "no-cache"
 REFERENCE = re.compile(r'((?:href|src)=")(\w[^":#]*")')
-"""A file of the page, named relative to the index; links begin with a dot."""
+"""A file of the page, named relative to an HTML file beside the index; links begin with a dot."""
 MIN_COMPRESSED_BYTES = 1000
 
 
@@ -38,20 +38,21 @@ class _Files(StaticFiles):
         self._folder = folder
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        if path in (".", INDEX):
-            return _index(self._folder, _version(self._folder))
+        name = INDEX if path == "." else path
+        if name in (each.name for each in self._folder.glob("*.html")):
+            return _html(self._folder / name, _version(self._folder))
         first, _, rest = path.partition("/")
         if first != VERSIONED:
             return await super().get_response(path, scope)
-        version, _, name = rest.partition("/")
-        response = await super().get_response(name, scope)
+        version, _, file = rest.partition("/")
+        response = await super().get_response(file, scope)
         if version == _version(self._folder):  # another one is of a page that is older or newer than this service
             response.headers["Cache-Control"] = FOREVER
         return response
 
 
-def _index(folder: Path, version: str) -> Response:
-    text = (folder / INDEX).read_text(encoding="utf-8")
+def _html(file: Path, version: str) -> Response:
+    text = file.read_text(encoding="utf-8")
     text = REFERENCE.sub(rf"\g<1>{VERSIONED}/{version}/\g<2>", text)
     return HTMLResponse(text, headers={"Cache-Control": REVALIDATE})
 

@@ -30,6 +30,9 @@ import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure/measure.js";
 import { Probe } from "./measure/probe.js";
 import { Compare } from "./stage/compare.js";
+import { prepareControlSets } from "./stage/controlsets.js";
+import { fitPicture } from "./stage/fit.js";
+import { prepareFive } from "./stage/five.js";
 import { stepBackWhileIdle } from "./stage/idle.js";
 import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
@@ -44,6 +47,7 @@ const get = (id) => document.getElementById(id);
 const scopes = new Scopes(() => showJobs());
 export const viewer = new Viewer({
   stage: get("stage"),
+  fitted: get("fitted"),
   canvas: get("picture"),
   status: get("status"),
   badge: get("badge"),
@@ -69,7 +73,7 @@ function tell(text, isBad = true) {
   get("address-message").textContent = text;
   get("address-message").classList.toggle("bad", isBad);
 }
-const handles = { home: get("home"), eye: get("eye"), stepBack: get("step-back"), stepOn: get("step-on") };
+const handles = { home: get("home"), eye: get("eye"), rock: get("rock"), stepBack: get("step-back"), stepOn: get("step-on") };
 steer(viewer, { stage: get("stage"), canvas: get("picture"), ...handles }, tell);
 
 const compare = new Compare(viewer, {
@@ -225,7 +229,7 @@ function showJobs() {
   showProgress();
   openFirst();
   const viewed = jobs.byId.get(viewer.scene);
-  light.keep(viewer.timeline.isPlaying || viewed?.state === "running");
+  light.keep(viewer.isRunning || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
     if (viewer.shown?.state !== "done") viewer.refresh(); // what is shown may be of its training still
@@ -270,7 +274,7 @@ const downloads = new Downloads(get("download"), get("jobs-message"), scopes, mo
 
 const light = new ScreenLight();
 viewer.timeline.playEvents.addEventListener("changed", () => {
-  light.keep(viewer.timeline.isPlaying || jobs.byId.get(viewer.scene)?.state === "running");
+  light.keep(viewer.isRunning || jobs.byId.get(viewer.scene)?.state === "running");
   address.note();
 });
 const goTo = (place) => {
@@ -321,11 +325,15 @@ keyEvents.addEventListener("changed", () => {
 });
 prepareBanners(get("news"));
 get("upload").addEventListener("submit", () => closeBanner(get("jobs-message")));
-stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null);
+fitPicture(get("theatre"), get("stage"));
+const isInUse = () => measure.isOn || (get("way").open && get("way").checkVisibility()) || document.querySelector("dialog[open]") !== null;
+stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null && !isInUse());
 
 const showHelp = () => toggleHelp(get("help"));
 const toggleFullScreen = prepareFullScreen(get("full-screen"));
 prepareHelp(get("help"));
+prepareFive(get("five"));
+prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 get("show-help").addEventListener("click", showHelp);
 get("copy-link").addEventListener("click", () => address.copy());
 onKeys("full_screen", { f: [] }, toggleFullScreen);

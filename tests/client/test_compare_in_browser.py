@@ -97,7 +97,7 @@ def seen(page: Page) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 def shades_across(page: Page) -> tuple[int, int]:
     """At a third and at two thirds of the picture's width, half-way down."""
-    left, top, right, bottom = box_of(page, "#stage")
+    left, top, right, bottom = box_of(page, "#fitted")
     row = seen(page)[round((top + bottom) / 2)]
     width = (bottom - top) * 60 / 48
     middle = (left + right) / 2
@@ -113,7 +113,7 @@ def test_a_seam_parts_recording_and_model_and_moves_by_keys_and_by_hand(site: Si
     model, recorded = grey_of(scene), shade_of(0)
     page.until(lambda: np.allclose(shades_across(page), (recorded, model), atol=3))
     seam = page.find("#seam")
-    left, _, right, _ = box_of(page, "#stage")
+    left, _, right, _ = box_of(page, "#fitted")
     by_hand = ActionChains(page.driver, 0).move_to_element(seam).click_and_hold()
     by_hand.move_by_offset(round(0.4 * (right - left)), 0).release().perform()
     assert 88 <= int(seam.get_attribute("aria-valuenow") or 0) <= 92
@@ -215,12 +215,12 @@ def test_comparing_goes_home_and_turning_away_says_why_it_ends(site: Site, page:
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_side_by_side_each_has_half_of_the_stage(site: Site, page: Page, width: int, height: int) -> None:
+def test_side_by_side_each_has_half_of_what_is_free(site: Site, page: Page, width: int, height: int) -> None:
     with screen_of(page, width, height):
         view(page, recorded_scene(site))
         choose(page, "side")
         until_frame(page, 0)
-        left, top, right, bottom = box_of(page, "#stage")
+        left, top, right, bottom = box_of(page, "#fitted")
         recorded, model = box_of(page, "#recorded"), box_of(page, "#picture")
         if width > height:
             middle = (left + right) / 2

@@ -30,6 +30,7 @@ stage.setPointerCapture = () => {};
 const about = { bubbles: true, isPrimary: true, button: 0, pointerId: 7, clientX: x, clientY: y };
 for (const kind of ["pointerdown", "pointerup"]) stage.dispatchEvent(new PointerEvent(kind, about));
 """
+HAS_CLOCK = "return import(document.scripts[0].src).then(({ clock }) => clock.bounds.length > 10)"
 DRAG_TAPE = """
 const tape = document.getElementById("tape");
 tape.value = String(arguments[0]);
@@ -84,7 +85,7 @@ def test_it_shows_the_endoscope_and_the_model_with_their_true_ages(
 ) -> None:
     watched(site, page)
     assert word(page) == say("live.word_live")
-    page.until(lambda: page.script("return import('/live/main.js').then(({ clock }) => clock.bounds.length > 10)"))
+    page.until(lambda: page.script(HAS_CLOCK))
     for name in ("live", "model"):
         differences, moments = [], set()
         for _ in range(15):
@@ -104,7 +105,7 @@ def test_ages_are_true_where_the_browser_s_clock_is_wrong(site: Site, page: Live
     )
     try:
         watched(site, page)
-        page.until(lambda: page.script("return import('/live/main.js').then(({ clock }) => clock.bounds.length > 10)"))
+        page.until(lambda: page.script(HAS_CLOCK))
         found = age_of(page, "live")
         assert found is not None
         age_ms = time.time() * 1000 % 2**24 - found["ms"]
@@ -286,10 +287,10 @@ def test_turning_is_shown_with_its_trust_and_ends_without_a_hand(
     site: Site, page: LivePage, painter: LivePainter
 ) -> None:
     watched(site, page)
-    page.script("import('/live/main.js').then(({ look }) => look.turn((orbit) => orbit.stand('orbit:18,0,1')))")
+    page.script("import(document.scripts[0].src).then(({ look }) => look.turn((orbit) => orbit.stand('orbit:18,0,1')))")
     page.until_text("#trust", say("light.care"))
     page.until_text("#trust-why", say("notice.pose_far"))
-    page.script("import('/live/main.js').then(({ look }) => (look.handMs -= 20000))")
+    page.script("import(document.scripts[0].src).then(({ look }) => (look.handMs -= 20000))")
     page.until_text("#trust", say("light.good"))
     page.until_text("#model-place", say("view.endoscope"))
 

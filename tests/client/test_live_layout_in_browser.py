@@ -45,6 +45,10 @@ def test_it_is_accessible_and_fits_in_every_state(
             "return arguments[0].map((id) => document.getElementById(id).getBoundingClientRect().height)", ACTIONS
         )
         assert min(sizes) >= MIN_ACTION_PX
+        page.click("#screen [data-switch-controls]")
+        judge("theatre")
+        assert not page.find("#end").is_displayed()
+        page.click("#screen [data-switch-controls]")
         page.click("#measure")
         page.until(lambda: page.state == "frozen")
         judge("frozen")

@@ -168,8 +168,8 @@ def test_the_dashboard_is_served_at_the_root(tmp_path: Path) -> None:
         assert_problem(service.http.get("/nothing.js"), 404)
 
 
-def script_of_page(service: ServiceUnderTest) -> str:
-    index = service.http.get("/")
+def script_of_page(service: ServiceUnderTest, path: str = "/") -> str:
+    index = service.http.get(path)
     assert index.headers["Cache-Control"] == "no-cache"
     return "/" + index.text.split('src="')[1].split('"')[0]
 
@@ -178,10 +178,12 @@ def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_ch
     folder = tmp_path / "page"
     (folder / "parts").mkdir(parents=True)
     (folder / "index.html").write_text('<script type="module" src="parts/main.js"></script><a href="./live.html">')
+    (folder / "live.html").write_text('<script type="module" src="parts/main.js"></script><a href="./index.html">')
     script = folder / "parts" / "main.js"
     script.write_text("// first" + " " * 2000)
     for service in running_service(tmp_path / "data", dashboard_dir=folder):
         address = script_of_page(service)
+        assert script_of_page(service, "/live.html") == script_of_page(service, "/index.html") == address
         answer = service.http.get(address)
         assert answer.text == script.read_text()
         assert "immutable" in answer.headers["Cache-Control"]

@@ -84,7 +84,7 @@ export class Address {
   note() {
     this.timer ||= setTimeout(() => {
       this.timer = 0;
-      if (!this.viewer.timeline.isPlaying) this.write();
+      if (!this.viewer.isRunning) this.write();
     }, WRITE_AFTER_MS);
   }
 

@@ -7,8 +7,11 @@
 
 /** What is typed into takes all keys; what has keys of its own keeps them. */
 const TYPED = "textarea, select, dialog[open], input:not([type=range], [type=checkbox])";
-const OWN = { " ": "button, summary, a, [type=checkbox]", Enter: "button, summary, a, [type=checkbox]" };
+const PRESSED = "button, summary, a, [type=checkbox]";
+const OWN = { " ": PRESSED, Enter: PRESSED, PageUp: ".drawer", PageDown: ".drawer" };
 const OF_SLIDERS = /^(Arrow|Home)/;
+/** Here Space works what has the focus, however it came by it. */
+const FILLED_IN = "form, dialog, .drawer";
 
 /** @type {KeyRow[]} */
 const rows = [];
@@ -27,9 +30,14 @@ export function onKeys(does, keys, act, withShift = false) {
 /** @returns {readonly KeyRow[]} */
 export const keyRows = () => rows;
 
+/** The sign that came last, and the one by which the focus came: "pointerdown" or "keydown". */
+let lastSign = "";
+let focusCameBy = "";
+
 /** @param {KeyboardEvent} event */
 function isForOthers({ key, target, ctrlKey, metaKey, altKey }) {
   if (key === undefined || ctrlKey || metaKey || altKey || !(target instanceof Element)) return true; // autofill tells no key
+  if (key === " " && focusCameBy === "pointerdown" && !target.closest(FILLED_IN)) return false;
   if (target.closest(TYPED)) return true;
   if (target.closest("[type=range], [role=slider]") && OF_SLIDERS.test(key)) return true;
   return key in OWN && target.closest(OWN[key]) !== null;
@@ -37,12 +45,18 @@ function isForOthers({ key, target, ctrlKey, metaKey, altKey }) {
 
 /** Begin to listen. */
 export function listenToKeys() {
+  for (const sign of ["pointerdown", "keydown"]) document.addEventListener(sign, () => (lastSign = sign), { capture: true });
+  document.addEventListener("focusin", () => (focusCameBy = lastSign), { capture: true });
+  let handled = "";
+  document.addEventListener("keyup", (event) => event.key === handled && event.preventDefault()); // Firefox presses buttons then
   document.addEventListener("keydown", (event) => {
+    handled = "";
     if (isForOthers(event)) return;
     const isArrow = event.key.startsWith("Arrow");
     const row = rows.find(({ keys, withShift }) => event.key in keys && (!isArrow || withShift === event.shiftKey));
     if (!row) return;
     event.preventDefault();
+    handled = event.key;
     row.act(...row.keys[event.key]);
   });
 }

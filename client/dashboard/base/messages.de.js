@@ -281,7 +281,7 @@ export const DE = {
     "view": "Ansehen",
     "save": "Speichern",
     "rename": "Umbenennen",
-    "long": "{seconds} s lang",
+    "long": "{seconds} s lang",
     "retry": "Noch einmal",
     "calibrate": "Kalibrierung nachreichen",
     "cancel": "Abbrechen",
@@ -744,6 +744,10 @@ export const DE = {
     "report": "Bericht",
     "more": "Mehr"
   },
+  "controls": {
+    "desk": "Alle Bedienelemente",
+    "theatre": "OP-Bedienung"
+  },
   "layer": {
     "title": "Bild der",
     "rgb": "Farbe",
@@ -793,6 +797,8 @@ export const DE = {
     "approach": "Näher, weiter weg",
     "focus": "Diesen Punkt ansehen; mit der Taste die Bildmitte",
     "home": "Zurück zum Endoskop",
+    "rock": "Die Ansicht pendeln lassen, oder das beenden",
+    "controls": "OP-Bedienung oder alle Bedienelemente",
     "eye": "Linkes Auge, rechtes Auge",
     "compare": "Mit der Aufnahme vergleichen: mit Trennlinie, daneben, aus",
     "measure": "Messen, oder das Messen beenden",
@@ -802,6 +808,8 @@ export const DE = {
   },
   "key": {
     " ": "Leertaste",
+    "PageUp": "Bild auf",
+    "PageDown": "Bild ab",
     "Home": "Pos1",
     "Shift": "Umschalt",
     "ArrowLeft": "←",

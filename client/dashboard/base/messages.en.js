@@ -281,7 +281,7 @@ export const EN = {
     "view": "View",
     "save": "Save as",
     "rename": "Rename",
-    "long": "{seconds} s long",
+    "long": "{seconds} s long",
     "retry": "Try again",
     "calibrate": "Add a calibration",
     "cancel": "Cancel",
@@ -744,6 +744,10 @@ export const EN = {
     "report": "Report",
     "more": "More"
   },
+  "controls": {
+    "desk": "All controls",
+    "theatre": "Theatre controls"
+  },
   "layer": {
     "title": "Picture of",
     "rgb": "colour",
@@ -793,6 +797,8 @@ export const EN = {
     "approach": "Nearer, farther",
     "focus": "Look at this point; by key at the middle of the picture",
     "home": "Back to the endoscope",
+    "rock": "Rock the view to and fro, or end it",
+    "controls": "Controls of the theatre, or all",
     "eye": "Left eye, right eye",
     "compare": "Compare with the recording: with a seam, beside it, off",
     "measure": "Measure, or end it",
@@ -802,6 +808,8 @@ export const EN = {
   },
   "key": {
     " ": "Space",
+    "PageUp": "Page Up",
+    "PageDown": "Page Down",
     "Home": "Home",
     "Shift": "Shift",
     "ArrowLeft": "←",

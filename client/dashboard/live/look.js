@@ -2,9 +2,8 @@
 // back, or turns it.
 
 import { Orbit } from "../stage/orbit.js";
+import { Rock } from "../stage/rock.js";
 
-const ROCK_DEG = 8;
-const ROCK_PERIOD_MS = 4000;
 const TICK_MS = 50;
 /** So long without a hand, a view that was turned goes back to the endoscope's. */
 export const RETURN_AFTER_MS = 20_000;
@@ -19,8 +18,9 @@ export class Look extends EventTarget {
   /** @param {import("./model.js").ModelPicture} model @param {import("./clock.js").FeedClock} clock */
   constructor(model, clock) {
     super();
-    Object.assign(this, { model, clock, feedId: null, rockingSince: null, handMs: performance.now() });
+    Object.assign(this, { model, clock, feedId: null, handMs: performance.now() });
     this.orbit = new Orbit(() => 0);
+    this.rock = new Rock(this.orbit, () => this.#ask(), () => this.#changed());
     this.#beLive();
     setInterval(() => this.#tick(), TICK_MS);
     for (const sign of HANDS) {
@@ -39,7 +39,7 @@ export class Look extends EventTarget {
   /** @param {string | null} feedId */
   open(feedId) {
     this.feedId = feedId;
-    this.rockingSince = null;
+    this.rock.stop();
     this.orbit.goHome();
     this.#beLive();
     this.model.clear();
@@ -48,7 +48,7 @@ export class Look extends EventTarget {
 
   /** Everything back: the newest moment, from the endoscope. */
   goLive() {
-    this.rockingSince = null;
+    this.rock.stop();
     this.orbit.goHome();
     this.#beLive();
     this.#changed();
@@ -84,21 +84,10 @@ export class Look extends EventTarget {
     return this.mode === "back" ? this.backS : Math.max(0, this.clock.nowS - this.atS);
   }
 
-  get isRocking() {
-    return this.rockingSince !== null;
-  }
-
-  /** Turn to and fro by itself, so that depth is seen without a hand; or end that. */
-  rock() {
-    this.rockingSince = this.isRocking ? null : performance.now();
-    if (!this.isRocking) this.orbit.goHome();
-    this.#changed();
-  }
-
   /** @param {(orbit: Orbit) => void} work by a hand */
   turn(work) {
     if (this.feedId === null) return;
-    this.rockingSince = null;
+    this.rock.stop();
     work(this.orbit);
     this.#changed();
   }
@@ -109,16 +98,11 @@ export class Look extends EventTarget {
 
   #tick() {
     if (this.feedId === null) return;
-    const now = performance.now();
-    if (this.isRocking) {
-      this.orbit.goHome();
-      const angle = (2 * Math.PI * (now - this.rockingSince)) / ROCK_PERIOD_MS;
-      this.orbit.stand(`orbit:${(ROCK_DEG * Math.sin(angle)).toFixed(2)},0,1`);
-    } else if (this.isTurned && now - this.handMs > RETURN_AFTER_MS) {
+    if (!this.rock.isOn && this.isTurned && performance.now() - this.handMs > RETURN_AFTER_MS) {
       this.orbit.goHome();
       return this.#changed();
     }
-    if (this.isRocking || this.mode === "back") this.#ask();
+    if (this.mode === "back") this.#ask();
   }
 
   #changed() {
@@ -131,7 +115,7 @@ export class Look extends EventTarget {
     const { pose } = this.orbit;
     const wish = { scene: this.feedId, t: this.#t };
     if (pose !== null) wish.pose = pose;
-    if (this.mode === "live" && !this.isRocking) wish.follow = true;
+    if (this.mode === "live" && !this.rock.isOn) wish.follow = true;
     this.model.want(wish);
   }
 

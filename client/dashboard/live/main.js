@@ -10,6 +10,7 @@ import { figure, language, languageEvents, noticeWords, setLanguage, showWords, 
 import { Scopes } from "../base/scopes.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { placeInPicture } from "../measure/pointer.js";
+import { prepareControlSets } from "../stage/controlsets.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
 import { headlineOf, headlineOfPicture } from "./headline.js";
@@ -175,10 +176,10 @@ function refresh() {
   setText(get("live-age"), now.pictureAgeS === null ? "" : ageWords(now.pictureAgeS));
   setText(get("live-message"), picture.isBlank ? blankWords(ofPicture) : "");
   refreshModel(now);
-  const isAway = look.mode !== "live" || look.isTurned || look.isRocking;
+  const isAway = look.mode !== "live" || look.isTurned || look.rock.isOn;
   get("live").classList.toggle("wanted", isAway);
   get("freeze").setAttribute("aria-pressed", String(look.mode === "frozen"));
-  get("look").setAttribute("aria-pressed", String(look.isRocking));
+  get("look").setAttribute("aria-pressed", String(look.rock.isOn));
   for (const name of ["freeze", "measure", "look"]) get(name).disabled = model.shown === null;
 }
 
@@ -196,7 +197,7 @@ function refreshModel({ modelAgeS }) {
     : words("live.model_at", { time: clockTime(1000 * shown.capturedAtS) });
   setText(get("model-age"), age);
   get("model-pane").dataset.kind = isLive ? "live" : look.mode;
-  setText(get("model-place"), look.isRocking ? words("live.rocking") : look.orbit.words);
+  setText(get("model-place"), look.rock.isOn ? words("live.rocking") : look.orbit.words);
   const message = refused?.message ?? (shown === null && !isGone ? words("live.no_model") : "");
   setText(get("model-message"), message);
   get("model-message").classList.toggle("over-picture", shown !== null);
@@ -266,7 +267,7 @@ setInterval(() => {
 }, TAPE_MS);
 
 get("freeze").addEventListener("click", freeze);
-get("look").addEventListener("click", () => look.rock());
+get("look").addEventListener("click", () => look.rock.toggle());
 get("measure").addEventListener("click", () => measuring.toggle());
 get("keep").addEventListener("click", keep);
 get("live").addEventListener("click", () => look.goLive());
@@ -293,13 +294,14 @@ onKeys("live_freeze", { " ": [], PageDown: [] }, () => isShown() && freeze());
 onKeys("live_live", { l: [], PageUp: [], Home: [] }, () => isShown() && look.goLive());
 onKeys("live_keep", { k: [] }, () => isShown() && keep());
 onKeys("live_measure", { m: [] }, () => isShown() && measuring.toggle());
-onKeys("live_rock", { r: [] }, () => isShown() && look.rock());
+onKeys("live_rock", { r: [] }, () => isShown() && look.rock.toggle());
 onKeys("live_step", arrows, (byS) => isShown() && look.step(byS));
 onKeys("turn", { ArrowLeft: [TURN, 0], ArrowRight: [-TURN, 0], ArrowUp: [0, TURN], ArrowDown: [0, -TURN] },
   (dx, dy) => look.turn((orbit) => orbit.turn(dx, dy)), true);
 onKeys("approach", { "+": [NEARER], "=": [NEARER], "-": [1 / NEARER] },
   (factor) => look.turn((orbit) => orbit.approach(factor)));
 onKeys("full_screen", { f: [] }, prepareFullScreen(get("full-screen")));
+prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 listenToKeys();
 
 const wide = matchMedia("(min-width: 1200px) and (min-height: 640px)");

@@ -43,7 +43,7 @@ export class LiveMeasure {
   /** Choose two points of the moment in view, which stands still meanwhile. */
   start() {
     if (!this.look.freeze()) return;
-    if (this.look.isRocking) this.look.rock();
+    if (this.look.rock.isOn) this.look.rock.toggle();
     this.isOn = true;
     this.#clear();
     this.#tell("live.measure_first");

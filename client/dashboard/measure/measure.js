@@ -37,7 +37,7 @@ export class Measure {
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.end());
     languageEvents.addEventListener("changed", () => this.isOn && this.#say());
-    window.addEventListener("resize", () => this.#draw());
+    new ResizeObserver(() => this.#draw()).observe(parts.canvas);
     parts.button.addEventListener("click", () => this.toggle());
     parts.panel.querySelector(".again").addEventListener("click", () => this.start());
     parts.panel.querySelector(".end").addEventListener("click", () => this.end());
@@ -55,6 +55,7 @@ export class Measure {
     this.isOn = true;
     this.#clear();
     this.viewer.timeline.play(false);
+    this.viewer.rock.stop();
     this.parts.panel.hidden = false;
     this.parts.button.setAttribute("aria-pressed", "true");
     this.parts.stage.toggleAttribute("data-measuring", true);

@@ -36,6 +36,7 @@ export class Probe {
     parts.stage.addEventListener("pointerleave", () => this.#leave());
     viewer.addEventListener("shown", ({ detail }) => !sameView(detail, this.asked) && this.#again());
     viewer.addEventListener("gone", () => this.#leave());
+    new ResizeObserver(() => this.#again()).observe(parts.canvas); // another place comes under the pointer
   }
 
   /** Nothing is known of the place in view. */

@@ -34,6 +34,9 @@ function axisOf(yawDeg, pitchDeg) {
   return [Math.sin(yaw) * Math.cos(pitch), -Math.sin(pitch), Math.cos(yaw) * Math.cos(pitch)];
 }
 
+/** @param {number[]} axis @returns {[number, number]} yaw and pitch of an orbit that looks along it, degrees */
+const anglesOf = (axis) => [-Math.atan2(axis[0], axis[2]) * DEGREES, Math.asin(clamp(axis[1], -1, 1)) * DEGREES];
+
 export class Orbit {
   /** @param {() => number} now the time that is shown, t */
   constructor(now) {
@@ -80,15 +83,14 @@ export class Orbit {
   }
 
   /** Leave the endoscope, from where it is. */
-  #leave() {
+  leave() {
     if (!this.isHome && !this.given) return;
     const pose = this.#stood();
     this.isHome = this.isRight = false;
     this.given = null;
     if (!pose || !this.cameras) return;
     const axis = column(pose, 2);
-    this.yaw = -Math.atan2(axis[0], axis[2]) * DEGREES;
-    this.pitch = Math.asin(clamp(axis[1], -1, 1)) * DEGREES;
+    [this.yaw, this.pitch] = anglesOf(axis);
     this.about = axis.map((each, i) => pose[i][3] + each * this.cameras.depthMm);
   }
 
@@ -109,6 +111,13 @@ export class Orbit {
     return Math.acos(clamp(Math.max(...this.taught.map((each) => dot(each, axis))), -1, 1)) * DEGREES;
   }
 
+  /** @returns {[number, number]} yaw and pitch of the pose that taught and is nearest, degrees */
+  nearestTaught() {
+    const axis = axisOf(this.yaw, this.pitch);
+    const nearest = this.taught.reduce((a, b) => (dot(b, axis) > dot(a, axis) ? b : a));
+    return anglesOf(nearest);
+  }
+
   /** Whether this is farther from the clip's poses than what they taught. */
   get isBeyond() {
     return this.awayDeg() > TAUGHT_DEG;
@@ -116,7 +125,7 @@ export class Orbit {
 
   /** @param {number} dx pixels to the right @param {number} dy pixels down */
   turn(dx, dy) {
-    this.#leave();
+    this.leave();
     const steps = Math.ceil(Math.max(Math.abs(dx), Math.abs(dy)) / STEP_PIXELS);
     for (let i = 0; i < steps; i++) this.#turnStep((dx / steps) * DEGREES_A_PIXEL, (dy / steps) * DEGREES_A_PIXEL);
   }
@@ -135,7 +144,7 @@ export class Orbit {
 
   /** @param {number} factor above 1: nearer */
   approach(factor) {
-    this.#leave();
+    this.leave();
     this.zoom = clamp(this.zoom * factor, MIN_ZOOM, MAX_ZOOM);
   }
 
@@ -145,7 +154,7 @@ export class Orbit {
    */
   pan(dx, dy) {
     if (!this.cameras) return;
-    this.#leave();
+    this.leave();
     const { depthMm, intrinsics } = this.cameras;
     const pose = this.cameras.orbit(this.yaw, this.pitch, this.zoom);
     const [right, down] = [column(pose, 0), column(pose, 1)];
@@ -155,7 +164,7 @@ export class Orbit {
 
   /** Look at a point, from the same side and as near as the zoom says. @param {number[]} point x, y, z, mm */
   focus(point) {
-    this.#leave();
+    this.leave();
     this.#lookAt(point);
   }
 

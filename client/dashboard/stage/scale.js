@@ -27,7 +27,7 @@ export class Scale {
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.#forget());
     languageEvents.addEventListener("changed", () => this.#draw());
-    window.addEventListener("resize", () => this.#draw());
+    new ResizeObserver(() => this.#draw()).observe(canvas);
   }
 
   #forget() {

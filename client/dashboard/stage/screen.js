@@ -25,6 +25,10 @@ export class Screen {
     document.addEventListener("visibilitychange", () => this.#look()); // timers sleep in hidden tabs
   }
 
+  get isStale() {
+    return this.status.dataset.state === "stale";
+  }
+
   get hasPicture() {
     return this.shown !== null;
   }
@@ -108,8 +112,20 @@ export class Screen {
     setText(this.badge, badge);
     this.badge.hidden = badge === "";
     setText(this.statusText, this.#text(state));
+    this.#fitText();
     setText(this.message, message);
     this.message.hidden = message === "";
+  }
+
+  /** Two lines of smaller letters for a text that is longer than the line. */
+  #fitText() {
+    const { status, statusText } = this;
+    const line = statusText.parentElement;
+    const size = () => [statusText.textContent.length, statusText.offsetLeft, line.clientWidth].join();
+    if (this.fitted === size()) return;
+    status.toggleAttribute("data-long", false);
+    status.toggleAttribute("data-long", line.scrollWidth > line.clientWidth);
+    this.fitted = size();
   }
 
   /** @returns {[string, string, string]} state, badge, message over the picture */

@@ -13,10 +13,10 @@ const arrows = (by) => ({ ArrowLeft: [by, 0], ArrowRight: [-by, 0], ArrowUp: [0,
 /**
  * @param {import("./viewer.js").Viewer} viewer
  * @param {{stage: HTMLElement, canvas: HTMLCanvasElement, home: HTMLButtonElement, eye: HTMLSelectElement,
- *   stepBack: HTMLButtonElement, stepOn: HTMLButtonElement}} parts
+ *   rock: HTMLButtonElement, stepBack: HTMLButtonElement, stepOn: HTMLButtonElement}} parts
  * @param {(text: string) => void} tell what somebody asked for and cannot have
  */
-export function steer(viewer, { stage, canvas, home, eye, stepBack, stepOn }, tell) {
+export function steer(viewer, { stage, canvas, home, eye, rock, stepBack, stepOn }, tell) {
   const { orbit, timeline } = viewer;
   const change = (work) => (...given) => {
     if (!viewer.scene) return;
@@ -54,16 +54,19 @@ export function steer(viewer, { stage, canvas, home, eye, stepBack, stepOn }, te
     focus,
   };
   const goHome = change(() => orbit.goHome());
+  const swing = () => viewer.scene && viewer.rock.toggle();
   const swapEyes = change(() => orbit.hasRightEye && orbit.seeRight(!(orbit.isHome && orbit.isRight)));
   listenToGestures(stage, acts);
   viewer.addEventListener("known", () => (eye.hidden = !orbit.hasRightEye));
   viewer.addEventListener("shown", () => (eye.value = orbit.isHome && orbit.isRight ? "right" : "left"));
   home.addEventListener("click", goHome);
+  rock.addEventListener("click", swing);
+  timeline.playEvents.addEventListener("changed", () => rock.setAttribute("aria-pressed", String(viewer.rock.isOn)));
   eye.addEventListener("change", change(() => orbit.seeRight(eye.value === "right")));
   stepBack.addEventListener("click", () => timeline.step(-1));
   stepOn.addEventListener("click", () => timeline.step(1));
 
-  onKeys("play", { " ": [] }, () => viewer.scene && timeline.play(!timeline.isPlaying));
+  onKeys("play", { " ": [], PageDown: [] }, () => viewer.scene && timeline.play(!timeline.isPlaying));
   onKeys("step", { ",": [-1], ".": [1] }, (frames) => timeline.step(frames));
   onKeys("speed", { "<": [-1], ">": [1] }, (steps) => timeline.changeSpeed(steps));
   onKeys("loop_start", { a: [] }, () => timeline.startLoop());
@@ -74,5 +77,6 @@ export function steer(viewer, { stage, canvas, home, eye, stepBack, stepOn }, te
   onKeys("approach", { "+": [NEARER], "=": [NEARER], "-": [1 / NEARER] }, acts.approach);
   onKeys("focus", { o: [] }, focusMiddle);
   onKeys("home", { Home: [] }, goHome);
+  onKeys("rock", { r: [], PageUp: [] }, swing);
   onKeys("eye", { e: [] }, swapEyes);
 }

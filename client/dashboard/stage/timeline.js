@@ -16,9 +16,10 @@ export class Timeline {
    *   loop: HTMLElement, loopStart: HTMLButtonElement, loopEnd: HTMLButtonElement, loopAll: HTMLButtonElement}} parts
    * @param {() => void} onChange
    * @param {() => boolean} isBusy whether another picture would only have to wait
+   * @param {() => boolean} [isStale] whether the picture stands for want of the service: time stands with it
    */
-  constructor(parts, onChange, isBusy) {
-    Object.assign(this, { parts, onChange, isBusy });
+  constructor(parts, onChange, isBusy, isStale = () => false) {
+    Object.assign(this, { parts, onChange, isBusy, isStale });
     this.t = 0;
     this.isPlaying = false;
     this.playEvents = new EventTarget();
@@ -138,7 +139,8 @@ export class Timeline {
     const run = (this.run = {}); // a second start ends the first
     const step = (now) => {
       if (!this.isPlaying || this.run !== run) return;
-      if (!this.isBusy()) {
+      if (this.isStale()) before = now;
+      else if (!this.isBusy()) {
         const elapsedS = (Math.max(0, now - before) / 1000) * Number(this.parts.speed.value);
         before = now;
         this.set(this.#after(elapsedS));

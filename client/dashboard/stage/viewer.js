@@ -11,6 +11,7 @@ import { Memory } from "./memory.js";
 import { Orbit } from "./orbit.js";
 import { judged, Pictures } from "./pictures.js";
 import { Pace } from "./rate.js";
+import { Rock } from "./rock.js";
 import { Screen } from "./screen.js";
 import { Timeline } from "./timeline.js";
 
@@ -61,12 +62,13 @@ export class Viewer extends EventTarget {
     /** @type {"steady"|"recorded"} recorded: as the moment was recorded, through its smoke, too */
     this.light = "steady";
     this.orbit = new Orbit(() => this.timeline.t);
+    this.rock = new Rock(this.orbit, () => this.refresh(), () => this.timeline.playEvents.dispatchEvent(new Event("changed")));
     this.pace = new Pace();
     this.pictures = new Pictures();
     this.memory = new Memory(mayDownload);
     this.drawnBy = new DrawnBy(parts.way, this.memory, () => this.refresh());
     this.screen = new Screen(parts);
-    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy);
+    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy, () => this.screen.isStale);
     this.clip = new Clip((cameras) => this.#know(cameras));
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
@@ -78,7 +80,7 @@ export class Viewer extends EventTarget {
       this.#tellWay();
       this.refresh(); // what is said of the picture
     });
-    new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.stage);
+    new ResizeObserver(() => this.#isDrawnHere && this.refresh()).observe(parts.fitted);
     this.#tellWay();
   }
 
@@ -128,7 +130,7 @@ export class Viewer extends EventTarget {
 
   refresh() {
     const now = performance.now();
-    this.isMoving = this.timeline.isPlaying || now - this.wishedAt < REST_MS;
+    this.isMoving = this.isRunning || now - this.wishedAt < REST_MS;
     this.wishedAt = now;
     this.isWanted = true;
     if (!this.isBusy) this.#work();
@@ -139,6 +141,15 @@ export class Viewer extends EventTarget {
     if (!this.orbit.know(cameras)) this.dispatchEvent(new Event("refused"));
     this.dispatchEvent(new Event("known"));
     if (cameras) this.refresh();
+  }
+
+  get #place() {
+    return this.rock.isOn ? words("live.rocking") : this.orbit.words;
+  }
+
+  /** Whether something moves by itself. */
+  get isRunning() {
+    return this.timeline.isPlaying || this.rock.isOn;
   }
 
   /** Whether this browser draws what is wished for. */
@@ -200,7 +211,7 @@ export class Viewer extends EventTarget {
     const highlights = view.highlights === "off" ? `, ${words("picture.no_highlights")}` : "";
     const light = view.light ? `, ${words("picture.recorded_light")}` : "";
     const layer = this.parts.layer.selectedOptions[0].text;
-    const name = view.layer === RECORDED ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}${light}`;
+    const name = view.layer === RECORDED ? layer : `${layer}, ${this.#place}${guesses}${highlights}${light}`;
     const isDrawnHere = this.#isDrawnHere;
     try {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
@@ -228,13 +239,13 @@ export class Viewer extends EventTarget {
   async #draw(view) {
     const { isMoving } = this;
     clearTimeout(this.resting);
-    if (isMoving && !this.timeline.isPlaying) this.resting = setTimeout(() => this.refresh(), 2 * REST_MS);
+    if (isMoving && !this.isRunning) this.resting = setTimeout(() => this.refresh(), 2 * REST_MS);
     return this.memory.draw(view, this.#room, { isMoving, isTimed: this.drawnBy.isOpen });
   }
 
   /** In pixels of the screen. */
   get #room() {
-    const { clientWidth, clientHeight } = this.parts.stage;
+    const { clientWidth, clientHeight } = this.parts.fitted;
     return { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio };
   }
 
@@ -292,7 +303,7 @@ export class Viewer extends EventTarget {
   #tell(name, picture, tookMs) {
     const server = Number.isFinite(picture.totalMs) ? ` (${words("readout.service", { ms: figure(picture.totalMs) })})` : "";
     const { rate } = this.pace;
-    const pace = rate >= 1 && this.timeline.isPlaying ? [words("readout.rate", { rate: figure(rate) })] : [];
+    const pace = rate >= 1 && this.isRunning ? [words("readout.rate", { rate: figure(rate) })] : [];
     const iteration = picture.iteration === null ? [] : [words("readout.iteration", { iteration: picture.iteration })];
     const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
     const took = `${figure(tookMs)} ms${server}`;
