@@ -100,7 +100,8 @@ def rendered(
 def measured_reply(scene: TrainedScene, request: MeasureRequest, device: Device) -> Reply:
     """A Measurement as JSON. Its time does not predict that of renders."""
     camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-    found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, device)
+    pose = pose_of(scene, request.pose)
+    found = measured(scene, request.t, pose, camera, request.points, device, shape=request.shape)
     return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_untimed=True)
 
 

@@ -307,15 +307,17 @@ class Core(FeedCalls):
         points: Sequence[tuple[float, float]],
         t: float | str | None = None,
         pose: str | None = None,
+        shape: str | None = None,
         **camera: float,
     ) -> Measurement:
         """Depth, place and uncertainty in mm under points (x, y) of a view; of two points their distance over time.
 
+        shape: "line", "area" or "angle", what the points make together, over time: see MeasuredShape.
         pose and camera (width, height, fx, fy, cx, cy) as render has them: the points are pixels of that picture. A
         point with a `refusal` was not measured.
         """
         asked = ";".join(f"{float(x)!r},{float(y)!r}" for x, y in points)
-        response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, **camera)
+        response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, shape=shape, **camera)
         return parsed(response, Measurement.model_validate_json, response.content)
 
     async def export(

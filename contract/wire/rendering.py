@@ -18,7 +18,7 @@ from contract.wire.cameras import CamerasRequest, ClipCamera
 from contract.wire.feeds import CutRange, FeedShown
 from intrasplat.formats import ExportOptions
 from intrasplat.live.times import FeedTime
-from intrasplat.measuring import MAX_POINTS, Point
+from intrasplat.measuring import MAX_POINTS, Point, ShapeKind
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
 from intrasplat.notices import Notice
 from intrasplat.picture import (
@@ -148,6 +148,8 @@ class MeasureRequest(BaseModel):
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
     camera: IntrinsicsOverride = IntrinsicsOverride()
     points: tuple[Point, ...] = Field(min_length=1, max_length=MAX_POINTS)
+    shape: ShapeKind | None = Field(default=None, exclude_if=lambda shape: shape is None)
+    """What the points make together; left out of JSON without one: older workers do not know it."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 

@@ -246,9 +246,26 @@
  */
 /**
  * @typedef {{
+ *   kind: ShapeKind,
+ *   unit: "mm"|"mm2"|"deg",
+ *   value: number,
+ *   uncertainty: number,
+ *   pieces_mm: number[],
+ *   piece_uncertainties_mm: number[],
+ *   t: number[],
+ *   time_s: number[],
+ *   values: number | null[],
+ *   uncertainties: number | null[],
+ *   trust: number[],
+ *   places_mm: number[][][],
+ * }} MeasuredShape
+ */
+/**
+ * @typedef {{
  *   t: number,
  *   points: MeasuredPoint[],
  *   distance?: MeasuredDistance | null,
+ *   shape?: MeasuredShape | null,
  *   depth_range_mm: number[],
  *   warnings: Notice[],
  *   notice?: string,
@@ -363,6 +380,7 @@
  * }} SceneCameras
  */
 /** @typedef {"info"|"warning"} Severity */
+/** @typedef {"line"|"area"|"angle"} ShapeKind */
 /** @typedef {"address_refused"|"certificate"|"fault"|"host_refused"|"status"|"timeout"|"unreachable"|"unclassified"} TryFailure */
 /** Each option's default, choices and limits. */
 export const LIMITS = {
