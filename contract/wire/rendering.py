@@ -76,7 +76,10 @@ class RenderRequest(BaseModel):
     light: Light = Field(default="steady", exclude_if=lambda light: light == "steady")
     smoke: Smoke = Field(default="remove", exclude_if=lambda smoke: smoke == "remove")
     detail: Detail = Field(default="on", exclude_if=lambda detail: detail == "on")
-    """light, smoke and detail are left out of JSON if they are the default: older workers do not know them."""
+    near_mm: int | None = Field(default=None, exclude_if=lambda mm: mm is None)
+    far_mm: int | None = Field(default=None, exclude_if=lambda mm: mm is None)
+    """The depths of the brightest and the darkest false colour; None: the scene's own. These, light, smoke and detail
+    are left out of JSON if they are the default: older workers do not know them."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
     """The most that may be drawn for it."""
 
