@@ -31,6 +31,9 @@ const COARSE = "coarse";
  */
 /** Not a layer of the model, but what the endoscope saw. */
 const RECORDED = "recorded";
+const DEPTH = "depth";
+/** The model against what the endoscope saw. */
+const ERROR = "error";
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
@@ -60,6 +63,8 @@ export class Viewer extends EventTarget {
     this.wishedAt = 0;
     /** @type {"steady"|"recorded"} recorded: as the moment was recorded, through its smoke, too */
     this.light = "steady";
+    /** @type {[number, number] | null} mm between which depth has its colours; null: the clip's own */
+    this.range = null;
     this.orbit = new Orbit(() => this.timeline.t);
     this.pace = new Pace();
     this.pictures = new Pictures();
@@ -94,6 +99,7 @@ export class Viewer extends EventTarget {
     this.memory.open(scene);
     this.orbit.goHome();
     this.light = "steady";
+    this.range = null;
     this.shown = null;
     this.screen.clear(scene, message);
     this.dispatchEvent(new Event("gone")); // what was measured or compared in it goes, too
@@ -107,10 +113,11 @@ export class Viewer extends EventTarget {
   /**
    * Look elsewhere; what is left out stays.
    * @param {{t?: number, pose?: string | null, layer?: string, unseen?: "mark"|"guess", highlights?: "on"|"off",
-   *   light?: "steady"|"recorded"}} wish
+   *   light?: "steady"|"recorded", range?: [number, number] | null}} wish
    */
-  look({ t, pose, layer, unseen, highlights, light }) {
+  look({ t, pose, layer, unseen, highlights, light, range }) {
     const { parts } = this;
+    if (range !== undefined) this.range = range;
     if (light !== undefined) this.light = light;
     if (pose !== undefined && !this.orbit.stand(pose)) this.dispatchEvent(new Event("refused"));
     if (layer !== undefined) parts.layer.value = layer;
@@ -200,7 +207,7 @@ export class Viewer extends EventTarget {
     const highlights = view.highlights === "off" ? `, ${words("picture.no_highlights")}` : "";
     const light = view.light ? `, ${words("picture.recorded_light")}` : "";
     const layer = this.parts.layer.selectedOptions[0].text;
-    const name = view.layer === RECORDED ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}${light}`;
+    const name = [RECORDED, ERROR].includes(view.layer) ? layer : `${layer}, ${this.orbit.words}${guesses}${highlights}${light}`;
     const isDrawnHere = this.#isDrawnHere;
     try {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
@@ -283,6 +290,8 @@ export class Viewer extends EventTarget {
       highlights: checked || disabled ? "on" : "off",
       format: "jpeg",
     };
+    if (view.layer === DEPTH && this.range) [view.near_mm, view.far_mm] = this.range;
+    if (view.layer === ERROR) return view; // as recorded, through the left eye
     if (this.orbit.pose) view.pose = this.orbit.pose;
     else if (this.orbit.eye === "right") view.eye = "right";
     if (this.light === "recorded") Object.assign(view, { light: "recorded", smoke: "show" });
