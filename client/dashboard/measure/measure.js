@@ -93,6 +93,7 @@ export class Measure {
 
   #open() {
     this.isOn = true;
+    this.picker.forget();
     this.#begin();
     this.parts.panel.hidden = false;
     this.parts.button.setAttribute("aria-pressed", "true");
@@ -126,7 +127,6 @@ export class Measure {
     this.chosen = []; // points of the picture of this.view
     this.view = null; // in which they were chosen
     this.current = null; // the measurement that these points make, and more points will
-    this.picker.forget();
     this.asked = {}; // replaced by each question: earlier answers are for nobody
   }
 
@@ -217,7 +217,7 @@ export class Measure {
   }
 
   #rename(each, name) {
-    if (name) each.name = name.replaceAll("~", " ");
+    each.name = name.replaceAll("~", " ").trim() || each.name;
     this.onChange();
     this.#draw();
   }
