@@ -19,7 +19,7 @@ from contract.wire.rendering import (
     render_cost,
 )
 from intrasplat.camera import Intrinsics
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, SceneError
 from intrasplat.export import DRAWN, export_parts
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.machine.parts import Parts
@@ -61,12 +61,15 @@ def rendered(
     recorded_of_scene, the recorded frame nearest to request.t, only for layer error: the view is then that of its time.
 
     Raises:
-        InputError, LimitError, SceneError: as Views.answer_in_parts.
+        InputError, LimitError: as Views.answer_in_parts.
     """
     recorded = None
     if request.layer is Layer.ERROR:
         check_comparable(request.pose, request.camera)
-        recorded, level = recorded_of_scene(), 0
+        try:
+            recorded, level = recorded_of_scene(), 0
+        except SceneError as error:  # the scene itself is there
+            raise InputError("layer", str(error), "Ask for another layer.") from error
         request = request.model_copy(update={**AS_RECORDED, "t": recorded.index / scene.frame_count})
     pose, lens = _pose_and_lens(scene, request, right_eye_of_scene)
     camera = camera_of(lens, request.camera, request.max_pixels)

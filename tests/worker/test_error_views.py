@@ -13,7 +13,7 @@ from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.rendering import RecordedRequest, RenderRequest
 from intrasplat.colours import COLOUR_TABLE
-from intrasplat.errors import InputError, SceneError
+from intrasplat.errors import InputError
 from intrasplat.names import RECORDED, REPORT
 from intrasplat.picture import BRIGHTEST_ERROR, ImageFormat, IntrinsicsOverride, Layer, RecordedMasks
 from intrasplat.pose import parse_pose
@@ -93,5 +93,6 @@ def test_an_error_needs_the_endoscopes_own_view_and_recorded_frames(store: Store
         assert refused.value.field == field
     small = views.answer(asked.model_copy(update={"camera": IntrinsicsOverride(width=24)}))
     assert array(small).shape[1] == 24
-    with pytest.raises(SceneError, match="recorded"):
+    with pytest.raises(InputError, match="recorded") as refused:  # the scene is there, and has other layers
         views.answer(asked.model_copy(update={"scene_id": stored(store, keeps_frames=False)}))
+    assert refused.value.field == "layer"

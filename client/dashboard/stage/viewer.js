@@ -39,7 +39,8 @@ const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
 /**
  * Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen, "gone" when it goes, "known"
- * when the scene's cameras are, and "refused" when nobody may stand where the viewer shall.
+ * when the scene's cameras are, "refused" when nobody may stand where the viewer shall, and "uncompared" (detail: why) when
+ * there is no recorded frame to compare with, and colours are shown instead.
  */
 export class Viewer extends EventTarget {
   /**
@@ -311,6 +312,11 @@ export class Viewer extends EventTarget {
   }
 
   #fail(error) {
+    if (this.parts.layer.value === ERROR && error.document?.field === "layer") {
+      this.look({ layer: "rgb" });
+      this.dispatchEvent(new CustomEvent("uncompared", { detail: error.message }));
+      return;
+    }
     const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;
