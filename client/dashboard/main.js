@@ -194,7 +194,7 @@ function offerMasks() {
   get("home").hidden = isOffered; // recorded frames are the endoscope's
 }
 
-viewer.addEventListener("uncompared", ({ detail }) => tell(words("compare.failed", { why: detail })));
+viewer.addEventListener("uncompared", ({ detail }) => tell(detail));
 /** Errors are those against recorded frames. @param {{recorded: object | null} | null} known a scene's report */
 function offerError(known) {
   const layer = get("layer");

@@ -40,6 +40,7 @@ from contract.wire.rendering import (
     SceneRequest,
     WorkerAddress,
 )
+from intrasplat.errors import InputError
 from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
@@ -137,6 +138,8 @@ class Painter:
         self.light: tuple[Light, Smoke] = ("steady", "remove")
         """Of the newest picture."""
         self.asked: RenderRequest | None = None
+        self.lacks_frames = False
+        """Whether nothing recorded can be compared with."""
         self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
@@ -150,6 +153,8 @@ class Painter:
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
+        if request.layer is Layer.ERROR and self.lacks_frames:
+            raise InputError("layer", "The recorded frames are damaged.", "Ask for another layer.")
         self.asked = request
         self.shown_unseen, self.shown_highlights, self.eye = request.unseen, request.highlights, request.eye
         self.light = (request.light, request.smoke)

@@ -217,6 +217,10 @@ def test_the_error_against_the_recording_is_offered_where_frames_are_kept_and_ha
     assert (site.painter.asked.layer, site.painter.asked.pose) == (Layer.ERROR, None)  # as recorded
     assert not page.find("#legend .range").is_displayed()
     assert page.state == "live"
+    site.painter.lacks_frames = True  # they turn out to be damaged
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.look({ t: 0.5 }))")
+    page.until_text("#address-message", say("problem.input:layer"))
+    page.until(lambda: page.state == "live" and page.script("return document.querySelector('#layer').value") == "rgb")
 
 
 def test_a_distance_follows_the_tissue_when_the_view_turns(site: Site, page: Page) -> None:

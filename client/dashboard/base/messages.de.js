@@ -158,7 +158,8 @@ export const DE = {
     "http_503:queue": "Der Dienst kann zurzeit keine neue Arbeit annehmen.",
     "http_504": "Der Dienst antwortet nicht rechtzeitig. Die Seite versucht es weiter.",
     "http_other": "Der Dienst antwortete mit einem Fehler.",
-    "input:format": "Diese Installation kann so eine Datei von dieser Szene nicht erzeugen; die Details sagen, was ihr fehlt."
+    "input:format": "Diese Installation kann so eine Datei von dieser Szene nicht erzeugen; die Details sagen, was ihr fehlt.",
+    "input:layer": "Die Bilder der Aufnahme fehlen oder sind beschädigt: Das Modell kann nicht mit ihnen verglichen werden."
   },
   "state": {
     "queued": "wartet",

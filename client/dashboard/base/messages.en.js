@@ -158,7 +158,8 @@ export const EN = {
     "http_503:queue": "The service cannot take new work at the moment.",
     "http_504": "The service does not answer in time. The page keeps trying.",
     "http_other": "The service answered with an error.",
-    "input:format": "This installation cannot make such a file of this scene; the details say what it lacks."
+    "input:format": "This installation cannot make such a file of this scene; the details say what it lacks.",
+    "input:layer": "The recorded frames of this scene are missing or damaged: the model cannot be compared with them."
   },
   "state": {
     "queued": "waiting",
