@@ -68,8 +68,8 @@ def rendered(
         check_comparable(request.pose, request.camera)
         try:
             recorded, level = recorded_of_scene(), 0
-        except SceneError as error:  # the scene itself is there
-            raise InputError("layer", str(error), "Ask for another layer.") from error
+        except SceneError as missing:  # the scene itself is there
+            raise InputError("layer", str(missing), "Ask for another layer.") from missing
         request = request.model_copy(update={**AS_RECORDED, "t": recorded.index / scene.frame_count})
     pose, lens = _pose_and_lens(scene, request, right_eye_of_scene)
     camera = camera_of(lens, request.camera, request.max_pixels)
