@@ -1,4 +1,4 @@
-"""The result of a measurement: points in mm under pixels of a view, the distance of two over time, and uncertainties.
+"""The result of a measurement: points in mm under pixels of a view, a distance or shape of them over time.
 
 Symbols: T frames. Uncertainties are expanded, with coverage factor 2: about 95 % of the true values lie within them
 (docs/conventions.md, "Measuring").
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -22,6 +22,22 @@ POINTS_REMEDY = f"Give 1 to {MAX_POINTS} points as x,y;x,y in pixels from the pi
 Point = tuple[float, float]
 Place = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
 Ends = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
+
+
+class ShapeKind(StrEnum):
+    """What points make together: a line of straight pieces in space, a polygon of flat triangles, or the angle at the
+    second of three points.
+    """
+
+    LINE = "line"
+    AREA = "area"
+    ANGLE = "angle"
+
+
+ShapeUnit = Literal["mm", "mm2", "deg"]
+UNITS: dict[ShapeKind, ShapeUnit] = {ShapeKind.LINE: "mm", ShapeKind.AREA: "mm2", ShapeKind.ANGLE: "deg"}
+POINTS_OF_SHAPE = {ShapeKind.LINE: (2, MAX_POINTS), ShapeKind.AREA: (3, MAX_POINTS), ShapeKind.ANGLE: (3, 3)}
+"""Fewest and most points of each kind."""
 
 
 class RefusalCode(StrEnum):
@@ -75,6 +91,32 @@ class MeasuredDistance(BaseModel):
     second_mm: tuple[Place, ...] = Field(description="where the second point is in the world at every frame")
 
 
+class MeasuredShape(BaseModel):
+    """A length in mm, an area in mm2 or an angle in degrees, at every frame; the tissue carries its points along.
+
+    Null where a point is out of the endoscope's view for too long to be trusted. Lists have T entries.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    kind: ShapeKind
+    unit: ShapeUnit
+    value: float = Field(description="at the time asked for")
+    uncertainty: float = Field(description="about 95 % of the true values lie within it")
+    pieces_mm: tuple[float, ...] = Field(description="of a line: the length of each piece at the time asked for")
+    piece_uncertainties_mm: tuple[float, ...] = Field(description="those of pieces_mm")
+    t: tuple[float, ...] = Field(description="times of the frames")
+    time_s: tuple[float, ...] = Field(description="seconds of the frames, from the first one")
+    values: tuple[float | None, ...] = Field(description="at every frame")
+    uncertainties: tuple[float | None, ...] = Field(description="those of values")
+    trust: tuple[float, ...] = Field(
+        description="at every frame: the least confidence of a point, times the share of its trust that is left"
+    )
+    places_mm: tuple[tuple[Place, ...], ...] = Field(
+        description="where each point is in the world: a list for each point, with a place for every frame"
+    )
+
+
 class Measurement(BaseModel):
     """What was measured in one view of a finished scene."""
 
@@ -84,7 +126,11 @@ class Measurement(BaseModel):
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = Field(
         default=None,
-        description="the distance of two points; null for any other number of points, and where a point is refused",
+        description="the distance of two points, if no shape is asked for; null for any other number of points, and "
+        "where a point is refused",
+    )
+    shape: MeasuredShape | None = Field(
+        default=None, description="what the points make together, if that is asked for and no point is refused"
     )
     depth_range_mm: Ends = Field(
         description="depths of the brightest and the darkest false colour of layer=depth from this pose"
@@ -111,3 +157,17 @@ def parse_points(text: str) -> tuple[Point, ...]:
     if len(points) > MAX_POINTS:
         raise InputError("points", f"{len(points)} points are too many.", POINTS_REMEDY)
     return tuple(points)
+
+
+def check_shape(shape: ShapeKind | None, count: int) -> None:
+    """Check that so many points make a shape.
+
+    Raises:
+        InputError: they are too few or too many.
+    """
+    if shape is None:
+        return
+    fewest, most = POINTS_OF_SHAPE[shape]
+    if not fewest <= count <= most:
+        wanted = f"{fewest} points" if fewest == most else f"{fewest} to {most} points"
+        raise InputError("points", f"{count} points make no {shape}.", f"Give {wanted}.")

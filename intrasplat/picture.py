@@ -12,13 +12,20 @@ MAX_JUDGED_PIXELS = 1 << 21
 """A picture smaller than the recording is drawn in the recording's pixels, but at most so many (1920 x 1080)."""
 
 
+BRIGHTEST_ERROR = 32
+"""Levels of 255 of the brightest false colour of layer error; more looks the same."""
+
+
 class Layer(StrEnum):
-    """rgb; depth along the camera's z; confidence in [0, 1]; smoke, the share of light that it takes, in [0, 1]."""
+    """rgb; depth along the camera's z; confidence in [0, 1]; smoke, the share of light that it takes, in [0, 1]; error,
+    by how many levels of 255 the model's colours differ from the recorded frame's, in the mean of R G B.
+    """
 
     RGB = "rgb"
     DEPTH = "depth"
     CONFIDENCE = "confidence"
     SMOKE = "smoke"
+    ERROR = "error"
 
 
 class ImageFormat(StrEnum):

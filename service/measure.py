@@ -1,4 +1,4 @@
-"""GET /scenes/{id}/measure: places in mm under points of a view, and the distance of two of them over time."""
+"""GET /scenes/{id}/measure: places in mm under points of a view, and what they make together over time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Response
 from pydantic import ConfigDict, Field
 
 from contract.wire.rendering import MeasureRequest
-from intrasplat.measuring import MAX_POINTS, Measurement, parse_points
+from intrasplat.measuring import MAX_POINTS, Measurement, ShapeKind, check_shape, parse_points
 from service.deps import AnyCaller, Services
 from service.renders import ViewQuery, image_response
 from service.scenes import find_finished
@@ -27,6 +27,12 @@ class MeasureQuery(ViewQuery):
         "the answer has their distance, too",
         examples=["320,256", "300,200;360.5,240"],
     )
+    shape: ShapeKind | None = Field(
+        default=None,
+        description="what the points make together, at every frame: line, the sum of straight pieces from point to "
+        "point (2 or more); area, of a polygon of flat triangles whose sides do not cross (3 or more); angle, at the "
+        "second of 3 points",
+    )
 
 
 @router.get("/{scene_id}/measure", operation_id="measure", response_model=Measurement)
@@ -34,9 +40,11 @@ async def measure(
     scene_id: str, services: Services, caller: AnyCaller, query: Annotated[MeasureQuery, Query()]
 ) -> Response:
     """Depth, place and uncertainty in mm of what the points of a view show; of two points the distance, which the
-    tissue carries along, at every frame. Where the confidence is low or no frame saw the tissue, nothing is measured,
-    and `refusal` says why. Research use only.
+    tissue carries along, at every frame; with `shape`, a length, an area or an angle of all of them. Where the
+    confidence is low or no frame saw the tissue, nothing is measured, and `refusal` says why. Research use only.
     """
+    points = parse_points(query.points)
+    check_shape(query.shape, len(points))
     shown = await find_finished(services, caller, scene_id)
     await services.audit.viewed(caller, scene_id)
     request = MeasureRequest(
@@ -45,7 +53,8 @@ async def measure(
         **shown.time_fields(query.t),
         pose=query.asked_pose,
         camera=query.camera,
-        points=parse_points(query.points),
+        points=points,
+        shape=query.shape,
         max_pixels=services.settings.max_render_pixels,
     )
     response = image_response(scene_id, await services.renderer.ask(request))

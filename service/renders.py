@@ -98,6 +98,8 @@ Centre = Annotated[
         description="where the optical axis is, in pixels from the left (cx) or upper (cy) edge; default: the clip's",
     ),
 ]
+DepthEnd = Annotated[int | None, Field(ge=1, le=10_000)]
+"""In whole mm, as the header says the range."""
 PoseText = Annotated[
     str | None,
     Field(
@@ -143,11 +145,15 @@ class RenderQuery(ViewQuery):
         description="right: seen from the right eye of a stereo clip and through its lens, as recorded?eye=right is; "
         "not with pose",
     )
-    layer: Layer = Field(default=Layer.RGB, description="depth is along the camera's z; confidence is in [0, 1]")
+    layer: Layer = Field(
+        default=Layer.RGB,
+        description="depth is along the camera's z; confidence is in [0, 1]; error: by how many levels of 255 the "
+        "model differs from the recorded frame nearest to t, in the mean of R G B, only from the endoscope's own pose",
+    )
     format: ImageFormat = Field(
         default=ImageFormat.PNG,
         description="png and npy are exact (depth: 16-bit png in 0.01 mm, npy in mm, 0 invalid); jpeg and webp are for "
-        "eyes, depth and confidence in false colour",
+        "eyes, layers but rgb in false colour. error is NaN in npy, 0 in png where nothing is compared",
     )
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
     unseen: Unseen = Field(
@@ -173,6 +179,11 @@ class RenderQuery(ViewQuery):
         default="on",
         description="on: layer rgb gets what the model misses of the recorded frames nearest in time; off: the model "
         "alone. Changes nothing where recorded frames are not kept",
+    )
+    near_mm: DepthEnd = Field(default=None, description="of layer=depth in false colours: the depth of the brightest")
+    far_mm: DepthEnd = Field(
+        default=None,
+        description="of layer=depth in false colours: the depth of the darkest. Without them the range is the clip's",
     )
 
 
@@ -273,6 +284,8 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
         light=query.light,
         smoke=query.smoke,
         detail=query.detail,
+        near_mm=query.near_mm,
+        far_mm=query.far_mm,
         max_pixels=settings.max_render_pixels,
     )
 

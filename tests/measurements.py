@@ -5,11 +5,22 @@ The right fifth of its picture is unsure, the upper fifth was never seen, and th
 
 from __future__ import annotations
 
+import itertools
 import math
 
 from contract.wire.rendering import MeasureRequest
 from intrasplat.camera import Intrinsics
-from intrasplat.measuring import MeasuredDistance, MeasuredPoint, Measurement, Point, Refusal, RefusalCode
+from intrasplat.measuring import (
+    UNITS,
+    MeasuredDistance,
+    MeasuredPoint,
+    MeasuredShape,
+    Measurement,
+    Point,
+    Refusal,
+    RefusalCode,
+    ShapeKind,
+)
 from tests.cameras import CAMERAS, FRAMES, RATE_HZ
 from worker.reply import Reply
 
@@ -30,10 +41,13 @@ def measured_flat(request: MeasureRequest) -> Measurement:
         cy=asked.cy or k.cy * height / k.height,
     )
     points = tuple(_point(number, point, camera) for number, point in enumerate(request.points))
-    distance = None
-    if len(points) == 2 and not any(each.refusal for each in points):
-        distance = _distance(request.t, points)
-    return Measurement(t=request.t, points=points, distance=distance, depth_range_mm=RANGE_MM, warnings=())
+    distance = shape = None
+    if not any(each.refusal for each in points):
+        if request.shape is not None:
+            shape = _shape(request.t, request.shape, points)
+        elif len(points) == 2:
+            distance = _distance(request.t, points)
+    return Measurement(t=request.t, points=points, distance=distance, shape=shape, depth_range_mm=RANGE_MM, warnings=())
 
 
 def measurement_reply(request: MeasureRequest) -> Reply:
@@ -64,18 +78,51 @@ def _point(number: int, point: Point, k: Intrinsics) -> MeasuredPoint:
     )
 
 
-def _distance(t: float, points: tuple[MeasuredPoint, ...]) -> MeasuredDistance:
+def _paths(t: float, points: tuple[MeasuredPoint, ...]) -> list[tuple[tuple[float, float, float], ...]]:
+    """Where the points are at every frame."""
     times = [frame / FRAMES for frame in range(FRAMES)]
-    paths = [
+    return [
         tuple((x * stretch(at) / stretch(t), y * stretch(at) / stretch(t), z) for at in times)
         for x, y, z in (each.point_mm for each in points if each.point_mm is not None)
     ]
+
+
+def _shape(t: float, kind: ShapeKind, points: tuple[MeasuredPoint, ...]) -> MeasuredShape:
+    """Its last frame is lost; the area of a polygon is that of a convex one."""
+    paths = _paths(t, points)
+    places = [each.point_mm for each in points if each.point_mm is not None]
+    pieces = [math.dist(*ends) for ends in itertools.pairwise(places)] if kind is ShapeKind.LINE else []
+    value, power = sum(pieces), 1
+    if kind is ShapeKind.AREA:
+        crosses = (a[0] * b[1] - a[1] * b[0] for a, b in itertools.pairwise([*places, places[0]]))
+        value, power = abs(sum(crosses)) / 2, 2
+    if kind is ShapeKind.ANGLE:
+        value, power = 90.0, 0
+    known = [value * (stretch(frame / FRAMES) / stretch(t)) ** power for frame in range(FRAMES - 1)]
+    return MeasuredShape(
+        kind=kind,
+        unit=UNITS[kind],
+        value=value,
+        uncertainty=UNCERTAINTY_MM,
+        pieces_mm=tuple(pieces),
+        piece_uncertainties_mm=(UNCERTAINTY_MM,) * len(pieces),
+        t=tuple(frame / FRAMES for frame in range(FRAMES)),
+        time_s=tuple(frame / RATE_HZ for frame in range(FRAMES)),
+        values=(*known, None),
+        uncertainties=(*[UNCERTAINTY_MM] * len(known), None),
+        trust=(0.9,) * len(known) + (0.1,),
+        places_mm=tuple(paths),
+    )
+
+
+def _distance(t: float, points: tuple[MeasuredPoint, ...]) -> MeasuredDistance:
+    paths = _paths(t, points)
     ends = (each.point_mm for each in points if each.point_mm is not None)
     now_mm = math.dist(*ends)
     return MeasuredDistance(
         distance_mm=now_mm,
         uncertainty_mm=UNCERTAINTY_MM,
-        t=tuple(times),
+        t=tuple(frame / FRAMES for frame in range(FRAMES)),
         time_s=tuple(frame / RATE_HZ for frame in range(FRAMES)),
         distances_mm=tuple(math.dist(*ends) for ends in zip(*paths, strict=True)),
         uncertainties_mm=(UNCERTAINTY_MM,) * FRAMES,

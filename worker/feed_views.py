@@ -22,7 +22,7 @@ from intrasplat.report import RightEye
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.encode import FOR_EYES
-from intrasplat.view.recorded import frame_of_feed, pictured_frame
+from intrasplat.view.recorded import frame_of_feed, pictured_frame, scene_picture
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.hosted_feed import HostedFeed
@@ -108,7 +108,14 @@ class FeedViews:
         wanted = request.model_copy(update={"t": view.t, "moment": None, "newer_than_s": None})
         replies, reply = self._replies, self._replies.get(wanted)
         if reply is None or reply.level > level:
-            reply = yield from rendered(view.scene, wanted, level, self._device, lambda: _right_eye(view.scene))
+            reply = yield from rendered(
+                view.scene,
+                wanted,
+                level,
+                self._device,
+                lambda: _right_eye(view.scene),
+                lambda: scene_picture(view.scene, view.t, request.eye),
+            )
             replies.keep(wanted, reply)
         return reply
 

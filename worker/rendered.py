@@ -19,7 +19,7 @@ from contract.wire.rendering import (
     render_cost,
 )
 from intrasplat.camera import Intrinsics
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, SceneError
 from intrasplat.export import DRAWN, export_parts
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.machine.parts import Parts
@@ -32,10 +32,12 @@ from intrasplat.splat.cpu.threads import beside
 from intrasplat.view.camera import camera_of, endoscope_pose, pose_of, right_eye, seen_through
 from intrasplat.view.coarse import LEVELS, thinned
 from intrasplat.view.encode import FOR_EYES, encode_layer
+from intrasplat.view.error import AS_RECORDED, check_comparable, error_levels
 from intrasplat.view.frame import View
 from intrasplat.view.lenses import Lenses
 from intrasplat.view.measure import WINDOW_PX
 from intrasplat.view.measured import measured
+from intrasplat.view.recorded import RecordedPicture
 from intrasplat.view.render import ROUNDING, ViewRequest, clamped_to_clip, frame_in_parts
 from intrasplat.view.renderer import renderer_of
 from worker.exports import OpenExports
@@ -53,12 +55,22 @@ def rendered(
     level: int,
     device: Device,
     right_eye_of_scene: Callable[[], RightEye | None],
+    recorded_of_scene: Callable[[], RecordedPicture],
 ) -> Parts[Reply]:
-    """One render of a scene at request.t. level: of detail. right_eye_of_scene is asked only if that eye is.
+    """One render of a scene at request.t. level: of detail. right_eye_of_scene is asked only if that eye is, and
+    recorded_of_scene, the recorded frame nearest to request.t, only for layer error: the view is then that of its time.
 
     Raises:
         InputError, LimitError: as Views.answer_in_parts.
     """
+    recorded = None
+    if request.layer is Layer.ERROR:
+        check_comparable(request.pose, request.camera)
+        try:
+            recorded, level = recorded_of_scene(), 0
+        except SceneError as missing:  # the scene itself is there
+            raise InputError("layer", str(missing), "Ask for another layer.") from missing
+        request = request.model_copy(update={**AS_RECORDED, "t": recorded.index / scene.frame_count})
     pose, lens = _pose_and_lens(scene, request, right_eye_of_scene)
     camera = camera_of(lens, request.camera, request.max_pixels)
     size, highlights = (camera.width, camera.height), request.highlights.shown_in(request.layer)
@@ -79,9 +91,10 @@ def rendered(
         frame = yield from frame_in_parts(view, with_confidence=request.layer is Layer.CONFIDENCE)
     range_mm = None
     if request.layer is Layer.DEPTH and request.format in FOR_EYES:
-        range_mm = renderer_of(drawn, device).depth_range.before(pose)
+        range_mm = renderer_of(drawn, device).depth_range.chosen(pose, request.near_mm, request.far_mm)
     frame = frame.enlarged(*size) if level else frame
-    body = yield from _encoded(frame, request, range_mm)
+    error = None if recorded is None else error_levels(frame.rgb, recorded, frame.unseen)
+    body = yield from _encoded(frame, request, range_mm, error)
     return Reply(
         body,
         MEDIA_TYPES[request.format],
@@ -100,7 +113,8 @@ def rendered(
 def measured_reply(scene: TrainedScene, request: MeasureRequest, device: Device) -> Reply:
     """A Measurement as JSON. Its time does not predict that of renders."""
     camera = camera_of(scene.intrinsics, request.camera, request.max_pixels)
-    found = measured(scene, request.t, pose_of(scene, request.pose), camera, request.points, device)
+    pose = pose_of(scene, request.pose)
+    found = measured(scene, request.t, pose, camera, request.points, device, shape=request.shape)
     return Reply(found.model_dump_json().encode(), MEDIA_TYPE_OF_JSON, found.t, found.warnings, is_untimed=True)
 
 
@@ -160,10 +174,15 @@ def _pose_and_lens(
     return right_eye(scene, clamped_to_clip(scene, request.t)[0], registration)
 
 
-def _encoded(frame: View, request: RenderRequest, depth_range_mm: tuple[float, float] | None) -> Parts[bytes]:
+def _encoded(
+    frame: View,
+    request: RenderRequest,
+    depth_range_mm: tuple[float, float] | None,
+    error: NDArray[np.float32] | None,
+) -> Parts[bytes]:
     """The encoded file. A large picture takes long and cannot be encoded in parts, so another thread does it."""
     how = request.layer, request.format, request.quality, request.unseen
-    encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm)
+    encode = partial(encode_layer, frame, *how, depth_range_mm=depth_range_mm, error=error)
     with traces.span("encode", layer=request.layer.value, format=request.format.value):
         if frame.unseen.size > LARGE_PIXELS:
             return (yield from beside(encode))

@@ -32,7 +32,7 @@ from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 from intrasplat.view.detail import detail_bytes
 from intrasplat.view.encode import FOR_EYES
-from intrasplat.view.recorded import live_frame, stored_frame
+from intrasplat.view.recorded import RecordedPicture, clip_picture, live_frame, stored_frame, stored_picture
 from worker.answer_cache import ReplyCache
 from worker.exports import OpenExports
 from worker.rendered import MEDIA_TYPE_OF_JSON, cost_of, export_reply, measured_reply, rendered, typical_cost
@@ -106,7 +106,9 @@ class Views:
         reply = self._replies.get(request)
         level = level if request.format in FOR_EYES else 0
         if reply is None or reply.level > level:
-            reply = yield from rendered(scene, request, level, self._device, lambda: self._right_eye(request))
+            reply = yield from rendered(
+                scene, request, level, self._device, lambda: self._right_eye(request), lambda: self._picture(request)
+            )
             reply = reply if snapshot is None else _of_snapshot(reply, snapshot)
             # Between the parts of a render, a scene may be purged or a newer snapshot shown.
             is_current = (
@@ -193,6 +195,17 @@ class Views:
             return self._store.newest_report(request.scene_id, request.attempt).right_eye
         clip = self._snapshots.clip(request.scene_id)
         return None if clip is None else clip.registration
+
+    def _picture(self, request: RenderRequest) -> RecordedPicture:
+        """The recorded frame nearest to a render's time."""
+        if request.attempt is not None:
+            folder = self._store.scene_folder(request.scene_id, request.attempt)
+            count = self._store.newest_report(request.scene_id, request.attempt).frame_count
+            return stored_picture(folder, count, request.t, request.eye)
+        clip = self._snapshots.clip(request.scene_id)
+        if clip is None:
+            raise NotYetError(f"The clip of job {request.scene_id} is not prepared yet.")
+        return clip_picture(clip, request.t, request.eye)
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._scenes.pop(key, None)

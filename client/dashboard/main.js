@@ -17,7 +17,7 @@ import { ClipForm } from "./form/form.js";
 import { Announcer } from "./library/announce.js";
 import { nameOf } from "./library/card.js";
 import { drawCurve, pointsOfCsv } from "./library/curve.js";
-import { Downloads } from "./library/downloads.js";
+import { Downloads, fileName, save } from "./library/downloads.js";
 import { baselinesOf } from "./library/figures.js";
 import { SceneImport } from "./library/importing.js";
 import { JobList } from "./library/joblist.js";
@@ -28,6 +28,7 @@ import { Shelf } from "./library/shelf.js";
 import { TimesLeft } from "./library/timeleft.js";
 import { listOpenFeeds } from "./live/links.js";
 import { Measure } from "./measure/measure.js";
+import { csvOf } from "./measure/measurements.js";
 import { Probe } from "./measure/probe.js";
 import { Compare } from "./stage/compare.js";
 import { prepareControlSets } from "./stage/controlsets.js";
@@ -90,8 +91,14 @@ const compare = new Compare(viewer, {
 const over = { stage: get("stage"), canvas: get("picture"), over: get("over") };
 new Probe(viewer, over);
 new Scale(viewer, { canvas: get("picture"), box: get("scale") });
-new Legend(viewer, get("legend"));
-const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") });
+new Legend(viewer, get("legend"), () => address.note());
+const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") }, {
+  onChange: () => address.note(),
+  onSave(measurements) {
+    const name = get("scene-id").textContent || viewer.scene;
+    save(`${fileName(name)}-measurements.csv`, async () => new Blob([csvOf(name, measurements)], { type: "text/csv" }));
+  },
+});
 const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
@@ -117,6 +124,7 @@ function view(id, message) {
   closeBanner(get("jobs-message"));
   viewer.open(id, message);
   compare.open(id);
+  offerError(null);
   address.note();
   jobs.view(id);
   if (id !== null && drawers.isOpen !== "report-drawer") drawers.close();
@@ -133,6 +141,7 @@ async function report(id) {
     const found = await getReport(id);
     if (!isStill()) return;
     compare.know(id, found);
+    offerError(found);
     verdict.know(found);
     showReport(get("report"), id, found, sendAgain);
     drawStrip(get("light-strip"), found.light);
@@ -187,6 +196,14 @@ function offerMasks() {
   const isOffered = viewer.scene !== null && get("layer").value === "recorded";
   get("better-masks").hidden = !isOffered;
   get("home").hidden = isOffered; // recorded frames are the endoscope's
+}
+
+viewer.addEventListener("uncompared", ({ detail }) => tell(detail));
+/** Errors are those against recorded frames. @param {{recorded: object | null} | null} known a scene's report */
+function offerError(known) {
+  const layer = get("layer");
+  layer.querySelector("[value=error]").disabled = !known?.recorded;
+  if (known && !known.recorded && layer.value === "error") viewer.look({ layer: "rgb" });
 }
 
 let isOpened = false;
@@ -280,8 +297,9 @@ viewer.timeline.playEvents.addEventListener("changed", () => {
 const goTo = (place) => {
   if (place.scene !== viewer.scene) view(place.scene);
   viewer.look(place);
+  measure.restore(place.measures);
 };
-const address = new Address(viewer, get("layer"), goTo, tell);
+const address = new Address(viewer, get("layer"), goTo, tell, () => measure.texts);
 
 const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
 const form = new ClipForm(

@@ -207,7 +207,7 @@ class Core(FeedCalls):
         scene: the job's or feed's id; needed unless the service holds one scene only.
         pose: orbit:YAW,PITCH,ZOOM in degrees, orbit:YAW,PITCH,ZOOM,X,Y,Z with the point looked at in mm, or
             world_from_camera as 12 or 16 numbers in mm, row-major.
-        layer: rgb, depth or confidence. format: png, jpeg, webp or npy. quality: of jpeg and webp, 1 to 100.
+        layer: rgb, depth, confidence, smoke or error. format: png, jpeg, webp or npy. quality: 1 to 100.
         unseen: mark (the default) hatches what no training frame saw, and makes it transparent in png and webp; guess
             shows what the model draws there.
         highlights: off shows rgb without the highlights that were separated by comparing both eyes of a stereo clip; a
@@ -217,7 +217,7 @@ class Core(FeedCalls):
         smoke: remove (the default) shows rgb without the smoke that was found before the tissue, show with it.
         detail: on (the default) adds what the model misses of the recorded frames nearest in time, off does not.
         known: an earlier view; it is returned if it is still what the service would send.
-        camera: width, height, fx, fy, cx, cy in pixels.
+        camera: width, height, fx, fy, cx, cy in pixels; near_mm, far_mm: ends of the false colours of depth.
         """
         query = view_query(t, scene, pose, layer, format, quality, unseen, highlights, light, smoke, detail, camera)
         return await views.render(self._session, query, known)
@@ -307,15 +307,17 @@ class Core(FeedCalls):
         points: Sequence[tuple[float, float]],
         t: float | str | None = None,
         pose: str | None = None,
+        shape: str | None = None,
         **camera: float,
     ) -> Measurement:
         """Depth, place and uncertainty in mm under points (x, y) of a view; of two points their distance over time.
 
+        shape: "line", "area" or "angle", what the points make together, over time: see MeasuredShape.
         pose and camera (width, height, fx, fy, cx, cy) as render has them: the points are pixels of that picture. A
         point with a `refusal` was not measured.
         """
         asked = ";".join(f"{float(x)!r},{float(y)!r}" for x, y in points)
-        response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, **camera)
+        response = await self._get("scenes", scene, "measure", points=asked, t=t, pose=pose, shape=shape, **camera)
         return parsed(response, Measurement.model_validate_json, response.content)
 
     async def export(

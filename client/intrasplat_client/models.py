@@ -229,6 +229,16 @@ class Severity(StrEnum):
     WARNING = "warning"
 
 
+class ShapeKind(StrEnum):
+    """What points make together: a line of straight pieces in space, a polygon of flat triangles, or the angle at
+    the second of three points.
+    """
+
+    LINE = "line"
+    AREA = "area"
+    ANGLE = "angle"
+
+
 class TryFailure(StrEnum):
     """Why one try to deliver a webhook failed; docs/codes.md explains each."""
 
@@ -629,6 +639,36 @@ class MeasuredPoint(Model):
     refusal: Refusal | None = None
 
 
+class MeasuredShape(Model):
+    """A length in mm, an area in mm2 or an angle in degrees, at every frame; the tissue carries its points along.
+
+    Null where a point is out of the endoscope's view for too long to be trusted. Lists have T entries.
+    """
+
+    kind: Annotated[ShapeKind | str, Field(union_mode="left_to_right")]
+    unit: str
+    value: float
+    """at the time asked for"""
+    uncertainty: float
+    """about 95 % of the true values lie within it"""
+    pieces_mm: tuple[float, ...]
+    """of a line: the length of each piece at the time asked for"""
+    piece_uncertainties_mm: tuple[float, ...]
+    """those of pieces_mm"""
+    t: tuple[float, ...]
+    """times of the frames"""
+    time_s: tuple[float, ...]
+    """seconds of the frames, from the first one"""
+    values: tuple[float | None, ...]
+    """at every frame"""
+    uncertainties: tuple[float | None, ...]
+    """those of values"""
+    trust: tuple[float, ...]
+    """at every frame: the least confidence of a point, times the share of its trust that is left"""
+    places_mm: tuple[tuple[tuple[float, ...], ...], ...]
+    """where each point is in the world: a list for each point, with a place for every frame"""
+
+
 class Measurement(Model):
     """What was measured in one view of a finished scene."""
 
@@ -636,7 +676,11 @@ class Measurement(Model):
     """the time that is shown"""
     points: tuple[MeasuredPoint, ...]
     distance: MeasuredDistance | None = None
-    """the distance of two points; null for any other number of points, and where a point is refused"""
+    """the distance of two points, if no shape is asked for; null for any other number of points, and where a point
+    is refused
+    """
+    shape: MeasuredShape | None = None
+    """what the points make together, if that is asked for and no point is refused"""
     depth_range_mm: tuple[float, ...]
     """depths of the brightest and the darkest false colour of layer=depth from this pose"""
     warnings: tuple[Notice, ...]

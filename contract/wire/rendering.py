@@ -18,7 +18,7 @@ from contract.wire.cameras import CamerasRequest, ClipCamera
 from contract.wire.feeds import CutRange, FeedShown
 from intrasplat.formats import ExportOptions
 from intrasplat.live.times import FeedTime
-from intrasplat.measuring import MAX_POINTS, Point
+from intrasplat.measuring import MAX_POINTS, Point, ShapeKind
 from intrasplat.names import JOB_ID_PATTERN, Detail, Eye, Light, Smoke
 from intrasplat.notices import Notice
 from intrasplat.picture import (
@@ -76,7 +76,10 @@ class RenderRequest(BaseModel):
     light: Light = Field(default="steady", exclude_if=lambda light: light == "steady")
     smoke: Smoke = Field(default="remove", exclude_if=lambda smoke: smoke == "remove")
     detail: Detail = Field(default="on", exclude_if=lambda detail: detail == "on")
-    """light, smoke and detail are left out of JSON if they are the default: older workers do not know them."""
+    near_mm: int | None = Field(default=None, exclude_if=lambda mm: mm is None)
+    far_mm: int | None = Field(default=None, exclude_if=lambda mm: mm is None)
+    """The depths of the brightest and the darkest false colour; None: the scene's own. These, light, smoke and detail
+    are left out of JSON if they are the default: older workers do not know them."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
     """The most that may be drawn for it."""
 
@@ -148,6 +151,8 @@ class MeasureRequest(BaseModel):
     pose: MatrixPose | OrbitPose | None = Field(default=None, discriminator="kind")
     camera: IntrinsicsOverride = IntrinsicsOverride()
     points: tuple[Point, ...] = Field(min_length=1, max_length=MAX_POINTS)
+    shape: ShapeKind | None = Field(default=None, exclude_if=lambda shape: shape is None)
+    """What the points make together; left out of JSON without one: older workers do not know it."""
     max_pixels: int = Field(default=4096 * 2160, gt=0)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from intrasplat.commands.arguments import finite
 from intrasplat.commands.device import add_device
 from intrasplat.commands.exits import ExitCode
-from intrasplat.measuring import parse_points
+from intrasplat.measuring import ShapeKind, check_shape, parse_points
 
 
 def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +19,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="X,Y;X,Y",
         help="points in pixels of the clip's left eye, from its upper left; of two the distance at every frame, too",
+    )
+    parser.add_argument(
+        "--shape",
+        type=ShapeKind,
+        choices=list(ShapeKind),
+        help="what the points make together, at every frame: line: straight pieces from point to point; area: a "
+        "polygon of flat triangles; angle: at the second of 3 points",
     )
     parser.add_argument("--t", type=finite, default=0.0, help="time: 0 is the first frame, 1 the end of the clip")
     parser.add_argument(
@@ -41,8 +48,10 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.view.measured import measured
 
     points, device = parse_points(options.points), choose_device(options.device)
+    check_shape(options.shape, len(points))
     check_is_scene(options.scene, "SCENE")
     scene = load_scene(options.scene)
     pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
-    print(measured(scene, options.t, pose, scene.intrinsics, points, device).model_dump_json(indent=2))
+    found = measured(scene, options.t, pose, scene.intrinsics, points, device, shape=options.shape)
+    print(found.model_dump_json(indent=2))
     return ExitCode.OK

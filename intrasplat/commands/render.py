@@ -50,7 +50,8 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         "--layer",
         choices=[layer.value for layer in Layer],
         default=Layer.RGB.value,
-        help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1 (default: rgb)",
+        help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1; error: levels "
+        "of 255 by which the model differs from the recorded frame nearest to the time (default: rgb)",
     )
     parser.add_argument(
         "--unseen",
@@ -114,6 +115,8 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
     from intrasplat.view.encode import encode_layer
+    from intrasplat.view.error import check_comparable, error_levels
+    from intrasplat.view.recorded import stored_picture
     from intrasplat.view.render import render_frame
     from intrasplat.view.renderer import renderer_of
 
@@ -124,22 +127,28 @@ def run_cli(options: argparse.Namespace) -> int:
     highlights = Highlights(options.highlights).shown_in(layer)
     wanted = _camera(options)
     camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
-    pose = pose_of(scene, None if options.pose is None else parse_pose(options.pose))
+    asked_pose = None if options.pose is None else parse_pose(options.pose)
+    pose, is_error = pose_of(scene, asked_pose), layer is Layer.ERROR
+    if is_error:
+        check_comparable(asked_pose, wanted)
     shown = dict[NoticeCode, list[tuple[str, Notice]]]()
     for t, path in _targets(options, scene.frame_count):
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
         if image_format is None:
             raise InputError("--out", f"{path.name!r} has no known ending.", f"Use {', '.join(SUFFIX_FORMATS)}.")
+        recorded = stored_picture(options.scene, scene.frame_count, t) if is_error else None
         frame = render_frame(
-            scene, t, pose, camera, device,
-            highlights=highlights, light=options.light, smoke=options.smoke,
+            scene, t if recorded is None else recorded.index / scene.frame_count, pose, camera, device,
+            highlights=highlights,
+            light="recorded" if is_error else options.light,
+            smoke="show" if is_error else options.smoke,
             detail=options.detail if layer is Layer.RGB else "off",
         )  # fmt: skip
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(
-            encode_layer(frame, layer, image_format, unseen=Unseen(options.unseen), depth_range_mm=range_mm)
-        )
+        error = None if recorded is None else error_levels(frame.rgb, recorded, frame.unseen)
+        unseen = Unseen(options.unseen)
+        path.write_bytes(encode_layer(frame, layer, image_format, unseen=unseen, depth_range_mm=range_mm, error=error))
         print(path)
         for notice in frame.warnings:
             shown.setdefault(notice.code, []).append((path.name, notice))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from intrasplat.camera import to_camera
 from intrasplat.clip import spread
+from intrasplat.errors import InputError
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.model import Model
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
@@ -21,8 +22,9 @@ from intrasplat.view.out_of_view import seen_by_endoscope
 
 SAMPLED_FRAMES = 8
 """Number of trained frames that are sampled, evenly spread."""
-PERCENTILES = (2.0, 98.0)
-"""Percentiles of the Gaussians' depths that bound the range, so that a few outliers do not flatten the picture."""
+PERCENTILES = (5.0, 95.0)
+"""Percentiles of the Gaussians' depths that bound the range, so that what is much nearer or farther, such as the edge
+of an organ, does not flatten the rest of the picture."""
 
 
 @dataclass(frozen=True)
@@ -53,3 +55,18 @@ class DepthRange:
         middle_mm = to_camera(np.array([[0.0, 0.0, self.median_mm]]), world_from_camera)[0, 2]
         moved_mm = round(float(middle_mm) - self.median_mm)
         return self.near_mm + moved_mm, self.far_mm + moved_mm
+
+    def chosen(
+        self, world_from_camera: NDArray[np.float64] | None, near_mm: float | None, far_mm: float | None
+    ) -> tuple[float, float]:
+        """As before(), with the ends that a caller chooses; None: that of the range.
+
+        Raises:
+            InputError: the far end is not beyond the near one.
+        """
+        own_near_mm, own_far_mm = self.before(world_from_camera)
+        near_mm, far_mm = own_near_mm if near_mm is None else near_mm, own_far_mm if far_mm is None else far_mm
+        if far_mm <= near_mm:
+            problem = f"{far_mm:g} mm is not beyond {near_mm:g} mm, the near end."
+            raise InputError("far_mm", problem, "Give a far end beyond the near one.")
+        return near_mm, far_mm

@@ -5,11 +5,14 @@ rgb         8 bit                       uint8 [H, W, 3]       8 bit
 depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
 confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high bright
 smoke       8 bit, 255 = 1              float32 [H, W]        false colour, thick bright
+error       8 bit, levels               float32 levels, NaN   false colour, BRIGHTEST_ERROR levels bright
 
 False colours are those of intrasplat/colours.py.
 
-If unseen pixels are marked, their other layers are 0, and rgb shows a hatch. Then png and webp of rgb have an
-alpha channel, UNSEEN_ALPHA (practically transparent) there and 255 elsewhere. Programs without alpha show the hatch.
+If unseen pixels are marked, rgb and all false colours show a hatch there, and exact files of the other layers are 0.
+Where nothing is compared, an error is NaN, 0 in png, and hatched.
+Then png and webp of rgb have an alpha channel, UNSEEN_ALPHA (practically transparent) there and 255 elsewhere. Programs
+without alpha show the hatch.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from intrasplat.colours import COLOUR_TABLE
-from intrasplat.picture import ImageFormat, Layer, Unseen
+from intrasplat.picture import BRIGHTEST_ERROR, ImageFormat, Layer, Unseen
 from intrasplat.view.unseen import hatched
 
 DEPTH_PNG_PER_MM = 100.0
@@ -65,13 +68,19 @@ def encode_layer(
     unseen: Unseen = Unseen.MARK,
     *,
     depth_range_mm: tuple[float, float] | None = None,
+    error: NDArray[np.float32] | None = None,
 ) -> bytes:
     """The bytes of a file with one layer of a frame.
 
     Args:
         quality: 1 to 100, for jpeg and webp.
         depth_range_mm: nearest and farthest depth of the false colours; jpeg and webp of depth need it.
+        error: [H, W] levels, NaN where nothing is compared (error.py); layer error needs it.
     """
+    if layer is Layer.ERROR:
+        if error is None:
+            raise ValueError("layer error needs the errors")
+        return _encode_error(error, image_format, quality)
     marked = frame.unseen if unseen is Unseen.MARK else None
     if layer is Layer.RGB:
         return _encode_colour(frame.rgb, marked, image_format, quality)
@@ -81,11 +90,21 @@ def encode_layer(
     if image_format is ImageFormat.NPY:
         return _npy(values)
     if image_format in FOR_EYES:
-        return _image(_in_false_colours(values, layer, depth_range_mm), image_format, quality)
+        coloured = _in_false_colours(values, layer, depth_range_mm)
+        return _image(coloured if marked is None else hatched(coloured, marked), image_format, quality)
     if layer is Layer.DEPTH:
         steps = np.clip(np.rint(values * DEPTH_PNG_PER_MM), 0, np.iinfo(np.uint16).max)
         return _image(steps.astype(np.uint16), image_format, quality)
     return _image(np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8), image_format, quality)
+
+
+def _encode_error(levels: NDArray[np.float32], image_format: ImageFormat, quality: int) -> bytes:
+    if image_format is ImageFormat.NPY:
+        return _npy(levels)
+    missing, known = np.isnan(levels), np.asarray(np.nan_to_num(levels), np.float32)
+    if image_format in FOR_EYES:
+        return _image(hatched(_coloured(known / np.float32(BRIGHTEST_ERROR)), missing), image_format, quality)
+    return _image(np.rint(known).astype(np.uint8), image_format, quality)
 
 
 def _values(frame: Layers, layer: Layer) -> NDArray[np.float32]:

@@ -211,19 +211,45 @@ class Distances:
     paths_mm: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Where P places go.
+
+    places_mm  [P, T, 3] positions in the world at every frame
+    spread_mm  [P, T] standard uncertainty of each displacement since the time of choice, in any direction
+    left       [P, T] share of the trust in each place that is left
+    """
+
+    places_mm: NDArray[np.float64]
+    spread_mm: NDArray[np.float64]
+    left: NDArray[np.float64]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """[T] whether all places are trusted at each frame."""
+        return np.asarray((self.left >= MIN_REMAINING_TRUST).all(axis=0))
+
+
+def paths(scene: TrainedScene, t: float, places: Sequence[MeasuredPlace], device: Device = CPU) -> Paths:
+    """The paths of places that were chosen at model time t."""
+    displacements, apart_mm = zip(*(_displacements(scene, t, each) for each in places), strict=True)
+    places_mm = np.stack([each.point_mm + moved for each, moved in zip(places, displacements, strict=True)])
+    left = np.stack([_remaining_trust(scene, each, device) for each in places])
+    return Paths(places_mm, MOTION_FACTOR * np.stack(apart_mm), left)
+
+
 def distances(
     scene: TrainedScene, t: float, first: MeasuredPlace, second: MeasuredPlace, device: Device = CPU
 ) -> Distances:
     """The distance of two places that were chosen at model time t, at that time and at every frame."""
     both = (first, second)
-    displacements, apart_mm = zip(*(_displacements(scene, t, each) for each in both), strict=True)
-    paths_mm = np.stack([each.point_mm + displacement for each, displacement in zip(both, displacements, strict=True)])
+    followed = paths(scene, t, both, device)
     covariance = sum((each.uncertainty_mm**2 * np.outer(each.ray, each.ray) for each in both), np.zeros((3, 3)))
-    apart_mm2 = MOTION_FACTOR**2 * np.sum(np.square(apart_mm), axis=0)
+    apart_mm2 = np.sum(np.square(followed.spread_mm), axis=0)
+    paths_mm = followed.places_mm
     now = _apart((second.point_mm - first.point_mm)[None], covariance[None])
     over_time = _apart(paths_mm[1] - paths_mm[0], covariance + apart_mm2[:, None, None] * np.eye(3))
-    known = np.all([_remaining_trust(scene, each, device) >= MIN_REMAINING_TRUST for each in both], axis=0)
-    return Distances(float(now[0][0]), float(now[1][0]), *over_time, known, paths_mm)
+    return Distances(float(now[0][0]), float(now[1][0]), *over_time, followed.known, paths_mm)
 
 
 def _apart(

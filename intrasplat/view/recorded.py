@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -48,6 +49,15 @@ BLACK_IS_CLEAR = b"\x00\x00\x00\x02tRNS\x00\x00\x76\x93\xcd\x38"
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPicture:
+    """One recorded frame: its number, R G B [h, w, 3], and where it shows instruments [h, w]."""
+
+    index: int
+    rgb: Picture
+    tool: Mask
 
 
 class ClipPictures:
@@ -126,12 +136,13 @@ def live_frame(
     Raises:
         InputError: the clip has no such eye.
     """
-    index = nearest(clip.used, t, clip.frame_count)
-    of = _eye(clip, eye)
-    if masks is RecordedMasks.ONLY:
-        return index, mask_png(_tool(of, index))
-    rgb = _rgb(of, index)
-    return index, _jpeg(_marked(rgb, _tool(of, index)) if masks is RecordedMasks.MARKED else rgb)
+    return _as_file(clip_picture(clip, t, eye), masks)
+
+
+def clip_picture(clip: DepthClip, t: float, eye: EyeName = "left") -> RecordedPicture:
+    """As live_frame, in memory."""
+    index, of = nearest(clip.used, t, clip.frame_count), _eye(clip, eye)
+    return RecordedPicture(index, _rgb(of, index), _tool(of, index))
 
 
 def pictured_frame(
@@ -142,14 +153,17 @@ def pictured_frame(
     Raises:
         InputError: it has none, or none of this eye.
     """
+    return _as_file(scene_picture(scene, t, eye), masks)
+
+
+def scene_picture(scene: TrainedScene, t: float, eye: EyeName = "left") -> RecordedPicture:
+    """As pictured_frame, in memory."""
     pictures, place = scene.pictures, EYES.index(eye)
     if pictures is None or place >= len(pictures.eyes):
         raise InputError("eye", f"the scene has no recorded frames of the {eye} eye.", "Ask for eye=left.")
     index = nearest(pictures.frames, t, scene.frame_count)
     rgb, tissue = pictures.picture(place, index)
-    if masks is RecordedMasks.ONLY:
-        return index, mask_png(~tissue)
-    return index, _jpeg(_marked(rgb.copy(), ~tissue) if masks is RecordedMasks.MARKED else rgb)
+    return RecordedPicture(index, rgb, ~tissue)
 
 
 def stored_frame(
@@ -165,19 +179,31 @@ def stored_frame(
         SceneError: it has no recorded frames, or a file is damaged.
         InputError: it has no such eye, or no masks.
     """
-    if masks is RecordedMasks.ONLY:
-        return read_frame(folder, frame_count, t, eye, MASK)
+    if masks is not RecordedMasks.MARKED:
+        return read_frame(folder, frame_count, t, eye, MASK if masks is RecordedMasks.ONLY else PICTURE)
+    return _as_file(stored_picture(folder, frame_count, t, eye), masks)
+
+
+def stored_picture(folder: Path, frame_count: int, t: float, eye: EyeName = "left") -> RecordedPicture:
+    """As stored_frame, in memory."""
     index, jpeg = read_frame(folder, frame_count, t, eye)
-    if masks is RecordedMasks.OFF:
-        return index, jpeg
     try:
         _, png = read_frame(folder, frame_count, t, eye, MASK)
     except InputError:  # nothing is masked
-        return index, jpeg
+        rgb = np.ascontiguousarray(_decoded(jpeg, cv2.IMREAD_COLOR)[..., ::-1])
+        return RecordedPicture(index, rgb, np.zeros(rgb.shape[:2], np.bool_))
     if jpeg_size(jpeg) != (size := png_size(png)) or size is None or size[0] > MAX_WIDTH or size[1] > MAX_HEIGHT:
         raise SceneError("A recorded frame of this scene is damaged, too large, or does not fit its mask.")
     rgb, tool = _decoded(jpeg, cv2.IMREAD_COLOR)[..., ::-1], _decoded(png, cv2.IMREAD_GRAYSCALE) > 0
-    return index, _jpeg(_marked(np.ascontiguousarray(rgb), tool))
+    return RecordedPicture(index, np.ascontiguousarray(rgb), tool)
+
+
+def _as_file(recorded: RecordedPicture, masks: RecordedMasks) -> tuple[int, bytes]:
+    """The frame's number, and the frame as JPEG or its mask as PNG."""
+    if masks is RecordedMasks.ONLY:
+        return recorded.index, mask_png(recorded.tool)
+    rgb = recorded.rgb if masks is RecordedMasks.OFF else _marked(recorded.rgb.copy(), recorded.tool)
+    return recorded.index, _jpeg(rgb)
 
 
 def _eye(clip: DepthClip, name: EyeName) -> Eye:

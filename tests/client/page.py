@@ -40,6 +40,7 @@ from contract.wire.rendering import (
     SceneRequest,
     WorkerAddress,
 )
+from intrasplat.errors import InputError
 from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
@@ -136,6 +137,9 @@ class Painter:
         self.eye: Eye = "left"
         self.light: tuple[Light, Smoke] = ("steady", "remove")
         """Of the newest picture."""
+        self.asked: RenderRequest | None = None
+        self.lacks_frames = False
+        """Whether nothing recorded can be compared with."""
         self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
@@ -149,6 +153,9 @@ class Painter:
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
+        if request.layer is Layer.ERROR and self.lacks_frames:
+            raise InputError("layer", "The recorded frames are damaged.", "Ask for another layer.")
+        self.asked = request
         self.shown_unseen, self.shown_highlights, self.eye = request.unseen, request.highlights, request.eye
         self.light = (request.light, request.smoke)
         picture = np.full((48, 60, 3), grey_of(request.scene_id), np.uint8)
@@ -163,6 +170,7 @@ class Painter:
             return Reply(depth_of(request), MEDIA_TYPES[request.format], request.t, camera=CAMERA)
         image = cv2.imencode(f".{request.format.value}", picture)[1].tobytes()
         iteration = SNAPSHOT_ITERATION if request.attempt is None else None
+        range_mm = (request.near_mm or RANGE_MM[0], request.far_mm or RANGE_MM[1])
         return Reply(
             image,
             MEDIA_TYPES[request.format],
@@ -171,7 +179,7 @@ class Painter:
             iteration,
             0.12 if NoticeCode.UNSEEN in [each.code for each in warnings] else self.unseen_share,
             camera=CAMERA,
-            depth_range_mm=RANGE_MM if request.layer is Layer.DEPTH else None,
+            depth_range_mm=range_mm if request.layer is Layer.DEPTH else None,
         )
 
 

@@ -249,3 +249,9 @@ def test_depth_in_false_colours_tells_between_which_depths(
     scene = service.finished_scene()
     response = service.http.get("/render", params={"scene": scene, "layer": "depth", "format": format})
     assert response.headers.get("X-Intrasplat-Depth-Range-Mm") == expected
+    (plain,) = service.painter.requests
+    assert "near_mm" not in plain.model_dump_json()  # older workers do not know it
+    chosen = {"scene": scene, "layer": "depth", "format": format, "near_mm": 50, "far_mm": 90}
+    assert service.http.get("/render", params=chosen).status_code == 200
+    assert (service.painter.requests[1].near_mm, service.painter.requests[1].far_mm) == (50, 90)
+    assert_problem(service.http.get("/render", params={**chosen, "near_mm": 0}), 422, "near_mm")

@@ -32,6 +32,20 @@ def test_points_of_a_view_are_measured_by_the_worker(service: ServiceUnderTest) 
     assert "Research use only" in answer.json()["notice"]
 
 
+def test_a_shape_of_points_is_asked_of_the_worker_and_comes_with_its_unit(service: ServiceUnderTest) -> None:
+    scene = service.finished_scene()
+    asked = {"points": "10,20;20,20;20,30;10,30", "shape": "area"}
+    found = Measurement.model_validate(service.http.get(f"/scenes/{scene}/measure", params=asked).json())
+    (request,) = service.painter.requests
+    assert isinstance(request, MeasureRequest)
+    assert request.shape == "area"
+    assert found == measured_flat(request)
+    assert found.shape is not None
+    assert found.shape.unit == "mm2"
+    plain = request.model_copy(update={"shape": None})
+    assert "shape" not in plain.model_dump_json()  # older workers do not know it
+
+
 def test_a_point_that_is_refused_says_why_by_a_code(service: ServiceUnderTest) -> None:
     answer = service.http.get(f"/scenes/{service.finished_scene()}/measure", params={"points": "10,12;55,12"})
     assert answer.status_code == 200
@@ -46,6 +60,8 @@ def test_a_point_that_is_refused_says_why_by_a_code(service: ServiceUnderTest) -
     [
         ({}, "points"),
         ({"points": "1"}, "points"),
+        ({"points": "1,2", "shape": "line"}, "points"),
+        ({"points": "1,2;3,4", "shape": "circle"}, "shape"),
         ({"points": "1,2", "t": -1}, "t"),
         ({"points": "1,2", "pose": "orbit:1"}, "pose"),
         ({"points": "1,2", "width": 4}, "width"),

@@ -1,10 +1,16 @@
-// The page's address: #/scene/ID?t=&pose=&layer= names a view, so that it survives a reload and can be sent to others.
+// The page's address: #/scene/ID?t=&pose=&layer=&range=&m= names a view and its measurements, so that it survives a reload and can be sent to others.
 // #/live/ID leads to the live screen of a feed.
 
 import { addressOf } from "../live/links.js";
+import { measurementOf } from "../measure/measurements.js";
 import { words } from "./messages.js";
 
-/** @typedef {{scene: string, t: number, pose: string | null, layer: string}} Place pose: as GET /render spells it, or RIGHT_EYE */
+/**
+ * pose: as GET /render spells it, or RIGHT_EYE. range: of depth's false colours in mm; null: the clip's. measures: as
+ * textOf() of measure/measurements.js writes them.
+ * @typedef {{scene: string, t: number, pose: string | null, layer: string, range: [number, number] | null,
+ *   measures: string[]}} Place
+ */
 
 /** Not a pose of the service's: the endoscope's right eye, wherever it is at t. */
 export const RIGHT_EYE = "right";
@@ -12,6 +18,7 @@ const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
 const LIVE = /^#\/live\/([0-9a-f]{32})$/;
 const ID = /^[0-9a-f]{32}$/;
 const POSE = /^(right|orbit:[-\d.e]+(,[-\d.e]+){2}((,[-\d.e]+){3})?|[-\d.e]+(,[-\d.e]+){11})$/;
+const RANGE = /^([1-9]\d{0,3}),([1-9]\d{0,3})$/;
 const WRITE_AFTER_MS = 400;
 const TOLD_MS = 6000;
 
@@ -36,15 +43,27 @@ export function placeOf(hash, layers) {
   const t = Number(read("t", (text) => text.trim() !== "" && Number(text) >= 0 && Number(text) <= 1, "0"));
   const pose = read("pose", (text) => POSE.test(text), null);
   const layer = read("layer", (text) => layers.includes(text), layers[0]);
-  return { place: { scene: found[1], t, pose, layer }, wrong: wrong.join(" ") };
+  const range = read("range", isRange, null)?.split(",").map(Number) ?? null;
+  const asked = query.getAll("m");
+  const measures = asked.filter((text) => measurementOf(text) !== null);
+  if (measures.length < asked.length) wrong.push(words("address.measures"));
+  return { place: { scene: found[1], t, pose, layer, range, measures }, wrong: wrong.join(" ") };
+}
+
+/** @param {string} text */
+function isRange(text) {
+  const [, near, far] = RANGE.exec(text) ?? [];
+  return Number(near) < Number(far);
 }
 
 /** @param {Place} place @param {string} usual the layer that needs no name @returns {string} the hash */
-export function hashOf({ scene, t, pose, layer }, usual) {
+export function hashOf({ scene, t, pose, layer, range, measures }, usual) {
   const parts = [];
   if (t > 0) parts.push(`t=${Number(t.toFixed(4))}`);
   if (pose !== null) parts.push(`pose=${pose.trim().replace(/[,\s]+/g, ",")}`);
   if (layer !== usual) parts.push(`layer=${layer}`);
+  if (range) parts.push(`range=${range.join(",")}`);
+  parts.push(...measures.map((each) => `m=${encodeURIComponent(each).replaceAll("%2C", ",").replaceAll("%3B", ";").replaceAll("%3A", ":")}`));
   return `#/scene/${scene}${parts.length ? `?${parts.join("&")}` : ""}`;
 }
 
@@ -55,9 +74,10 @@ export class Address {
    * @param {HTMLSelectElement} layer
    * @param {(place: Place) => void} go there: somebody followed or typed an address
    * @param {(text: string, isBad?: boolean) => void} tell
+   * @param {() => string[]} measures that are there
    */
-  constructor(viewer, layer, go, tell) {
-    Object.assign(this, { viewer, layer, go, tell });
+  constructor(viewer, layer, go, tell, measures) {
+    Object.assign(this, { viewer, layer, go, tell, measures });
     this.timer = 0;
     addEventListener("hashchange", () => this.follow());
     viewer.addEventListener("shown", () => this.note());
@@ -90,8 +110,8 @@ export class Address {
 
   /** Say it now. */
   write() {
-    const { scene, timeline, orbit } = this.viewer;
-    const place = { scene, t: timeline.t, pose: orbit.place, layer: this.layer.value };
+    const { scene, timeline, orbit, range } = this.viewer;
+    const place = { scene, t: timeline.t, pose: orbit.place, layer: this.layer.value, range, measures: this.measures() };
     const hash = scene ? hashOf(place, this.#layers[0]) : "";
     if (hash !== location.hash) history.replaceState(null, "", hash || location.pathname);
   }

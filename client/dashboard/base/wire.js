@@ -246,9 +246,26 @@
  */
 /**
  * @typedef {{
+ *   kind: ShapeKind,
+ *   unit: "mm"|"mm2"|"deg",
+ *   value: number,
+ *   uncertainty: number,
+ *   pieces_mm: number[],
+ *   piece_uncertainties_mm: number[],
+ *   t: number[],
+ *   time_s: number[],
+ *   values: number | null[],
+ *   uncertainties: number | null[],
+ *   trust: number[],
+ *   places_mm: number[][][],
+ * }} MeasuredShape
+ */
+/**
+ * @typedef {{
  *   t: number,
  *   points: MeasuredPoint[],
  *   distance?: MeasuredDistance | null,
+ *   shape?: MeasuredShape | null,
  *   depth_range_mm: number[],
  *   warnings: Notice[],
  *   notice?: string,
@@ -363,6 +380,7 @@
  * }} SceneCameras
  */
 /** @typedef {"info"|"warning"} Severity */
+/** @typedef {"line"|"area"|"angle"} ShapeKind */
 /** @typedef {"address_refused"|"certificate"|"fault"|"host_refused"|"status"|"timeout"|"unreachable"|"unclassified"} TryFailure */
 /** Each option's default, choices and limits. */
 export const LIMITS = {
@@ -405,3 +423,6 @@ export const COLOUR_TABLE = [
   "dec958dfca57e0cb56e1cc55e2cd54e4ce53e5cf52e6d051e7d150e8d24fe9d34eead34cebd44bedd54aeed649efd748",
   "f0d846f1d945f2da44f3db42f5dc41f6dd3ff7de3ef8df3cf9e03afbe138fce236fde334fee434fee535fee636fee838",
 ].join("");
+
+/** Levels of the brightest colour of layer error. */
+export const BRIGHTEST_ERROR = 32;

@@ -36,14 +36,14 @@ const KEPT_MS = 10_000;
 const kindOf = (id, format) => `${id} ${format.split("-")[0]}`;
 
 /** @param {string} name of a scene @returns {string} the same as a file's name, without its ending */
-const fileName = (name) => name.replace(/[^\p{L}\p{N}._-]+/gu, "_");
+export const fileName = (name) => name.replace(/[^\p{L}\p{N}._-]+/gu, "_");
 
 /**
  * Save what is loaded under a name. Not a link: a link sends no key.
  * @param {string} name
  * @param {() => Promise<Blob>} load
  */
-async function save(name, load) {
+export async function save(name, load) {
   const link = element("a");
   link.href = URL.createObjectURL(await load());
   link.download = name;

@@ -110,7 +110,7 @@ export class LiveMeasure {
     const last = readings.at(-1);
     const second = this.chosen.length > 0;
     const why = { why: readingOf(last) };
-    if (last.refusal) return this.#tell(second ? "measure.refused_second" : "measure.refused_first", why);
+    if (last.refusal) return this.#tell(second ? "measure.refused_next" : "measure.refused_first", why);
     this.chosen = points;
     const places = readings.map((each) => each.point_mm);
     this.found = distance && { mm: distance.distance_mm, sigma: distance.uncertainty_mm, places };

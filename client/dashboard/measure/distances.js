@@ -1,7 +1,7 @@
-// The curve of a distance over the clip, with its uncertainty as a band.
+// The curve of a measurement over the clip, with its uncertainty as a band.
 
 import { draw } from "../base/element.js";
-import { figure, words } from "../base/messages.js";
+import { figure, language, words } from "../base/messages.js";
 
 const WIDTH = 300;
 const HEIGHT = 90;
@@ -10,21 +10,27 @@ const RIGHT = 6;
 const TOP = 8;
 const BOTTOM = 18;
 /** The axis spans at least so much, so that noise does not look like movement. */
-const MIN_SPAN_MM = 1;
-const NOTHING = { time_s: [], distances_mm: [], uncertainties_mm: [] };
+const MIN_SPAN = { mm: 1, mm2: 10, deg: 2 };
+const NOTHING = { time_s: [], values: [], uncertainties: [], unit: "mm" };
+/** What each picture shows, and in which language. */
+const drawn = new WeakMap();
 
 /**
+ * Draw it, unless it is there.
  * @param {SVGSVGElement} svg
- * @param {import("../base/wire.js").MeasuredDistance | null} found null, or known at no frame: nothing is drawn
+ * @param {import("../base/wire.js").MeasuredShape | null} found null, or known at no frame: nothing is drawn
  */
-export function drawDistances(svg, found) {
+export function drawOverTime(svg, found) {
+  const [shape, of] = drawn.get(svg) ?? [];
+  if (shape === found && of === language()) return;
+  drawn.set(svg, [found, language()]);
   svg.replaceChildren();
-  const { time_s: times, distances_mm: lengths, uncertainties_mm: sigmas } = found ?? NOTHING;
+  const { time_s: times, values: lengths, uncertainties: sigmas, unit } = found ?? NOTHING;
   const known = times.map((_, i) => i).filter((i) => lengths[i] !== null);
   svg.toggleAttribute("hidden", known.length === 0);
   if (known.length === 0) return;
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
-  const [low, high] = spanOf(known.flatMap((i) => [lengths[i] - sigmas[i], lengths[i] + sigmas[i]]));
+  const [low, high] = spanOf(known.flatMap((i) => [lengths[i] - sigmas[i], lengths[i] + sigmas[i]]), MIN_SPAN[unit]);
   const last = times.at(-1) || 1;
   const x = (seconds) => LEFT + (seconds / last) * (WIDTH - LEFT - RIGHT);
   const y = (mm) => TOP + ((high - mm) / (high - low)) * (HEIGHT - TOP - BOTTOM);
@@ -40,17 +46,17 @@ export function drawDistances(svg, found) {
     draw(svg, "polyline", { class: "score", points: middle.join(" ") });
   }
   draw(svg, "line", { class: "now", x1: x(0), x2: x(0), y1: TOP, y2: HEIGHT - BOTTOM });
-  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, words("measure.axes"));
+  draw(svg, "text", { class: "tick", x: LEFT, y: HEIGHT - 4 }, words(`measure.axes_${unit}`));
   draw(svg, "text", { class: "tick right", x: WIDTH - RIGHT, y: HEIGHT - 4 }, `${figure(last, 1)} s`);
   const told = known.map((i) => lengths[i]);
-  const range = { low: figure(Math.min(...told), 1), high: figure(Math.max(...told), 1) };
+  const range = { low: figure(Math.min(...told), 1), high: figure(Math.max(...told), 1), unit: words(`measure.unit_${unit}`) };
   svg.setAttribute("aria-label", words("measure.over_time", range));
 }
 
 /**
  * Move the line of the time in view.
- * @param {SVGSVGElement} svg as drawDistances left it
- * @param {import("../base/wire.js").MeasuredDistance} found
+ * @param {SVGSVGElement} svg as drawOverTime left it
+ * @param {import("../base/wire.js").MeasuredShape} found
  * @param {number} t
  */
 export function markTime(svg, { time_s: times }, t) {
@@ -64,9 +70,9 @@ export function markTime(svg, { time_s: times }, t) {
 }
 
 /** Least and greatest of the axis. */
-function spanOf(values) {
+function spanOf(values, least) {
   const [low, high] = [Math.min(...values), Math.max(...values)];
-  const more = Math.max(0, MIN_SPAN_MM - (high - low)) / 2;
+  const more = Math.max(0, least - (high - low)) / 2;
   return [Math.max(0, low - more), high + more];
 }
 

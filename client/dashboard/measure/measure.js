@@ -1,13 +1,17 @@
-// The tool "Measure": two points of the tissue, their distance in mm with its uncertainty, followed in time. For
-// research alone, as it says.
+// The tool "Measure": distances, lines, areas and angles of points of the tissue, with their uncertainty, followed in
+// time. They stay until they are deleted, or the scene leaves the screen. For research alone, as it says.
 
 import { getMeasurement } from "../base/api.js";
-import { figure, language, languageEvents, words } from "../base/messages.js";
-import { drawDistances, markTime } from "./distances.js";
+import { languageEvents, words } from "../base/messages.js";
+import { drawOverTime, markTime } from "./distances.js";
+import { figureOf, MeasurementList } from "./list.js";
+import { freeName, KINDS, measurementOf, MOST, shapeAt, textOf } from "./measurements.js";
 import { Overlay } from "./overlay.js";
 import { isMeasurable, queryOf, sameView } from "./places.js";
 import { PointPicker } from "./pointpicker.js";
 import { readingOf } from "./probe.js";
+
+/** @typedef {import("./measurements.js").Measurement} Measurement */
 
 /** A pointer that moves less between down and up has clicked, and turns nothing. */
 const CLICK_PX = 6;
@@ -16,13 +20,22 @@ export class Measure {
   /**
    * @param {import("../stage/viewer.js").Viewer} viewer
    * @param {{stage: HTMLElement, canvas: HTMLElement, over: HTMLElement, button: HTMLButtonElement,
-   *   panel: HTMLElement}} parts panel: with .told, .distance, .again, .end and svg
+   *   panel: HTMLElement}} parts panel: with .kind, .told, .list, .again, .csv, .end and svg
+   * @param {{onChange: () => void, onSave: (measurements: Measurement[]) => void}} told onChange: others are there now
    */
-  constructor(viewer, parts) {
-    this.viewer = viewer;
-    this.parts = parts;
+  constructor(viewer, parts, told) {
+    Object.assign(this, { viewer, parts, onChange: told.onChange });
     this.overlay = new Overlay(parts.over, parts.canvas);
     this.isOn = false;
+    /** @type {Measurement[]} */
+    this.measurements = [];
+    /** @type {Measurement | null} whose curve is drawn */
+    this.selected = null;
+    this.list = new MeasurementList(parts.panel.querySelector(".list"), {
+      onSelect: (each) => this.#select(each),
+      onName: (each, name) => this.#rename(each, name),
+      onDelete: (each) => this.#delete(each),
+    });
     this.picker = new PointPicker(parts, {
       clickPx: CLICK_PX,
       isOn: () => this.isOn,
@@ -33,16 +46,37 @@ export class Measure {
       onCross: () => this.#draw(),
       onEnd: () => this.end(),
     });
-    this.#clear();
+    this.#begin();
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
-    viewer.addEventListener("gone", () => this.end());
-    languageEvents.addEventListener("changed", () => this.isOn && this.#say());
+    viewer.addEventListener("gone", () => this.#forget());
+    languageEvents.addEventListener("changed", () => {
+      this.list.forget();
+      if (this.isOn) this.#say();
+    });
     new ResizeObserver(() => this.#draw()).observe(parts.canvas);
     parts.button.addEventListener("click", () => this.toggle());
-    parts.panel.querySelector(".again").addEventListener("click", () => this.start());
-    parts.panel.querySelector(".end").addEventListener("click", () => this.end());
+    const { panel } = parts;
+    panel.querySelector(".kind").addEventListener("change", () => this.start());
+    panel.querySelector(".again").addEventListener("click", () => this.start());
+    panel.querySelector(".csv").addEventListener("click", () => told.onSave(this.measurements));
+    panel.querySelector(".end").addEventListener("click", () => this.end());
     const notTwice = (event) => this.isOn && event.stopImmediatePropagation();
     parts.stage.addEventListener("dblclick", notTwice, { capture: true });
+  }
+
+  /** @returns {string[]} the measurements, as an address holds them */
+  get texts() {
+    return this.measurements.map(textOf);
+  }
+
+  /** Have these measurements, found once more. @param {string[]} texts of an address */
+  restore(texts) {
+    if (texts.join() === this.texts.join()) return;
+    this.measurements = texts.map(measurementOf).filter((each) => each !== null).slice(0, MOST);
+    this.selected = this.measurements.at(-1) ?? null;
+    if (this.measurements.length > 0) this.#open();
+    this.#say();
+    this.#findAll(this.viewer.scene);
   }
 
   toggle() {
@@ -50,23 +84,31 @@ export class Measure {
     else this.start();
   }
 
-  /** Choose two points. */
+  /** Choose the points of another measurement. */
   start() {
-    this.isOn = true;
-    this.#clear();
     this.viewer.timeline.play(false);
     this.viewer.rock.stop();
-    this.parts.panel.hidden = false;
-    this.parts.button.setAttribute("aria-pressed", "true");
-    this.parts.stage.toggleAttribute("data-measuring", true);
-    this.#tell(isMeasurable(this.viewer.shown) ? "measure.first" : "measure.not_here");
+    this.#open();
     this.parts.stage.focus();
   }
 
+  #open() {
+    this.isOn = true;
+    this.picker.forget();
+    this.#begin();
+    this.parts.panel.hidden = false;
+    this.parts.button.setAttribute("aria-pressed", "true");
+    this.parts.stage.toggleAttribute("data-measuring", true);
+    const { shown } = this.viewer;
+    this.#tell(shown === null || isMeasurable(shown) ? "measure.first" : "measure.not_here");
+    this.#draw();
+  }
+
+  /** Put the tool away; the measurements come back with it. */
   end() {
     const hadFocus = this.parts.panel.contains(document.activeElement);
     this.isOn = false;
-    this.#clear();
+    this.#begin();
     this.parts.panel.hidden = true;
     this.parts.button.setAttribute("aria-pressed", "false");
     this.parts.stage.removeAttribute("data-measuring");
@@ -74,13 +116,19 @@ export class Measure {
     if (hadFocus) this.parts.button.focus();
   }
 
-  #clear() {
+  /** The scene leaves the screen. */
+  #forget() {
+    this.measurements = [];
+    this.selected = null;
+    this.end();
+    this.#say();
+  }
+
+  #begin() {
     this.chosen = []; // points of the picture of this.view
     this.view = null; // in which they were chosen
-    this.found = null; // the distance of both
-    this.picker.forget();
+    this.current = null; // the measurement that these points make, and more points will
     this.asked = {}; // replaced by each question: earlier answers are for nobody
-    this.#say();
   }
 
   /** @param {string} place of the words to show @param {Record<string, string>} [values] */
@@ -93,90 +141,120 @@ export class Measure {
     const { panel } = this.parts;
     const { place, values } = this.told ?? { place: "measure.first", values: {} };
     panel.querySelector(".told").textContent = words(place, values);
-    const now = this.found && this.#now();
-    panel.querySelector(".distance").textContent = !this.found
-      ? ""
-      : now === null
-        ? words("measure.away")
-        : words("measure.distance", { mm: figure(now.mm, 1), sigma: figure(now.sigma, 1) });
-    this.#drawCurve();
+    panel.querySelector(".csv").hidden = !this.measurements.some(({ shape }) => shape);
+    this.#sayNow();
   }
 
-  /** Anew only when it is another's, or in another language. */
-  #drawCurve() {
+  /** What changes with the time in view. */
+  #sayNow() {
+    const t = this.viewer.shown?.t ?? 0;
     const svg = this.parts.panel.querySelector("svg");
-    if (this.drawn !== this.found || this.drawnIn !== language()) drawDistances(svg, this.found);
-    [this.drawn, this.drawnIn] = [this.found, language()];
-    if (this.found) markTime(svg, this.found, this.viewer.shown?.t ?? 0);
+    this.list.show(this.measurements, this.selected, t);
+    drawOverTime(svg, this.selected?.shape ?? null);
+    if (this.selected?.shape) markTime(svg, this.selected.shape, t);
+  }
+
+  get #kind() {
+    return this.parts.panel.querySelector(".kind").value;
   }
 
   /** @param {[number, number]} point of the picture in view */
   async choose(point) {
     const { shown } = this.viewer;
+    const kind = this.#kind;
+    const { shape, fewest, most } = KINDS[kind];
     if (!isMeasurable(shown)) return this.#tell("measure.not_here");
-    if (this.found || !sameView(shown, this.view)) this.chosen = [];
-    this.found = null;
+    if (this.chosen.length >= most || !sameView(shown, this.view)) this.#begin();
+    if (!this.current && this.measurements.length >= MOST) return this.#tell("measure.too_many");
     this.view = shown;
     const points = [...this.chosen, point];
+    const query = queryOf(shown, points);
     const asked = (this.asked = {});
     this.#tell("measure.asking");
     try {
-      const { points: readings, distance } = await getMeasurement(shown.scene, queryOf(shown, points));
-      if (asked !== this.asked || !this.isOn) return;
-      this.#take(points, readings, distance);
+      const found = await getMeasurement(shown.scene, points.length < fewest ? query : { ...query, shape });
+      if (asked === this.asked && this.isOn) this.#take(points, query, kind, found);
     } catch (error) {
       if (asked === this.asked && this.isOn) this.#tell("measure.failed", { why: error.message });
     }
     this.#draw();
   }
 
-  #take(points, readings, distance) {
-    const last = readings.at(-1);
-    if (last.refusal) {
-      this.#tell(this.chosen.length ? "measure.refused_second" : "measure.refused_first", { why: readingOf(last) });
-      return;
-    }
+  #take(points, query, kind, { points: readings, shape }) {
+    const reading = readingOf(readings.at(-1));
+    const isFirst = this.chosen.length === 0;
+    if (readings.at(-1).refusal) return this.#tell(isFirst ? "measure.refused_first" : "measure.refused_next", { why: reading });
     this.chosen = points;
-    this.found = distance;
-    this.#tell(distance ? "measure.done" : "measure.second", { reading: readingOf(last) });
+    if (!shape) return this.#tell("measure.next", { count: points.length, reading });
+    if (this.current) Object.assign(this.current, { query, shape });
+    else {
+      this.current = { name: freeName(this.measurements), kind, query, shape, why: "" };
+      this.measurements.push(this.current);
+    }
+    this.selected = this.current;
+    const mayGrow = points.length < KINDS[kind].most;
+    this.#tell(mayGrow ? "measure.more" : "measure.done", { count: points.length, reading });
+    this.onChange();
   }
 
-  /** The points chosen hold for the view in which they were; both together, for every view of their scene. */
-  #follow(shown) {
-    if (!this.isOn) return;
-    if (shown.scene !== (this.view?.scene ?? shown.scene)) return this.end();
-    if (!this.found && this.chosen.length > 0 && !sameView(shown, this.view)) {
-      this.#clear();
-      this.#tell("measure.moved");
+  async #findAll(scene) {
+    for (const each of [...this.measurements]) {
+      if (this.viewer.scene !== scene) return;
+      try {
+        const { shape } = await getMeasurement(scene, { ...each.query, shape: KINDS[each.kind].shape });
+        Object.assign(each, { shape, why: shape ? "" : words("measure.refused_again") });
+      } catch (error) {
+        each.why = words("measure.failed", { why: error.message });
+      }
+      this.#say();
+      this.#draw();
     }
-    if (this.found) this.#say();
+  }
+
+  #select(each) {
+    this.selected = each;
+    this.#say();
     this.#draw();
   }
 
-  /** @returns {{mm: number, sigma: number, places: number[][]} | null} at the time in view; null: not known then */
-  #now() {
-    const { shown } = this.viewer;
-    const { t: times, distances_mm: lengths, uncertainties_mm: sigmas, first_mm: first, second_mm: second } = this.found;
-    const place = Math.min(Math.max((shown?.t ?? 0) * times.length, 0), times.length - 1);
-    const [before, after] = [Math.floor(place), Math.ceil(place)];
-    if (lengths[before] === null || lengths[after] === null) return null;
-    const mixed = (a, b) => a + (place - before) * (b - a);
-    const at = (path) => path[before].map((each, i) => mixed(each, path[after][i]));
-    return {
-      mm: mixed(lengths[before], lengths[after]),
-      sigma: mixed(sigmas[before], sigmas[after]),
-      places: [at(first), at(second)],
-    };
+  #rename(each, name) {
+    each.name = name.replaceAll("~", " ").trim() || each.name;
+    this.onChange();
+    this.#draw();
+  }
+
+  #delete(each) {
+    this.measurements = this.measurements.filter((other) => other !== each);
+    if (each === this.current) this.#begin();
+    if (each === this.selected) this.selected = this.measurements.at(-1) ?? null;
+    this.onChange();
+    this.#tell("measure.first");
+    this.#draw();
+    this.parts.stage.focus();
+  }
+
+  /** The points chosen hold for the view in which they were; what they make, for every view of their scene. */
+  #follow(shown) {
+    if (!this.isOn) return;
+    const isElsewhere = this.chosen.length > 0 && !sameView(shown, this.view);
+    if (isElsewhere && !this.current) this.#tell("measure.moved");
+    if (isElsewhere) this.#begin();
+    this.#sayNow();
+    this.#draw();
   }
 
   #draw() {
     if (!this.isOn) return;
     const { shown } = this.viewer;
-    const now = this.found && shown?.camera ? this.#now() : null;
-    if (now) this.overlay.line(shown.camera, now.places, words("measure.distance", { mm: figure(now.mm, 1), sigma: figure(now.sigma, 1) }));
-    else if (!this.found && shown?.camera && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
-    else this.overlay.clear();
-    const cross = shown?.camera && this.picker.crossIn(shown.camera);
+    this.overlay.clear();
+    if (!shown?.camera) return;
+    for (const { name, kind, shape } of this.measurements) {
+      const now = shape && shapeAt(shape, shown.t);
+      const text = now && `${name}  ${figureOf(shape, now.value, now.sigma)}`;
+      if (now) this.overlay.line(shown.camera, now.places, text, { isClosed: kind === "area" });
+    }
+    if (!this.current && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
+    const cross = this.picker.crossIn(shown.camera);
     if (cross) this.overlay.cross(shown.camera, cross);
   }
 }

@@ -1,4 +1,4 @@
-// Points, line and cross over the picture, at places of the tissue or points of the picture.
+// Points, lines, areas and cross over the picture, at places of the tissue or points of the picture.
 
 import { draw } from "../base/element.js";
 import { project, toScreen } from "./places.js";
@@ -19,20 +19,23 @@ export class Overlay {
 
   /** @param {import("../stage/stream.js").Camera} camera @param {number[][]} points of the picture */
   points(camera, points) {
-    this.clear();
     for (const point of points) this.#mark("point", this.#at(camera, point));
   }
 
-  /** @param {import("../stage/stream.js").Camera} camera @param {number[][]} places two, in mm @param {string} text */
-  line(camera, places, text) {
-    this.clear();
+  /**
+   * @param {import("../stage/stream.js").Camera} camera
+   * @param {number[][]} places two or more, in mm
+   * @param {string} text
+   * @param {{isClosed?: boolean}} [how] isClosed: it is an area
+   */
+  line(camera, places, text, { isClosed = false } = {}) {
     const ends = places.map((place) => project(camera, place)).map((each) => each && this.#at(camera, each));
     if (ends.includes(null)) return;
-    const [[x1, y1], [x2, y2]] = ends;
-    for (const name of ["under", "line"]) draw(this.svg, "line", { class: name, x1, y1, x2, y2 });
+    const points = ends.map((end) => end.map((each) => each.toFixed(1)).join(",")).join(" ");
+    for (const name of ["under", "line"]) draw(this.svg, isClosed ? "polygon" : "polyline", { class: name, points });
     for (const end of ends) this.#mark("point", end);
-    const [x, y] = [(x1 + x2) / 2, (y1 + y2) / 2 - ARM_PX];
-    draw(this.svg, "text", { x, y }, text);
+    const [x, y] = isClosed ? meanOf(ends) : meanOf(middleOf(ends));
+    draw(this.svg, "text", { x, y: y - ARM_PX }, text);
   }
 
   /** @param {import("../stage/stream.js").Camera} camera @param {number[]} point of the picture, besides what is there */
@@ -51,3 +54,8 @@ export class Overlay {
     for (const each of ["under", name]) draw(this.svg, "path", { class: each, d: arms });
   }
 }
+
+/** The ends of a line's middle piece. */
+const middleOf = (ends) => ends.slice(Math.ceil(ends.length / 2) - 1, Math.ceil(ends.length / 2) + 1);
+
+const meanOf = (ends) => [0, 1].map((i) => ends.reduce((sum, end) => sum + end[i], 0) / ends.length);

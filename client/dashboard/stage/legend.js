@@ -1,35 +1,67 @@
-// What the false colours of the layers depth and confidence mean.
+// What the false colours of the layers depth, confidence and error mean. The range of depth can be set.
 
 import { setText } from "../base/element.js";
 import { figure, languageEvents, words } from "../base/messages.js";
+import { BRIGHTEST_ERROR } from "../base/wire.js";
 import { gradient } from "./colours.js";
 
 export class Legend {
   /**
    * @param {import("./viewer.js").Viewer} viewer
-   * @param {HTMLElement} box with .what, .low, .colours and .high
+   * @param {HTMLElement} box with .what, .low, .colours, .high and .range with .near, .far and .auto
+   * @param {() => void} onRange another range was chosen
    */
-  constructor(viewer, box) {
+  constructor(viewer, box, onRange) {
     this.box = box;
+    this.viewer = viewer;
     this.shown = null;
     viewer.addEventListener("shown", ({ detail }) => this.#show(detail));
     viewer.addEventListener("gone", () => this.#show(null));
     languageEvents.addEventListener("changed", () => this.#show(this.shown));
+    const [near, far] = (this.ends = [".near", ".far"].map((each) => box.querySelector(each)));
+    const choose = (range) => {
+      viewer.look({ range });
+      onRange();
+    };
+    for (const end of this.ends) {
+      end.addEventListener("change", () => {
+        const isRange = this.ends.every((each) => each.validity.valid && each.value) && Number(near.value) < Number(far.value);
+        if (isRange) choose([Number(near.value), Number(far.value)]);
+        else this.#fill(true);
+      });
+    }
+    box.querySelector(".auto").addEventListener("click", () => choose(null));
   }
 
   #show(shown) {
     this.shown = shown;
-    const range = shown?.layer === "depth" ? (shown.depthRangeMm ?? null) : null;
-    const isConfidence = shown?.layer === "confidence";
-    this.box.hidden = !isConfidence && range === null;
-    if (this.box.hidden) return;
-    const [low, high] = isConfidence
-      ? [words("legend.unsure"), words("legend.sure")]
-      : range.map((each) => words("legend.mm", { mm: figure(each) }));
-    this.#say(".what", words(isConfidence ? "legend.confidence" : "legend.depth"));
-    this.#say(".low", low);
-    this.#say(".high", high);
-    this.box.querySelector(".colours").style.backgroundImage = gradient(isConfidence ? "to right" : "to left");
+    const legend = shown && this.#legendOf(shown);
+    this.box.hidden = !legend;
+    this.box.querySelector(".range").hidden = shown?.layer !== "depth";
+    if (!legend) return;
+    this.#say(".what", words(`legend.${shown.layer}`));
+    this.#say(".low", legend.low);
+    this.#say(".high", legend.high);
+    this.box.querySelector(".colours").style.backgroundImage = gradient(shown.layer === "depth" ? "to left" : "to right");
+    if (shown.layer === "depth") this.#fill(false);
+  }
+
+  /** @returns {{low: string, high: string} | null} what its ends mean; null: the picture has no false colours */
+  #legendOf({ layer, depthRangeMm }) {
+    if (layer === "confidence") return { low: words("legend.unsure"), high: words("legend.sure") };
+    if (layer === "error") return { low: words("legend.levels", { levels: 0 }), high: words("legend.levels_most", { levels: BRIGHTEST_ERROR }) };
+    if (layer !== "depth" || !depthRangeMm) return null;
+    const [low, high] = depthRangeMm.map((each) => words("legend.mm", { mm: figure(each) }));
+    return { low, high };
+  }
+
+  /** Show the range in its fields, but for one that somebody writes in. */
+  #fill(isForced) {
+    const range = this.shown?.depthRangeMm ?? [];
+    for (const [i, end] of this.ends.entries()) {
+      if (isForced || end !== document.activeElement) end.value = String(range[i] ?? "");
+    }
+    this.box.querySelector(".auto").disabled = this.viewer.range === null;
   }
 
   #say(part, text) {

@@ -6,7 +6,7 @@ import { connectionLost, Problem, wrongKeyWords } from "../base/problem.js";
 /**
  * What is asked for; the query of GET /render.
  * @typedef {{scene: string, t: number, pose?: string, eye?: "right", layer: string, unseen: string, highlights: string,
- *   format: string, light?: "recorded", smoke?: "show"}} View
+ *   format: string, light?: "recorded", smoke?: "show", near_mm?: number, far_mm?: number}} View
  */
 /**
  * What came: a file, or an image that this browser drew. way: how. isExtrapolated: it shows a guess, or a pose or time far

@@ -32,12 +32,16 @@ const COARSE = "coarse";
  */
 /** Not a layer of the model, but what the endoscope saw. */
 const RECORDED = "recorded";
+const DEPTH = "depth";
+/** The model against what the endoscope saw. */
+const ERROR = "error";
 /** There is nothing to show, or not to this key; a picture that was there goes. */
 const NOTHING_TO_SHOW = [401, 403, 404, 409];
 
 /**
  * Tells "shown" (a CustomEvent whose detail is Shown) of every picture that has come to the screen, "gone" when it goes, "known"
- * when the scene's cameras are, and "refused" when nobody may stand where the viewer shall.
+ * when the scene's cameras are, "refused" when nobody may stand where the viewer shall, and "uncompared" (detail: why) when
+ * there is no recorded frame to compare with, and colours are shown instead.
  */
 export class Viewer extends EventTarget {
   /**
@@ -61,6 +65,8 @@ export class Viewer extends EventTarget {
     this.wishedAt = 0;
     /** @type {"steady"|"recorded"} recorded: as the moment was recorded, through its smoke, too */
     this.light = "steady";
+    /** @type {[number, number] | null} mm between which depth has its colours; null: the clip's own */
+    this.range = null;
     this.orbit = new Orbit(() => this.timeline.t);
     this.rock = new Rock(this.orbit, () => this.refresh(), () => this.timeline.playEvents.dispatchEvent(new Event("changed")));
     this.pace = new Pace();
@@ -96,6 +102,7 @@ export class Viewer extends EventTarget {
     this.memory.open(scene);
     this.orbit.goHome();
     this.light = "steady";
+    this.range = null;
     this.shown = null;
     this.screen.clear(scene, message);
     this.dispatchEvent(new Event("gone")); // what was measured or compared in it goes, too
@@ -109,10 +116,11 @@ export class Viewer extends EventTarget {
   /**
    * Look elsewhere; what is left out stays.
    * @param {{t?: number, pose?: string | null, layer?: string, unseen?: "mark"|"guess", highlights?: "on"|"off",
-   *   light?: "steady"|"recorded"}} wish
+   *   light?: "steady"|"recorded", range?: [number, number] | null}} wish
    */
-  look({ t, pose, layer, unseen, highlights, light }) {
+  look({ t, pose, layer, unseen, highlights, light, range }) {
     const { parts } = this;
+    if (range !== undefined) this.range = range;
     if (light !== undefined) this.light = light;
     if (pose !== undefined && !this.orbit.stand(pose)) this.dispatchEvent(new Event("refused"));
     if (layer !== undefined) parts.layer.value = layer;
@@ -211,7 +219,7 @@ export class Viewer extends EventTarget {
     const highlights = view.highlights === "off" ? `, ${words("picture.no_highlights")}` : "";
     const light = view.light ? `, ${words("picture.recorded_light")}` : "";
     const layer = this.parts.layer.selectedOptions[0].text;
-    const name = view.layer === RECORDED ? layer : `${layer}, ${this.#place}${guesses}${highlights}${light}`;
+    const name = [RECORDED, ERROR].includes(view.layer) ? layer : `${layer}, ${this.#place}${guesses}${highlights}${light}`;
     const isDrawnHere = this.#isDrawnHere;
     try {
       const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
@@ -294,6 +302,8 @@ export class Viewer extends EventTarget {
       highlights: checked || disabled ? "on" : "off",
       format: "jpeg",
     };
+    if (view.layer === DEPTH && this.range) [view.near_mm, view.far_mm] = this.range;
+    if (view.layer === ERROR) return view; // as recorded, through the left eye
     if (this.orbit.pose) view.pose = this.orbit.pose;
     else if (this.orbit.eye === "right") view.eye = "right";
     if (this.light === "recorded") Object.assign(view, { light: "recorded", smoke: "show" });
@@ -313,6 +323,11 @@ export class Viewer extends EventTarget {
   }
 
   #fail(error) {
+    if (this.parts.layer.value === ERROR && error.document?.field === "layer") {
+      this.look({ layer: "rgb" });
+      this.dispatchEvent(new CustomEvent("uncompared", { detail: error.message }));
+      return;
+    }
     const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;

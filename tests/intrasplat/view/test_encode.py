@@ -83,7 +83,9 @@ def test_npy_is_the_array_itself(images: Images, layer: Layer, name: str) -> Non
 def test_what_is_for_eyes_is_a_colour_picture_of_its_size(
     images: Images, layer: Layer, image_format: ImageFormat
 ) -> None:
-    content = encode_layer(images, layer, image_format, unseen=Unseen.GUESS, depth_range_mm=RANGE_MM)
+    content = encode_layer(
+        images, layer, image_format, unseen=Unseen.GUESS, depth_range_mm=RANGE_MM, error=images.smoke
+    )
     assert decoded(content).shape == (HEIGHT, WIDTH, 3)
 
 
@@ -135,6 +137,18 @@ def test_all_layers_but_colours_are_0_where_nothing_was_seen(images: Images, lay
     assert not decoded(encode_layer(images, layer, ImageFormat.PNG))[images.unseen].any()
 
 
+@pytest.mark.parametrize("layer", list(Layer))
+def test_what_was_not_seen_has_the_same_hatch_in_every_layer_for_eyes(images: Images, layer: Layer) -> None:
+    height, width = 96, 192
+    unseen = np.zeros((height, width), np.bool_)
+    unseen[:, 64:] = True
+    flat = Images(np.full((height, width, 3), 99, np.uint8), *(np.ones((3, height, width), np.float32)), unseen)
+    error = np.where(unseen, np.float32(np.nan), np.float32(1))
+    shown = decoded(encode_layer(flat, layer, ImageFormat.JPEG, 100, depth_range_mm=RANGE_MM, error=error)).astype(int)
+    hatch = decoded(encode_layer(flat, Layer.RGB, ImageFormat.PNG))[..., :3].astype(int)
+    np.testing.assert_allclose(shown[:, 80:], hatch[:, 80:], atol=6)  # of the encoder
+
+
 @pytest.mark.parametrize("image_format", [ImageFormat.JPEG, ImageFormat.WEBP])
 def test_quality_is_paid_for_in_bytes(images: Images, image_format: ImageFormat) -> None:
     sizes = [len(encode_layer(images, Layer.RGB, image_format, quality)) for quality in (1, 50, 100)]
@@ -153,7 +167,8 @@ def test_depth_beyond_the_range_of_a_png_is_held_at_its_end(images: Images) -> N
 
 def test_depth_that_is_invalid_everywhere_is_a_black_picture(images: Images) -> None:
     blind = Images(images.rgb, np.zeros_like(images.depth_mm), images.confidence, images.smoke, images.unseen)
-    assert not decoded(encode_layer(blind, Layer.DEPTH, ImageFormat.JPEG, depth_range_mm=RANGE_MM)).any()
+    encoded = encode_layer(blind, Layer.DEPTH, ImageFormat.JPEG, unseen=Unseen.GUESS, depth_range_mm=RANGE_MM)
+    assert not decoded(encoded).any()
 
 
 def in_false_colours(layer: Layer, value: float, depth_range_mm: tuple[float, float] | None = RANGE_MM) -> list[int]:
