@@ -121,6 +121,7 @@ export const DE = {
     "input:scene": "Diese Datei ist keine Szene von intrasplat, oder sie ist beschädigt.",
     "input:options": "Diese Einstellungen passen nicht zu diesem Clip.",
     "limit": "Es ist größer, als dieser Dienst annimmt.",
+    "missing_extra": "Diese Installation kann solche Dateien nicht erzeugen; die Details sagen, was zu installieren ist.",
     "limit:clip": "Der Clip ist größer oder länger, als dieser Dienst annimmt.",
     "not_yet": "Es gibt noch nichts zu sehen.",
     "out_of_memory": "Der Clip braucht mehr Speicher, als der Dienst hat. Senden Sie einen kürzeren oder kleineren.",

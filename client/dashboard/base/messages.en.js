@@ -121,6 +121,7 @@ export const EN = {
     "input:scene": "This file is no scene of intrasplat, or it is damaged.",
     "input:options": "These settings do not go with this clip.",
     "limit": "It is larger than this service accepts.",
+    "missing_extra": "This installation cannot make such a file; the details say what to install.",
     "limit:clip": "The clip is larger or longer than this service accepts.",
     "not_yet": "There is nothing to show yet.",
     "out_of_memory": "The clip needs more memory than the service has. Send a shorter or smaller one.",
