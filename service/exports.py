@@ -92,7 +92,8 @@ async def export_scene(
     if first.head.more:
         head = {name: value for name, value in response.headers.items() if name != "content-length"}
         response = StreamingResponse(_parts(services, request, first, part), headers=head)
-    response.headers["Content-Disposition"] = attachment(shown.stem + EXPORT_FORMATS[query.format].suffix)
+    seen = f"-{query.view}" if query.view not in (None, "endoscope") else ""
+    response.headers["Content-Disposition"] = attachment(shown.stem + seen + EXPORT_FORMATS[query.format].suffix)
     return response
 
 

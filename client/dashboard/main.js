@@ -34,6 +34,7 @@ import { stepBackWhileIdle } from "./stage/idle.js";
 import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
 import { Scale } from "./stage/scale.js";
+import { Snapshot } from "./stage/snapshot.js";
 import { steer } from "./stage/steer.js";
 import { Verdict } from "./stage/verdict.js";
 import { Viewer } from "./stage/viewer.js";
@@ -88,6 +89,14 @@ new Probe(viewer, over);
 new Scale(viewer, { canvas: get("picture"), box: get("scale") });
 new Legend(viewer, get("legend"));
 const measure = new Measure(viewer, { ...over, button: get("measure"), panel: get("measuring") });
+const facts = () => ({
+  name: get("scene-id").textContent,
+  badge: get("badge").textContent,
+  verdict: get("verdict").querySelector(".shape + span")?.textContent ?? "",
+  warning: get("picture-warning").textContent,
+  seam: compare.seam,
+});
+const snapshot = new Snapshot(viewer, { stage: get("stage"), recorded: get("recorded"), button: get("snapshot") }, facts, tell);
 const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
@@ -298,6 +307,7 @@ const form = new ClipForm(
       else if (waiting.job === null) waiting.end(); // nothing came of it
     },
     onAsked: () => drawers.open("drawer", false),
+    onScene: (file) => sceneImport.send(file),
   },
 );
 const sceneImport = new SceneImport({ ask: get("import"), file: get("import-file"), message: get("jobs-message") }, expect);
@@ -332,6 +342,7 @@ onKeys("full_screen", { f: [] }, toggleFullScreen);
 onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
+onKeys("snapshot", { p: [] }, () => snapshot.take());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
 if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

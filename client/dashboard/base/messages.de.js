@@ -312,6 +312,10 @@ export const DE = {
     "choose": "Szene aus einer Datei öffnen",
     "sending": "Die Szene wird gesendet."
   },
+  "snapshot": {
+    "take": "Bild sichern",
+    "too_slow": "Das Bild dieser Ansicht dauert zu lange. Versuchen Sie es noch einmal."
+  },
   "download": {
     "title": "{name} als Datei speichern",
     "close": "Schließen",
@@ -328,8 +332,13 @@ export const DE = {
     "ply": "Splats für Splat-Betrachter, in mm",
     "splat": "Splats, klein, in mm",
     "gltf": "Splats als glTF, in Metern",
-    "webm": "Video ohne Instrumente",
     "mp4": "Video ohne Instrumente",
+    "mp4-rock": "Video, hin und her gedreht",
+    "mp4-orbit": "Video, kreisend",
+    "mp4-stereo": "Video für 3D-Bildschirme, beide Augen nebeneinander",
+    "webm": "Video für Webseiten",
+    "needs": "braucht {what}",
+    "no_stereo": "das andere Auge ist nicht bekannt",
     "depth": "Tiefe jedes Bildes, in mm, für NumPy",
     "tracks": "Wo jeder Punkt mit der Zeit ist, für NumPy",
     "ply-zip": "Splats jedes Bildes, in mm",
@@ -799,6 +808,7 @@ export const DE = {
     "measure": "Messen, oder das Messen beenden",
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",
+    "snapshot": "Ein Bild dieser Ansicht sichern",
     "help": "Diese Hilfe zeigen oder schließen"
   },
   "key": {

@@ -312,6 +312,10 @@ export const EN = {
     "choose": "Open a scene from a file",
     "sending": "The scene is being sent."
   },
+  "snapshot": {
+    "take": "Save picture",
+    "too_slow": "The picture of this view takes too long. Try again."
+  },
   "download": {
     "title": "Save {name} as a file",
     "close": "Close",
@@ -328,8 +332,13 @@ export const EN = {
     "ply": "Splats for splat viewers, in mm",
     "splat": "Splats, small, in mm",
     "gltf": "Splats as glTF, in metres",
-    "webm": "Video without instruments",
     "mp4": "Video without instruments",
+    "mp4-rock": "Video, turning to and fro",
+    "mp4-orbit": "Video, circling",
+    "mp4-stereo": "Video for 3D screens, both eyes side by side",
+    "webm": "Video for web pages",
+    "needs": "needs {what}",
+    "no_stereo": "the other eye is not known",
     "depth": "Depth of every frame, in mm, for NumPy",
     "tracks": "Where each point is over time, for NumPy",
     "ply-zip": "Splats of every frame, in mm",
@@ -799,6 +808,7 @@ export const EN = {
     "measure": "Measure, or end it",
     "full_screen": "Full screen",
     "copy_link": "Copy the link to this view",
+    "snapshot": "Save a picture of this view",
     "help": "Show or close this help"
   },
   "key": {
