@@ -89,7 +89,8 @@ export class Downloads {
       const made = button(text, () => this.#save(id, { format, view, ...moment }));
       Object.assign(made.dataset, { format, view: view ?? "" });
       made.disabled = why !== "";
-      if (why) made.append(element("small", { text: why }));
+      if (why) made.append(" ", element("small", { text: why }));
+      made.removeAttribute("aria-label"); // its text says it all
       return made;
     });
     return [element("h3", { text: title }), element("div", { class: "kinds" }, ...buttons)];
