@@ -219,6 +219,7 @@ export const DE = {
     "name": "Beispiel, künstliches Gewebe"
   },
   "readout": {
+    "reduced": "kleiner, für eine langsame Leitung",
     "service": "Dienst {ms} ms",
     "rate": "{rate} Bilder/s",
     "unseen": "{share} % nie gesehen",

@@ -219,6 +219,7 @@ export const EN = {
     "name": "Example, synthetic tissue"
   },
   "readout": {
+    "reduced": "smaller, for a slow line",
     "service": "service {ms} ms",
     "rate": "{rate} pictures/s",
     "unseen": "{share} % unseen",
