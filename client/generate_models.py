@@ -15,6 +15,7 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from contract.wire.cameras import SceneCameras
+from contract.wire.exports import ExportOffer
 from contract.wire.feeds import CutRange, FeedReceipt, FeedView
 from contract.wire.job import TERMINAL_STATES, JobView
 from contract.wire.webhooks import Delivery
@@ -23,7 +24,7 @@ from intrasplat.options import JobOptions
 from intrasplat.report import Report
 
 MODELS = Path(__file__).resolve().parent / "intrasplat_client" / "models.py"
-READ = (JobView, Delivery, Report, SceneCameras, Measurement, FeedView, FeedReceipt, CutRange)
+READ = (JobView, Delivery, Report, SceneCameras, Measurement, FeedView, FeedReceipt, CutRange, ExportOffer)
 """Types that the service answers with; the types that they contain are added."""
 CLOSED = ("JobState",)
 """Enumerations of which a reader must know every member. Unknown members of all others are read as text."""

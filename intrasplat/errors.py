@@ -3,6 +3,7 @@
     IntrasplatError
     ├── InputError            the user's input cannot be used: names the field and the remedy
     │   ├── LimitError        the input is larger than this machine accepts
+    │   ├── MissingExtraError what is asked for needs an extra that is not installed
     │   └── ResumeMismatch    the folder holds a stopped run that this request does not continue
     ├── TrainingDiverged      the optimiser left the finite numbers, or the model collapsed
     ├── SceneError            a stored scene is missing, damaged or of another version
@@ -28,6 +29,7 @@ class ErrorCode(StrEnum):
     INPUT = "input"
     KEY_EXPIRED = "key_expired"
     LIMIT = "limit"
+    MISSING_EXTRA = "missing_extra"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"
     FEEDS_FULL = "feeds_full"
@@ -70,6 +72,12 @@ class LimitError(InputError):
     """The input is larger than this machine accepts (frames, pixels, bytes, seconds)."""
 
     code = ErrorCode.LIMIT
+
+
+class MissingExtraError(InputError):
+    """What is asked for needs an optional part of intrasplat that is not installed; the remedy names it."""
+
+    code = ErrorCode.MISSING_EXTRA
 
 
 class ResumeMismatch(InputError):

@@ -5,16 +5,18 @@ intrasplat/export writes the formats; docs/export.md lists their units, axes and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
+from importlib.util import find_spec
 from typing import ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, MissingExtraError
 
-VideoView = Literal["endoscope", "orbit", "stereo"]
+VideoView = Literal["endoscope", "orbit", "rock", "stereo"]
 FORMAT_REMEDY = "docs/export.md lists the formats and their options."
 
 
@@ -40,8 +42,8 @@ class ExportOptions(BaseModel):
     )
     view: VideoView | None = Field(
         default=None,
-        description="for a video: endoscope: as it saw the clip; orbit: circling about it, about one moment if t is "
-        "given; stereo: both eyes side by side (default: endoscope)",
+        description="for a video: endoscope: as it saw the clip; orbit: circling about it; rock: turning to and fro; "
+        "these two of one moment if t is given; stereo: both eyes side by side (default: endoscope)",
     )
     baseline_mm: float | None = Field(
         default=None,
@@ -66,6 +68,8 @@ class ExportFormat:
     about: str
     is_stored: bool = False
     """Whether the service itself writes it from the stored files, for keys that may download them."""
+    extra: str | None = None
+    """The extra of intrasplat that whoever writes it needs; of EXTRA_MODULES."""
 
 
 _VIDEO = ("view", "every", "t", "baseline_mm")
@@ -81,15 +85,21 @@ EXPORT_FORMATS = {
         "the Gaussians at time t as glTF splats, metres, +Y up",
     ),
     "points": ExportFormat("-points.ply", _BYTES, ("t",), "the Gaussians' centres at time t as coloured points, mm"),
-    "mesh-stl": ExportFormat("-mesh.stl", "model/stl", ("t",), "the surface at time t as STL without colours, mm"),
-    "mesh-ply": ExportFormat("-mesh.ply", _BYTES, ("t",), "the surface at time t as a coloured mesh, mm"),
+    "mesh-stl": ExportFormat(
+        "-mesh.stl", "model/stl", ("t",), "the surface at time t as STL without colours, mm", extra="mesh"
+    ),
+    "mesh-ply": ExportFormat("-mesh.ply", _BYTES, ("t",), "the surface at time t as a coloured mesh, mm", extra="mesh"),
     "mesh-glb": ExportFormat(
-        "-mesh.glb", "model/gltf-binary", ("t",), "the surface at time t as glTF, coloured, metres, +Y up"
+        "-mesh.glb",
+        "model/gltf-binary",
+        ("t",),
+        "the surface at time t as glTF, coloured, metres, +Y up",
+        extra="mesh",
     ),
     "depth": ExportFormat("-depth.npy", _BYTES, ("every",), "depth of each frame, [T, H, W] float32 mm"),
     "tracks": ExportFormat("-tracks.npz", "application/zip", ("every",), "where each Gaussian is over time, mm"),
     "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
-    "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (VP9)"),
+    "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (H.264; else VP9)"),
     "html": ExportFormat(
         ".html", "text/html", (), "a page with player and scene that opens from a disk", is_stored=True
     ),
@@ -100,8 +110,31 @@ EXPORT_FORMATS = {
 }
 """The formats by name."""
 
-_OF_VIEW = {"t": "orbit", "baseline_mm": "stereo"}
-"""Options of a video that fit only one `view`."""
+EXTRA_MODULES = {"mesh": "skimage"}
+"""A module of each extra that formats need, by which its installation is known."""
+
+
+@cache
+def missing_extras() -> tuple[str, ...]:
+    """The extras of EXTRA_MODULES that are not installed here."""
+    return tuple(extra for extra, module in EXTRA_MODULES.items() if find_spec(module) is None)
+
+
+def requirement(extra: str) -> str:
+    """What pip installs for an extra."""
+    return f"intrasplat[{extra}]"
+
+
+def check_extra(name: str, missing: Collection[str]) -> None:
+    """Raise MissingExtraError if the format needs an extra that is missing."""
+    known = EXPORT_FORMATS.get(name)
+    if known is not None and known.extra is not None and known.extra in missing:
+        problem = f"This installation cannot make {name} files: it lacks {requirement(known.extra)}."
+        raise MissingExtraError("format", problem, f"pip install '{requirement(known.extra)}' where its worker runs.")
+
+
+_OF_VIEWS = {"t": ("orbit", "rock"), "baseline_mm": ("stereo",)}
+"""Options of a video that fit only some of its views."""
 
 
 def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
@@ -121,9 +154,10 @@ def check_export(name: str, given: Mapping[str, object]) -> ExportOptions:
             takes = f"It takes {' and '.join(export_format.options)}." if export_format.options else "It takes none."
             remedy = f"Leave it out. {takes}"
             raise InputError(option, f"{option} does not fit the format {name}: {export_format.about}.", remedy)
-    for option, view in _OF_VIEW.items():
-        if option in chosen and "view" in export_format.options and chosen.get("view") != view:
-            raise InputError(option, f"{option} is for view={view} alone.", f"Leave it out, or add view={view}.")
+    for option, views in _OF_VIEWS.items():
+        if option in chosen and "view" in export_format.options and chosen.get("view") not in views:
+            problem = f"{option} is for view={' and view='.join(views)} alone."
+            raise InputError(option, problem, f"Leave it out, or add view={views[0]}.")
     if "t" in chosen and "every" in chosen:
         raise InputError("every", "With t one moment is shown, and every frame is of it.", "Leave out every or t.")
     try:

@@ -1,4 +1,6 @@
-"""GET /scenes/{id}/export: a stored scene as a file for other programs, sent while the worker makes it."""
+"""GET /scenes/{id}/export: a stored scene as a file for other programs, sent while the worker makes it; /exports lists
+the formats.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ import logging
 import time
 import uuid
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, get_args
 
 from fastapi import APIRouter, Query, Response
 from pydantic import ConfigDict, Field
@@ -16,17 +18,19 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
+from contract.wire.exports import ExportOffer
 from contract.wire.rendering import CutRequest, ExportRequest
 from intrasplat.errors import UnavailableError
-from intrasplat.formats import EXPORT_FORMATS, ExportOptions, check_export
+from intrasplat.formats import EXPORT_FORMATS, ExportOptions, VideoView, check_export, requirement
 from intrasplat.scene.stored_exports import stored_parts
 from service.access import Caller
 from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
+from service.filenames import attachment
 from service.moments import AskedTime, moment_of, scene_time
 from service.renders import image_response, problem_of_reply
-from service.scenes import find_finished, finished_job
+from service.scenes import file_stem, find_finished, finished_job
 from service.shown import Shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
@@ -88,8 +92,38 @@ async def export_scene(
     if first.head.more:
         head = {name: value for name, value in response.headers.items() if name != "content-length"}
         response = StreamingResponse(_parts(services, request, first, part), headers=head)
-    response.headers["Content-Disposition"] = _disposition(scene_id, query.format)
+    seen = f"-{query.view}" if query.view not in (None, "endoscope") else ""
+    response.headers["Content-Disposition"] = attachment(shown.stem + seen + EXPORT_FORMATS[query.format].suffix)
     return response
+
+
+@router.get("/{scene_id}/exports", operation_id="list_exports")
+async def list_exports(scene_id: str, services: Services, caller: AnyCaller) -> list[ExportOffer]:
+    """The formats that the scene can be saved in, and what this installation lacks for some of them."""
+    shown = await find_finished(services, caller, scene_id)
+    missing = await services.renderer.missing_extras()
+    views = await run_in_threadpool(_views, services, shown)
+    return [
+        ExportOffer(
+            format=name,
+            about=each.about,
+            file_name=shown.stem + each.suffix,
+            media_type=each.media_type,
+            options=list(each.options),
+            views=views if "view" in each.options else [],
+            needs=requirement(each.extra) if each.extra is not None and each.extra in missing else None,
+        )
+        for name, each in EXPORT_FORMATS.items()
+        if not (shown.is_feed and each.is_stored)
+    ]
+
+
+def _views(services: Deps, shown: Shown) -> list[VideoView]:
+    """The views of a video: stereo without baseline_mm only where the distance of the eyes is known."""
+    views = list(get_args(VideoView))
+    if shown.attempt is None or services.store.newest_report(shown.scene_id, shown.attempt).right_eye is None:
+        views.remove("stereo")
+    return views
 
 
 def _request_of(shown: Shown, query: ExportQuery) -> ExportRequest:
@@ -115,14 +149,12 @@ async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> R
     caller.require(KeyScope.DOWNLOAD)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
-    parts = await run_in_threadpool(stored_parts, name, folder, scene_id, services.settings.dashboard_dir)
+    dashboard, label = services.settings.dashboard_dir, record.labels.label
+    parts = await run_in_threadpool(stored_parts, name, folder, scene_id, dashboard, label)
     await run_in_threadpool(services.audit.record, AuditAction.DOWNLOADED, caller, scene_id)
-    headers = {"Content-Disposition": _disposition(scene_id, name), "Cache-Control": "no-store"}
+    file_name = file_stem(record) + EXPORT_FORMATS[name].suffix
+    headers = {"Content-Disposition": attachment(file_name), "Cache-Control": "no-store"}
     return StreamingResponse(parts, media_type=EXPORT_FORMATS[name].media_type, headers=headers)
-
-
-def _disposition(scene_id: str, name: str) -> str:
-    return f'attachment; filename="{scene_id}{EXPORT_FORMATS[name].suffix}"'
 
 
 async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: int) -> AsyncIterator[bytes]:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import time
 
 from fastapi import APIRouter, Request, Response
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.wire.job import JobFiles, JobRecord, JobView
+from contract.wire.labels import Labels
 from intrasplat.errors import InputError
 from intrasplat.options import JobOptions, parse_options
 from intrasplat.report import Imported
@@ -62,7 +64,7 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
         tenant=caller.tenant,
         files=JobFiles(clip=name),
         options=options.model_copy(update={"preset": archive.manifest.preset}),
-        labels=received.labels,
+        labels=_labels(received.labels, head.label),
         callback_url=received.callback_url,
         input_bytes=received.total_bytes,
         input_sha256=received.sha256(),
@@ -74,6 +76,20 @@ def _accept(services: Deps, caller: Caller, job_id: str, received: Received, key
     )
     services.audit.record(AuditAction.IMPORTED, caller, job_id)
     return spool_and_queue(services, record)
+
+
+def _labels(given: Labels, exported: str | None) -> Labels:
+    """What the caller writes on the scene; without a label, that of the archive.
+
+    Raises:
+        InputError: the archive's is none.
+    """
+    if given.label is not None or exported is None:
+        return given
+    try:
+        return Labels(label=exported, metadata=given.metadata)
+    except ValidationError as error:
+        raise InputError(SCENE_PART, "its label is none that a scene can have.", "Give it another one.") from error
 
 
 def _options(text: str) -> JobOptions:

@@ -1,16 +1,22 @@
 """The files of the web page. They may stay in browsers' caches for good: their address has a hash of all of them.
 
 Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The
-same files are there without a hash, too, and are cached nowhere.
+same files are there without a hash, too, and are cached nowhere. An HTML file has its words in the browser's language,
+and names all modules: on a slow line the words are there at the first paint, and no module waits for the one that
+imports it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import html
+import json
 import re
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
+from starlette.datastructures import Headers
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
@@ -25,6 +31,11 @@ REVALIDATE = "no-cache"
 REFERENCE = re.compile(r'((?:href|src)=")(\w[^":#]*")')
 """A file of the page, named relative to an HTML file beside the index; links begin with a dot."""
 MIN_COMPRESSED_BYTES = 1000
+SCRIPT = re.compile(r'<script type="module" src="([^"]+)"')
+IMPORT = re.compile(r'^import [^"]*"(\.[^"]+)";$', re.MULTILINE)
+PLACE = re.compile(r'(<(?:\w+)[^>]*\bdata-words="(\w+)\.(\w+)"[^>]*>)[^<]*')
+MESSAGES = {language: f"base/messages.{language}.js" for language in ("en", "de")}
+"""Tables of words; the first is of whoever asks for no other."""
 
 
 def page_files(folder: Path) -> ASGIApp:
@@ -40,7 +51,7 @@ class _Files(StaticFiles):
     async def get_response(self, path: str, scope: Scope) -> Response:
         name = INDEX if path == "." else path
         if name in (each.name for each in self._folder.glob("*.html")):
-            return _html(self._folder / name, _version(self._folder))
+            return _html(self._folder, name, _version(self._folder), _language(Headers(scope=scope)))
         first, _, rest = path.partition("/")
         if first != VERSIONED:
             return await super().get_response(path, scope)
@@ -51,10 +62,49 @@ class _Files(StaticFiles):
         return response
 
 
-def _html(file: Path, version: str) -> Response:
-    text = file.read_text(encoding="utf-8")
-    text = REFERENCE.sub(rf"\g<1>{VERSIONED}/{version}/\g<2>", text)
-    return HTMLResponse(text, headers={"Cache-Control": REVALIDATE})
+@lru_cache(maxsize=4)
+def _text(folder: Path, name: str, version: str, language: str) -> str:
+    text = (folder / name).read_text(encoding="utf-8")
+    if (script := SCRIPT.search(text)) and (folder / MESSAGES[language]).is_file():
+        links = "".join(f'  <link rel="modulepreload" href="{each}">\n' for each in _modules(folder, script[1]))
+        text = text.replace("</head>", f"{links}</head>", 1)
+        text = text.replace('<html lang="en">', f'<html lang="{language}">', 1)
+        text = PLACE.sub(_filled(_words(folder / MESSAGES[language])), text)
+    return REFERENCE.sub(rf"\g<1>{VERSIONED}/{version}/\g<2>", text)
+
+
+def _html(folder: Path, name: str, version: str, language: str) -> Response:
+    headers = {"Cache-Control": REVALIDATE, "Vary": "Accept-Language"}
+    return HTMLResponse(_text(folder, name, version, language), headers=headers)
+
+
+def _modules(folder: Path, script: str) -> list[str]:
+    """All that a script imports, by itself or by way of others."""
+    found, waiting = {}, [folder.resolve() / script]
+    while waiting:
+        module = waiting.pop(0)
+        for name in IMPORT.findall(module.read_text(encoding="utf-8")):
+            path = (module.parent / name).resolve()
+            if path not in found:
+                found[path] = path.relative_to(folder.resolve()).as_posix()
+                waiting.append(path)
+    return list(found.values())
+
+
+def _words(table: Path) -> Mapping[str, Mapping[str, str]]:
+    text = table.read_text(encoding="utf-8")
+    words: dict[str, dict[str, str]] = json.loads(text[text.index("{") : text.rindex("}") + 1])
+    return words
+
+
+def _filled(words: Mapping[str, Mapping[str, str]]) -> Callable[[re.Match[str]], str]:
+    return lambda place: place[1] + html.escape(words[place[2]][place[3]], quote=False)
+
+
+def _language(headers: Headers) -> str:
+    """The first of the browser's languages that has words."""
+    asked = [each.strip()[:2].lower() for each in headers.get("Accept-Language", "").split(",")]
+    return next((each for each in asked if each in MESSAGES), next(iter(MESSAGES)))
 
 
 def _version(folder: Path) -> str:

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocketState
 
 from contract.queue.feeds import FeedsFullError
 from contract.queue.interface import QueueFullError
-from intrasplat.errors import ErrorCode, InputError, LimitError, SceneError, UnavailableError
+from intrasplat.errors import ErrorCode, InputError, LimitError, MissingExtraError, SceneError, UnavailableError
 from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
@@ -46,6 +46,7 @@ TITLES = {
     423: "Being written to",
     429: "Too much at once",
     500: "A fault of the service",
+    501: "This installation lacks what it takes",
     503: "Not available now",
     507: "No room on disk",
 }
@@ -120,6 +121,8 @@ def problem_of(error: Exception) -> Problem | None:
     match error:
         case Problem():
             return error
+        case MissingExtraError():
+            return lacking(error.problem, error.remedy)
         case InputError():
             status = 413 if isinstance(error, LimitError) else 422
             return Problem(status, error.problem, field=error.field, remedy=error.remedy)
@@ -146,6 +149,11 @@ def problem_of(error: Exception) -> Problem | None:
 def fault() -> Problem:
     """The answer to an unexpected error; the log has the details, under the request's id."""
     return Problem(500, "Something went wrong in the service; its log has the details.", remedy=FAULT_REMEDY)
+
+
+def lacking(detail: str, remedy: str | None) -> Problem:
+    """The answer where an extra is not installed; its member `code` is "missing_extra"."""
+    return Problem(501, detail, field="format", remedy=remedy, extensions={"code": ErrorCode.MISSING_EXTRA.value})
 
 
 def disk_full(detail: str, remedy: str = SPACE_REMEDY, *, status: int = 507, field: str | None = None) -> Problem:

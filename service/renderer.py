@@ -21,9 +21,10 @@ from starlette.concurrency import run_in_threadpool
 from contract.queue.interface import WORKER_TTL_S, Queue
 from contract.runtime import traces
 from contract.wire.cameras import CamerasRequest
-from contract.wire.rendering import CutRequest, PushRequest, ReplyError, WorkerAddress, WorkerReply
+from contract.wire.rendering import CutRequest, ExportRequest, PushRequest, ReplyError, WorkerAddress, WorkerReply
 from intrasplat.errors import UnavailableError
 from intrasplat.files.durable import replace_file
+from intrasplat.formats import EXPORT_FORMATS, check_extra
 from service.connection import Answer, AnyRequest, Connection, Reached, WorkerGoneError
 
 WORKER_REMEDY = "Ask again in some seconds; if it stays so, start one with `intrasplat up` or `intrasplat worker`."
@@ -52,6 +53,10 @@ class Renderer(Protocol):
 
     async def reachable(self, workers: Sequence[WorkerAddress], timeout_s: float) -> list[WorkerAddress]:
         """The workers that can be reached within timeout_s."""
+        ...
+
+    async def missing_extras(self) -> frozenset[str]:
+        """The extras that no live worker has; none where no worker is known."""
         ...
 
     async def run(self) -> None:
@@ -135,6 +140,12 @@ class ZmqRenderer:
             return False
         return True
 
+    async def missing_extras(self) -> frozenset[str]:
+        try:
+            return _missing(await self._live())
+        except UnavailableError:
+            return frozenset()
+
     async def run(self) -> None:
         while True:
             await asyncio.sleep(KNOWN_PERIOD_S)
@@ -155,12 +166,15 @@ class ZmqRenderer:
 
         Raises:
             UnavailableError: there is no worker at all.
+            MissingExtraError: no worker has the extra that an export needs.
         """
         addresses = await self._live()
         if request.attempt is not None and not _is_of_feed(request):
             others = [each for each in addresses if each.feed_id is None]
             if not others:
                 raise UnavailableError("No worker is ready.", WORKER_REMEDY)
+            if isinstance(request, ExportRequest):
+                others = _able(others, request)
             return sorted(others, key=lambda address: self._preference(address, request.scene_id), reverse=True)
         there = [each for each in addresses if _has(each, request)]
         return there or [each for each in await self._live(reread=True) if _has(each, request)]
@@ -235,6 +249,19 @@ def _is_of_feed(request: AnyRequest) -> bool:
 def _has(address: WorkerAddress, request: AnyRequest) -> bool:
     """Whether the worker follows the feed, or runs the job."""
     return request.scene_id == (address.feed_id if _is_of_feed(request) else address.job_id)
+
+
+def _able(workers: list[WorkerAddress], request: ExportRequest) -> list[WorkerAddress]:
+    """Those that have what the export needs. Raises MissingExtraError: none has."""
+    check_extra(request.format, _missing(workers))
+    known = EXPORT_FORMATS.get(request.format)
+    return [each for each in workers if known is None or known.extra not in each.missing_extras]
+
+
+def _missing(workers: Sequence[WorkerAddress]) -> frozenset[str]:
+    """The extras that all of them lack."""
+    lacks = [frozenset(each.missing_extras) for each in workers if each.feed_id is None]
+    return frozenset.intersection(*lacks) if lacks else frozenset()
 
 
 def _places(addresses: list[WorkerAddress]) -> list[WorkerAddress]:

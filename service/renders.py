@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
 from contract.wire.rendering import RenderRequest, ReplyError
+from intrasplat.errors import ErrorCode
 from intrasplat.names import Detail, Eye, Light, Smoke
 from intrasplat.notices import NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
@@ -24,7 +25,7 @@ from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.moments import AskedTime, moment_text
-from service.problems import Problem
+from service.problems import Problem, lacking
 from service.request_log import GONE
 from service.shown import Shown, find_shown
 
@@ -315,6 +316,8 @@ def image_response(scene_id: str, answer: Answer) -> Response:
 
 def problem_of_reply(error: ReplyError) -> Problem:
     """The HTTP problem for a worker's error."""
+    if error.code is ErrorCode.MISSING_EXTRA:
+        return lacking(error.problem, error.remedy)
     headers = {"Retry-After": NOT_YET_RETRY_S} if error.kind == "not-yet" else None
     return Problem(
         STATUS_OF_REPLY[error.kind],

@@ -19,6 +19,7 @@ from intrasplat.report import Report
 from service.access import Caller
 from service.bodies import BINARY, TEXT
 from service.deps import AnyCaller, Deps, Services, no_such_scene, owned_scene
+from service.filenames import attachment, stem_of
 from service.listing import PAGED, SceneQuery, tell_next
 from service.problems import Problem
 from service.purge import Receipt
@@ -108,7 +109,8 @@ async def get_masks(scene_id: str, services: Services, caller: AnyCaller) -> Fil
         detail = "No masks were found for this scene: they were given, there were none, or nothing looked like one."
         raise Problem(404, detail, field="scene_id", remedy=f"See masks in GET /scenes/{scene_id}.")
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
-    return FileResponse(folder / MASKS, media_type="application/zip", filename=f"{scene_id}-masks.zip")
+    headers = {"Content-Disposition": attachment(f"{file_stem(record)}-masks.zip")}
+    return FileResponse(folder / MASKS, media_type="application/zip", headers=headers)
 
 
 @router.get("/{scene_id}/cameras", operation_id="get_cameras", response_model=SceneCameras)
@@ -155,7 +157,13 @@ async def find_finished(services: Deps, caller: Caller, scene_id: str) -> Shown:
 
 
 def _finished(services: Deps, caller: Caller, scene_id: str) -> Shown:
-    return Shown(scene_id, finished_job(services, caller, scene_id).attempt)
+    record = finished_job(services, caller, scene_id)
+    return Shown(scene_id, record.attempt, stem=file_stem(record))
+
+
+def file_stem(record: JobRecord) -> str:
+    """Of the names of files that are made of the job's scene."""
+    return stem_of(record.labels.label, record.created_at_s, record.job_id)
 
 
 def _known(services: Deps, scene_id: str) -> JobRecord | None:

@@ -15,6 +15,7 @@ from contract.store.shelf import is_job_id
 from contract.wire.job import JobState
 from service.access import AccessRefusal, Caller
 from service.deps import Deps, no_such_scene, owned_scene
+from service.filenames import stem_of
 from service.listing import SceneSearch
 from service.moments import moment_of, scene_time
 from service.problems import Problem
@@ -27,6 +28,8 @@ class Shown:
     scene_id: str
     attempt: int | None
     is_feed: bool = False
+    stem: str = ""
+    """Of the names of files that are made of it."""
 
     @property
     def state(self) -> JobState:
@@ -96,7 +99,8 @@ def scene_or_feed(
     record = services.feeds.record(scene)
     if record is None or not caller.owns(record):
         raise no_such_scene(scene, caller, record)
-    return Shown(scene, None, is_feed=True)
+    stem = stem_of(record.options.label, record.created_at_s, scene)
+    return Shown(scene, None, is_feed=True, stem=stem)
 
 
 def _only(services: Deps, caller: Caller) -> Shown:

@@ -14,6 +14,7 @@ from pathlib import Path
 from contract.runtime.supervised import Supervised
 from contract.wire.feeds import FeedRecord, FeedReport, FeedWish
 from contract.wire.rendering import WorkerAddress
+from intrasplat.formats import missing_extras
 from intrasplat.live.state import FeedReason, FeedState
 from worker.feed_orders import FeedReady, FollowFeed, WishFeed, read_feed_message
 from worker.orders import Message, line_of
@@ -144,7 +145,12 @@ class FeedChild:
             return None
         ready = running.ready
         return WorkerAddress(
-            name=name, endpoint=ready.endpoint, device=ready.device, renders_only=True, feed_id=self._record.feed_id
+            name=name,
+            endpoint=ready.endpoint,
+            device=ready.device,
+            renders_only=True,
+            feed_id=self._record.feed_id,
+            missing_extras=missing_extras(),
         )
 
     def ask_to_end(self) -> None:

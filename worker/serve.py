@@ -30,7 +30,7 @@ from contract.wire.rendering import (
     WorkerReply,
     WorkerRequest,
 )
-from intrasplat.errors import InputError, SceneError, UnavailableError
+from intrasplat.errors import ErrorCode, InputError, MissingExtraError, SceneError, UnavailableError
 from worker.aside import Aside
 from worker.job_errors import FAULT_REMEDY
 from worker.reply import NotYetError, Reply
@@ -235,7 +235,8 @@ def _busy(wait_s: float) -> ReplyError:
 def _reply_error(error: Exception) -> ReplyError:
     """The error that the caller gets. For an unforeseen error only its type, because its text may contain anything."""
     if isinstance(error, InputError):
-        return ReplyError(kind="input", problem=error.problem, field=error.field, remedy=error.remedy)
+        code = error.code if isinstance(error, MissingExtraError) else ErrorCode.UNCLASSIFIED
+        return ReplyError(kind="input", problem=error.problem, field=error.field, remedy=error.remedy, code=code)
     if isinstance(error, SceneError):
         remedy = "GET /scenes lists what there is."
         return ReplyError(kind="scene", problem=str(error), field="scene", remedy=remedy)

@@ -22,6 +22,7 @@ from contract.store.feed_files import FeedFiles
 from contract.store.store import Store, open_store
 from contract.wire.rendering import WorkerAddress
 from intrasplat.errors import UnavailableError
+from intrasplat.formats import missing_extras
 from intrasplat.machine.processes import set_niceness
 from worker.announce import LOOK_PERIOD_S, announced
 from worker.child import ChildKeeper
@@ -121,6 +122,7 @@ def address_of(
         job_id=consumer.job_id,
         scenes=child.scenes,
         renders_only=renders_only,
+        missing_extras=missing_extras(),
     )
 
 

@@ -12,12 +12,13 @@ import { listenToKeys, onKeys } from "./base/keys.js";
 import { figure, languageEvents, showWords, words } from "./base/messages.js";
 import { pause } from "./base/pause.js";
 import { failureOf } from "./base/problem.js";
+import { fileName, save } from "./base/save.js";
 import { Scopes } from "./base/scopes.js";
 import { ClipForm } from "./form/form.js";
 import { Announcer } from "./library/announce.js";
 import { nameOf } from "./library/card.js";
 import { drawCurve, pointsOfCsv } from "./library/curve.js";
-import { Downloads, fileName, save } from "./library/downloads.js";
+import { Downloads } from "./library/downloads.js";
 import { baselinesOf } from "./library/figures.js";
 import { SceneImport } from "./library/importing.js";
 import { JobList } from "./library/joblist.js";
@@ -38,6 +39,7 @@ import { stepBackWhileIdle } from "./stage/idle.js";
 import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
 import { Scale } from "./stage/scale.js";
+import { Snapshot } from "./stage/snapshot.js";
 import { steer } from "./stage/steer.js";
 import { Verdict } from "./stage/verdict.js";
 import { Viewer } from "./stage/viewer.js";
@@ -96,9 +98,17 @@ const measure = new Measure(viewer, { ...over, button: get("measure"), panel: ge
   onChange: () => address.note(),
   onSave(measurements) {
     const name = get("scene-id").textContent || viewer.scene;
-    save(`${fileName(name)}-measurements.csv`, async () => new Blob([csvOf(name, measurements)], { type: "text/csv" }));
+    save(`${fileName(name)}-measurements.csv`, new Blob([csvOf(name, measurements)], { type: "text/csv" }));
   },
 });
+const facts = () => ({
+  name: get("scene-id").textContent,
+  badge: get("badge").textContent,
+  verdict: get("verdict").querySelector(".shape + span")?.textContent ?? "",
+  warning: get("picture-warning").textContent,
+  seam: compare.seam,
+});
+const snapshot = new Snapshot(viewer, { stage: get("stage"), recorded: get("recorded"), button: get("snapshot") }, facts, tell);
 const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
@@ -320,6 +330,7 @@ const form = new ClipForm(
       else if (waiting.job === null) waiting.end(); // nothing came of it
     },
     onAsked: () => drawers.open("drawer", false),
+    onScene: (file) => sceneImport.send(file),
   },
 );
 const sceneImport = new SceneImport({ ask: get("import"), file: get("import-file"), message: get("jobs-message") }, expect);
@@ -358,6 +369,7 @@ onKeys("full_screen", { f: [] }, toggleFullScreen);
 onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
+onKeys("snapshot", { p: [] }, () => snapshot.take());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
 if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

@@ -91,6 +91,7 @@ class Client(_Blocking):
     recorded = _blocking(Core.recorded)
     cameras = _blocking(Core.cameras)
     measure = _blocking(Core.measure)
+    exports = _blocking(Core.exports)
     export = _blocking(Core.export)
     file = _blocking(Core.file)
     delete = _blocking(Core.delete)

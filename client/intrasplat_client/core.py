@@ -13,7 +13,7 @@ import httpx
 from pydantic import TypeAdapter
 from typing_extensions import Unpack
 
-from intrasplat_client import events, submission, views
+from intrasplat_client import events, models, submission, views
 from intrasplat_client.connection import Call, Connection
 from intrasplat_client.errors import Unreachable
 from intrasplat_client.feeds import FeedCalls
@@ -325,6 +325,11 @@ class Core(FeedCalls):
     ) -> bytes:
         """Export the scene to a file format; docs/export.md lists the formats and their options."""
         return (await self._get("scenes", scene, "export", t=t, format=format, **options)).content
+
+    async def exports(self, scene: str) -> list[models.ExportOffer]:
+        """The formats of export() for this scene, and what the service lacks for some of them (`needs`)."""
+        response = await self._get("scenes", scene, "exports")
+        return parsed(response, TypeAdapter(list[models.ExportOffer]).validate_json, response.content)
 
     async def file(self, scene: str, name: str = "scene.safetensors") -> bytes:
         """A stored file of the scene: manifest.json, or one that it lists. Needs the scope download."""

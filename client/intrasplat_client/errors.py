@@ -2,7 +2,7 @@
 
 IntrasplatError
 ├── InputError                  what the caller gave cannot be used: names the field and the remedy
-│   ├── RequestRefused          the service refused the request (4xx, 507)
+│   ├── RequestRefused          the service refused the request (4xx, 501, 507)
 │   │   ├── Unauthorized        401: a key is needed, or this one is not known
 │   │   ├── Forbidden           403: the key lacks a scope, or the service does not answer to this name
 │   │   ├── NotFound            404: there is no such job or scene, or it is another tenant's
@@ -155,6 +155,8 @@ class JobCancelled(IntrasplatError):
         self.job = job
 
 
+REFUSED_ALSO = (HTTPStatus.NOT_IMPLEMENTED, HTTPStatus.INSUFFICIENT_STORAGE)
+"""The installation lacks an extra, or space."""
 REFUSED: Mapping[int, type[RequestRefused]] = {
     HTTPStatus.UNAUTHORIZED: Unauthorized,
     HTTPStatus.FORBIDDEN: Forbidden,
@@ -195,7 +197,7 @@ def error_of_document(
         return RateLimited(refusal)
     if refusal.status == HTTPStatus.SERVICE_UNAVAILABLE:
         return ServiceUnavailable(refusal)
-    if refusal.status >= HTTPStatus.INTERNAL_SERVER_ERROR and refusal.status != HTTPStatus.INSUFFICIENT_STORAGE:
+    if refusal.status >= HTTPStatus.INTERNAL_SERVER_ERROR and refusal.status not in REFUSED_ALSO:
         return ServiceFault(refusal)
     return REFUSED.get(refusal.status, RequestRefused)(refusal)
 

@@ -33,6 +33,7 @@ class ErrorCode(StrEnum):
     INPUT = "input"
     KEY_EXPIRED = "key_expired"
     LIMIT = "limit"
+    MISSING_EXTRA = "missing_extra"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"
     FEEDS_FULL = "feeds_full"
@@ -342,6 +343,22 @@ class DetailScores(Model):
     psnr_tissue_db: float | None
     psnr_right_db: float | None
     ssim: float | None
+
+
+class ExportOffer(Model):
+    """A format of GET /scenes/{id}/export for one scene, and whether this installation can make it."""
+
+    format: str
+    about: str
+    file_name: str
+    """after the scene's label; what the export's Content-Disposition says, too"""
+    media_type: str
+    options: tuple[str, ...]
+    """the options that fit"""
+    views: tuple[str, ...] = ()
+    """of a video: the views that this scene has"""
+    needs: str | None = None
+    """what must be installed where the worker runs before it can be made; null: nothing"""
 
 
 class FeedOptions(Model):

@@ -10,12 +10,14 @@ id of the request that it gives up, and gets no answer.
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from contract.wire.cameras import CamerasRequest, ClipCamera
 from contract.wire.feeds import CutRange, FeedShown
+from intrasplat.codes import known_code
+from intrasplat.errors import ErrorCode
 from intrasplat.formats import ExportOptions
 from intrasplat.live.times import FeedTime
 from intrasplat.measuring import MAX_POINTS, Point, ShapeKind
@@ -232,6 +234,8 @@ class ReplyError(BaseModel):
     problem: str
     field: str | None = None
     remedy: str | None = None
+    code: Annotated[ErrorCode, known_code(ErrorCode)] = ErrorCode.UNCLASSIFIED
+    """Of an input error that has a code of its own."""
     retry_after_s: float | None = None
     """When the request will probably be answered, in seconds from now."""
 
@@ -289,3 +293,5 @@ class WorkerAddress(BaseModel):
     """It claims no jobs."""
     feed_id: str | None = None
     """The live feed that it follows: it answers requests for that alone."""
+    missing_extras: tuple[str, ...] = ()
+    """The extras of EXTRA_MODULES (intrasplat/formats.py) that it lacks: it makes no exports that need them."""

@@ -20,7 +20,7 @@ from intrasplat.export.target import ExportTarget
 from intrasplat.export.tracks import tracks_parts
 from intrasplat.export.tum import export_tum
 from intrasplat.export.video import video_parts
-from intrasplat.formats import ExportOptions
+from intrasplat.formats import ExportOptions, check_extra, missing_extras
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device
 
@@ -60,11 +60,13 @@ def export_parts(scene: TrainedScene, name: str, options: ExportOptions, device:
 
     Raises, at the first part:
         InputError: there is no such format, or the scene cannot be written in it with these options.
+        MissingExtraError: the format needs an extra that is not installed.
         LimitError: the file would be larger than MAX_EXPORT_BYTES.
     """
     writer = EXPORTS.get(name)
     if writer is None:
         raise InputError("format", f"{name} is not an export format.", f"Use one of: {', '.join(EXPORTS)}.")
+    check_extra(name, missing_extras())
     return _cut(writer(ExportTarget(scene, options, device)))
 
 

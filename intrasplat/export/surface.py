@@ -71,13 +71,10 @@ def surface(target: ExportTarget) -> Generator[bytes, None, Mesh]:
     """Return the mesh at the target's moment; yield b"" now and then meanwhile.
 
     Raises:
-        InputError: scikit-image is not installed, or the views show nothing solid.
+        InputError: the views show nothing solid.
     """
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        problem, remedy = "Meshes need scikit-image, which is not installed.", "pip install 'intrasplat[mesh]'"
-        raise InputError("format", problem, remedy) from error
+    from skimage.measure import marching_cubes
+
     views = []
     for view in _views(target):
         views.append(view)

@@ -17,9 +17,10 @@ import math
 import re
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal, TypeVar
 
@@ -85,6 +86,8 @@ class ArchiveHead(BaseModel):
     intrasplat: VersionText
     scene_id: str | None = Field(default=None, pattern=JOB_ID_PATTERN)
     exported_at_s: float = Field(ge=0, le=1e11)
+    label: str | None = Field(default=None, exclude_if=lambda label: label is None)
+    """What it was called there, unchecked."""
     files: dict[str, ArchivedFile]
 
 
@@ -114,7 +117,7 @@ class Archived:
     report: Report
 
 
-def archive_parts(folder: Path, scene_id: str | None = None) -> Iterator[bytes]:
+def archive_parts(folder: Path, scene_id: str | None = None, label: str | None = None) -> Iterator[bytes]:
     """The archive of the scene in a folder, piece by piece. If the scene is removed meanwhile, it is still complete.
 
     Raises, before the first part:
@@ -131,10 +134,11 @@ def archive_parts(folder: Path, scene_id: str | None = None) -> Iterator[bytes]:
             }
         except OSError as error:
             raise SceneError(f"The scene cannot be read ({type(error).__name__}).") from error
-        return _written(files, scene_id, opening.pop_all())
+        head = partial(ArchiveHead, intrasplat=version(), scene_id=scene_id, label=label)
+        return _written(files, head, opening.pop_all())
 
 
-def _written(files: Mapping[str, BinaryIO], scene_id: str | None, closing: ExitStack) -> Iterator[bytes]:
+def _written(files: Mapping[str, BinaryIO], head: Callable[..., ArchiveHead], closing: ExitStack) -> Iterator[bytes]:
     listed: dict[str, ArchivedFile] = {}
 
     def content(name: str, file: BinaryIO) -> Iterator[bytes]:
@@ -148,8 +152,7 @@ def _written(files: Mapping[str, BinaryIO], scene_id: str | None, closing: ExitS
     def members() -> Iterator[tuple[str, Iterator[bytes]]]:
         for name, file in files.items():
             yield name, content(name, file)
-        head = ArchiveHead(intrasplat=version(), scene_id=scene_id, exported_at_s=time.time(), files=listed)
-        yield ARCHIVE, iter((head.model_dump_json(indent=1).encode(),))
+        yield ARCHIVE, iter((head(exported_at_s=time.time(), files=listed).model_dump_json(indent=1).encode(),))
 
     with closing:
         yield from zip_parts(members())

@@ -75,7 +75,7 @@ def encoded(
 
     None: there are no frames, or this FFmpeg has none of CODECS.
     """
-    found = next((name for name in CODECS if _has_encoder(name)), None)
+    found = next((name for name in CODECS if has_encoder(name)), None)
     if found is None or not frames:
         return None
     content = io.BytesIO()
@@ -98,7 +98,8 @@ def even(size: int) -> int:
     return size + size % 2
 
 
-def _has_encoder(name: str) -> bool:
+def has_encoder(name: str) -> bool:
+    """Whether this FFmpeg has the encoder."""
     try:
         av.codec.Codec(name, "w")
     except av.codec.codec.UnknownCodecError:

@@ -13,17 +13,20 @@ from intrasplat.server_parts import server_part
 DASHBOARD_VARIABLE = "INTRASPLAT_DASHBOARD_DIR"
 
 
-def stored_parts(name: str, folder: Path, scene_id: str | None, dashboard_dir: Path | None) -> Iterator[bytes]:
+def stored_parts(
+    name: str, folder: Path, scene_id: str | None, dashboard_dir: Path | None, label: str | None = None
+) -> Iterator[bytes]:
     """The file in a format of EXPORT_FORMATS that has is_stored set, piece by piece.
 
     Args:
         scene_id: None: the folder belongs to no service.
         dashboard_dir: the page's files; None: they are not known.
+        label: what its callers call the scene.
 
     Raises, before the first piece:
         InputError, SceneError, UnavailableError: as archive_parts() and page_parts().
     """
-    return page_parts(folder, scene_id, dashboard_dir) if name == "html" else archive_parts(folder, scene_id)
+    return page_parts(folder, scene_id, dashboard_dir) if name == "html" else archive_parts(folder, scene_id, label)
 
 
 def installed_dashboard() -> Path | None:

@@ -88,8 +88,8 @@ def test_the_theatre_has_five_large_buttons_letters_for_3_m_and_nothing_that_del
         for x in (0.25, 0.5):
             click_at(page, x, 0.5)
             page.until(lambda: page.script("return document.querySelectorAll('.measured path').length") >= 2)
-        page.until(lambda: page.text("#measuring .distance"))
-        far = ("#picture-warning", "#scale .about", "#time-value", ".measured text", "#measuring .distance")
+        page.until(lambda: page.text("#measuring .figure"))
+        far = ("#picture-warning", "#scale .about", "#time-value", ".measured text", "#measuring .figure")
         assert {css: page.script(FONT, css) for css in far if page.script(FONT, css) < MIN_FAR_PX} == {}
         assert page.script(FONT, "#badge") >= BADGE_PX
         five(page, say("tool.scenes"))

@@ -58,7 +58,7 @@ def test_the_picture_is_free_of_controls_and_all_over_it_follows(
             site.announce()
             click_at(page, x, 0.5)
             page.until(lambda: page.script("return document.querySelectorAll('.measured path').length") >= 2)
-        page.until(lambda: page.text("#measuring .distance"))
+        page.until(lambda: page.text("#measuring .figure"))
         if min(width, height) > PHONE_PX:
             page.click("#tools [data-drawer=library]")
             page.until(lambda: is_free_of(page, "#library"))

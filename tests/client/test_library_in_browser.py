@@ -11,17 +11,14 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
-from client.page import DASHBOARD
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobFiles, JobRecord
 from contract.wire.labels import LabelChange, Labels
-from contract.wire.rendering import ExportRequest, SceneRequest
-from intrasplat.errors import InputError
 from intrasplat.formats import EXPORT_FORMATS
 from intrasplat.notices import Notice, NoticeCode
-from tests.client.page import REPORT_OF_THE_PAGE, Page, Painter, Site, grey_of, site_at
+from service.renderer import ADDRESSES_VALID_S
+from tests.client.page import REPORT_OF_THE_PAGE, Page, Site, grey_of, site_at
 from tests.client.words import say
-from worker.reply import Reply
 
 NAMES = "return [...document.querySelectorAll('#jobs .name')].map((each) => each.textContent)"
 PICTURES = "return [...document.querySelectorAll('#jobs img.thumbnail')].map((each) => each.src)"
@@ -167,46 +164,50 @@ def test_a_scene_is_saved_in_every_format_of_the_service_at_the_moment_in_view(
     site: Site, page: Page, tmp_path: Path
 ) -> None:
     page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
-    scene = labelled(site, site.scene(), "liver/3")
+    scene = labelled(site, site.scene(), "läsion/3")
     page.press(scene, "View")
     page.until_state("live")
     page.find("#time").send_keys(Keys.END)
     page.press(scene, say("job.save"))
     page.until(lambda: page.find("#download").is_displayed())
+    page.until(lambda: page.script("return !!document.querySelector('#download [data-format]')"))
     offered = page.script(
-        "return [...document.querySelectorAll('#download [data-format]')].map((b) => b.dataset.format)"
+        "return [...document.querySelectorAll('#download [data-format]')].map(({ dataset: d }) => [d.format, d.view])"
     )
-    assert sorted(offered) == sorted(EXPORT_FORMATS)
+    assert {name for name, _ in offered} == {*EXPORT_FORMATS}
+    assert {view for name, view in offered if name == "mp4"} == {"", "rock", "orbit", "stereo"}
     assert say("download.moment", seconds=say("time.moment", seconds="1.95")) in page.text("#download")
     page.click("#download [data-format=mesh-stl]")
-    page.until(lambda: (tmp_path / "liver_3-mesh.stl").exists())
+    page.until(lambda: (tmp_path / "läsion_3-mesh.stl").exists())
     assert not page.find("#download").is_displayed()
     asked = page.script("return performance.getEntriesByType('resource').map((entry) => entry.name)")
     (saved,) = (each for each in asked if f"/scenes/{scene}/export?format=mesh-stl&t=" in each)
     assert float(saved.rpartition("=")[2]) > 0.9
+    page.press(scene, say("job.save"))
+    page.click("#download [data-view=rock]")
+    page.until(lambda: (tmp_path / "läsion_3-rock.mp4").exists())
 
 
-def test_a_kind_of_file_that_the_installation_lacks_says_so_and_is_not_offered_again(
-    driver: webdriver.Chrome, tmp_path: Path
-) -> None:
-    painter = Painter()
+def test_what_the_installation_cannot_make_is_disabled_and_names_the_extra(site: Site, page: Page) -> None:
+    (able,) = site.queue.workers()
+    site.queue.announce(able.model_copy(update={"missing_extras": ("mesh",)}))
+    scene = site.scene()
+    site.queue.announce(able.model_copy(update={"missing_extras": ("mesh",)}))
+    time.sleep(ADDRESSES_VALID_S)
 
-    def answer(request: SceneRequest) -> Reply:
-        if isinstance(request, ExportRequest):
-            raise InputError("format", "Meshes need scikit-image, which is not installed.", "Install it.")
-        return painter.answer(request)
-
-    with site_at(tmp_path / "data", answer) as site:
-        scene = site.scene()
-        page = Page(driver, site.url)
-        page.open()
+    def lacks_meshes() -> bool:
         page.press(scene, say("job.save"))
-        page.click("#download [data-format=mesh-stl]")
-        page.until_text("#jobs-message", say("problem.input:format"))
-        page.press(scene, say("job.save"))
-        assert not page.find("#download [data-format=mesh-glb]").is_enabled()
-        assert page.find("#download [data-format=splat]").is_enabled()
-        driver.get("about:blank")
+        page.until(lambda: page.script("return !!document.querySelector('#download [data-format]')"))
+        return say("download.needs", what="intrasplat[mesh]") in page.text("#download [data-format=mesh-glb]")
+
+    page.until(lacks_meshes)
+    assert not page.find("#download [data-format=mesh-glb]").is_enabled()
+    assert page.find("#download [data-format=splat]").is_enabled()
+    assert not page.find("#download [data-view=stereo]").is_enabled()
+    assert say("download.no_stereo") in page.text("#download [data-view=stereo]")
+    lost = "const { exportScene } = await import(new URL('base/api.js', document.scripts[0].src)); "
+    ask = f"return exportScene('{scene}', {{ format: 'mesh-stl' }}).catch((error) => error.message)"
+    assert page.script(f"return (async () => {{ {lost}{ask} }})()") == say("problem.missing_extra")
 
 
 def test_a_click_on_the_picture_of_a_scene_opens_it(site: Site, page: Page) -> None:
@@ -214,13 +215,6 @@ def test_a_click_on_the_picture_of_a_scene_opens_it(site: Site, page: Page) -> N
     page.script("import(document.scripts[0].src).then(({ jobs }) => jobs.poll())")
     page.click(card(scene, ".card"))
     page.until_state("live")
-
-
-def test_files_are_named_as_the_service_names_them() -> None:
-    source = (DASHBOARD / "library/downloads.js").read_text(encoding="utf-8")
-    (text,) = re.findall(r"const GROUPS = \{(.*?)\n\};", source, re.DOTALL)
-    suffixes = dict(re.findall(r'"?([\w-]+)"?: "([^"]+)"', text))
-    assert suffixes == {name: each.suffix for name, each in EXPORT_FORMATS.items()}
 
 
 def test_row_10_a_key_without_scopes_is_offered_nothing_that_would_be_refused(

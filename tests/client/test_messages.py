@@ -27,7 +27,7 @@ API_WORDS = re.compile(
 """What programs and those who run a service read: routes, queries, headers, names of fields and settings, ids."""
 
 SCRIPTS = [script for script in sorted(DASHBOARD.rglob("*.js")) if not re.match(r"messages\.\w\w\.js", script.name)]
-STATUS_WITH_CODE = {413: "limit", 422: "input", 507: "store_full"}
+STATUS_WITH_CODE = {413: "limit", 422: "input", 501: "missing_extra", 507: "store_full"}
 """As in problem.js."""
 
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import httpx
 import pytest
 
+from contract.wire.labels import LabelChange
 from contract.wire.rendering import ExportRequest, SceneRequest
 from intrasplat.errors import InputError, UnavailableError
 from intrasplat.formats import EXPORT_FORMATS
 from service import exports
+from service.renderer import ADDRESSES_VALID_S
 from tests.service.live import live_service
 from tests.service.under_test import ServiceUnderTest, assert_problem
 from worker.reply import Reply
@@ -43,10 +49,47 @@ def test_every_format_has_its_file_name(service: ServiceUnderTest, name: str) ->
     scene = service.finished_scene()
     answer = service.http.get(f"/scenes/{scene}/export", params={"format": name})
     assert answer.status_code == 200
-    assert f'filename="{scene}{EXPORT_FORMATS[name].suffix}"' in answer.headers["content-disposition"]
+    named = rf'attachment; filename="scene-\d{{4}}-\d\d-\d\d-{scene[:8]}{EXPORT_FORMATS[name].suffix}"'
+    assert re.fullmatch(named, answer.headers["content-disposition"])
     asked = service.painter.requests[-1]
     assert isinstance(asked, ExportRequest)
     assert (asked.format, asked.part, asked.options.given()) == (name, 0, {})
+
+
+def test_files_are_named_after_the_scene_in_any_script(service: ServiceUnderTest) -> None:
+    scene = service.finished_scene()
+    service.queue.relabel(scene, LabelChange(label='../Läsion "3" 肝臓'))
+    (offer,) = (each for each in service.http.get(f"/scenes/{scene}/exports").json() if each["format"] == "mesh-stl")
+    assert offer["file_name"] == "Läsion_3_肝臓-mesh.stl"
+    saved_as = service.http.get(f"/scenes/{scene}/export?format=mesh-stl").headers["content-disposition"]
+    assert saved_as == f"attachment; filename=\"Lasion_3_-mesh.stl\"; filename*=UTF-8''{quote(offer['file_name'])}"
+
+
+def test_formats_that_no_worker_can_make_are_listed_and_refused_with_the_extra(service: ServiceUnderTest) -> None:
+    scene = service.finished_scene()
+    assert {each["needs"] for each in service.http.get(f"/scenes/{scene}/exports").json()} == {None}
+    (able,) = service.queue.workers()
+    service.queue.announce(able.model_copy(update={"missing_extras": ("mesh",)}))
+    offers = newest_offers(service, scene)
+    assert {name for name, each in offers.items() if each["needs"]} == {"mesh-stl", "mesh-ply", "mesh-glb"}
+    assert offers["mesh-glb"]["needs"] == "intrasplat[mesh]"
+    assert offers["mp4"]["views"] == ["endoscope", "orbit", "rock"]  # the other eye of this scene is not known
+    refused = service.http.get(f"/scenes/{scene}/export?format=mesh-glb")
+    problem = assert_problem(refused, 501, "format")
+    assert (problem["code"], service.painter.requests) == ("missing_extra", [])
+    assert "intrasplat[mesh]" in problem["remedy"]
+    assert service.http.get(f"/scenes/{scene}/export?format=ply").status_code == 200
+    service.queue.announce(able.model_copy(update={"name": "able"}))
+    assert not newest_offers(service, scene)["mesh-glb"]["needs"]
+    assert service.http.get(f"/scenes/{scene}/export?format=mesh-glb").status_code == 200
+
+
+def newest_offers(service: ServiceUnderTest, scene: str) -> dict[str, Any]:
+    """By format, once the service has read the workers anew."""
+    for pause_s in (ADDRESSES_VALID_S, 0.1):  # the first request begins to read
+        time.sleep(pause_s)
+        answer = service.http.get(f"/scenes/{scene}/exports")
+    return {each["format"]: each for each in answer.json()}
 
 
 @pytest.mark.parametrize(

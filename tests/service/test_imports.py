@@ -102,10 +102,12 @@ def test_a_scene_goes_out_of_one_site_and_into_another(
     assert service.http.get(f"{scene}/curve").text.splitlines()[-1] == "2.5,36.2000,"
 
     exported = service.http.get(f"{scene}/export", params={"format": "scene"})
-    assert exported.headers["content-disposition"] == f'attachment; filename="{job["id"]}.scene.zip"'
+    assert exported.headers["content-disposition"] == 'attachment; filename="demo.scene.zip"'
     assert files_of(exported.content)[SCENE] == files_of(archive)[SCENE]
     for second in running_service(tmp_path_factory.mktemp("second")):
-        again = sent(second, exported.content).json()["id"]
+        taken_in = sent(second, exported.content).json()
+        again = taken_in["id"]
+        assert taken_in["label"] == "demo"  # as it is called where it comes from
         worked_off(second)
         kept = Report.model_validate(second.http.get(f"/scenes/{again}").json())
         assert kept.imported is not None

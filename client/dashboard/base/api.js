@@ -2,6 +2,7 @@
 
 import { askForKey, currentKey, keyHeaders } from "./key.js";
 import { connectionLost, Problem, problemOf, wrongKeyWords } from "./problem.js";
+import { nameIn } from "./save.js";
 
 /** @typedef {import("./wire.js").JobView} Job */
 /**
@@ -109,15 +110,22 @@ export const getCameras = (id) => json(`/scenes/${id}/cameras`);
 export const getMeasurement = (id, query) => json(`/scenes/${id}/measure?${new URLSearchParams(query)}`);
 /** @param {string} id @returns {Promise<string>} CSV */
 export const getCurve = async (id) => bodyOf(await request(`/scenes/${id}/curve`), "text");
+/** @param {string} path @returns {Promise<{blob: Blob, name: string}>} a file to save */
+async function file(path) {
+  const response = await request(path);
+  return { blob: await bodyOf(response, "blob"), name: nameIn(response) };
+}
+/** @param {string} id @returns {Promise<import("./wire.js").ExportOffer[]>} the formats that it can be saved in */
+export const listExports = (id) => json(`/scenes/${id}/exports`);
 /**
  * @param {string} id
- * @param {{format: string, t?: number}} wanted docs/export.md lists the formats
- * @returns {Promise<Blob>}
+ * @param {{format: string, view?: string, t?: number}} wanted docs/export.md lists the formats
  */
-export const exportScene = (id, wanted) => blob(`/scenes/${id}/export?${queryOf(wanted)}`);
-
-/** @param {string} id @returns {Promise<Blob>} a zip of the masks that were found */
-export const getMasks = (id) => blob(`/scenes/${id}/masks`);
+export const exportScene = (id, wanted) => file(`/scenes/${id}/export?${queryOf(wanted)}`);
+/** A zip of the masks that were found. @param {string} id */
+export const getMasks = (id) => file(`/scenes/${id}/masks`);
+/** @returns {Promise<{version: string}>} */
+export const getInfo = () => json("/info");
 
 /**
  * Return if a finished scene is still there for this key; throws as a picture of it would. It costs the service no picture.

@@ -121,6 +121,7 @@ export const DE = {
     "input:scene": "Diese Datei ist keine Szene von intrasplat, oder sie ist beschädigt.",
     "input:options": "Diese Einstellungen passen nicht zu diesem Clip.",
     "limit": "Es ist größer, als dieser Dienst annimmt.",
+    "missing_extra": "Diese Installation kann solche Dateien nicht erzeugen; die Details sagen, was zu installieren ist.",
     "limit:clip": "Der Clip ist größer oder länger, als dieser Dienst annimmt.",
     "not_yet": "Es gibt noch nichts zu sehen.",
     "out_of_memory": "Der Clip braucht mehr Speicher, als der Dienst hat. Senden Sie einen kürzeren oder kleineren.",
@@ -219,6 +220,7 @@ export const DE = {
     "name": "Beispiel, künstliches Gewebe"
   },
   "readout": {
+    "reduced": "kleiner, für eine langsame Leitung",
     "service": "Dienst {ms} ms",
     "rate": "{rate} Bilder/s",
     "unseen": "{share} % nie gesehen",
@@ -312,6 +314,10 @@ export const DE = {
     "choose": "Szene aus einer Datei öffnen",
     "sending": "Die Szene wird gesendet."
   },
+  "snapshot": {
+    "take": "Bild sichern",
+    "too_slow": "Das Bild dieser Ansicht dauert zu lange. Versuchen Sie es noch einmal."
+  },
   "download": {
     "title": "{name} als Datei speichern",
     "close": "Schließen",
@@ -328,8 +334,13 @@ export const DE = {
     "ply": "Splats für Splat-Betrachter, in mm",
     "splat": "Splats, klein, in mm",
     "gltf": "Splats als glTF, in Metern",
-    "webm": "Video ohne Instrumente",
     "mp4": "Video ohne Instrumente",
+    "mp4-rock": "Video, hin und her gedreht",
+    "mp4-orbit": "Video, kreisend",
+    "mp4-stereo": "Video für 3D-Bildschirme, beide Augen nebeneinander",
+    "webm": "Video für Webseiten",
+    "needs": "braucht {what}",
+    "no_stereo": "das andere Auge ist nicht bekannt",
     "depth": "Tiefe jedes Bildes, in mm, für NumPy",
     "tracks": "Wo jeder Punkt mit der Zeit ist, für NumPy",
     "ply-zip": "Splats jedes Bildes, in mm",
@@ -833,6 +844,7 @@ export const DE = {
     "measure": "Messen, oder das Messen beenden",
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",
+    "snapshot": "Ein Bild dieser Ansicht sichern",
     "help": "Diese Hilfe zeigen oder schließen"
   },
   "key": {

@@ -121,6 +121,7 @@ export const EN = {
     "input:scene": "This file is no scene of intrasplat, or it is damaged.",
     "input:options": "These settings do not go with this clip.",
     "limit": "It is larger than this service accepts.",
+    "missing_extra": "This installation cannot make such a file; the details say what to install.",
     "limit:clip": "The clip is larger or longer than this service accepts.",
     "not_yet": "There is nothing to show yet.",
     "out_of_memory": "The clip needs more memory than the service has. Send a shorter or smaller one.",
@@ -219,6 +220,7 @@ export const EN = {
     "name": "Example, synthetic tissue"
   },
   "readout": {
+    "reduced": "smaller, for a slow line",
     "service": "service {ms} ms",
     "rate": "{rate} pictures/s",
     "unseen": "{share} % unseen",
@@ -312,6 +314,10 @@ export const EN = {
     "choose": "Open a scene from a file",
     "sending": "The scene is being sent."
   },
+  "snapshot": {
+    "take": "Save picture",
+    "too_slow": "The picture of this view takes too long. Try again."
+  },
   "download": {
     "title": "Save {name} as a file",
     "close": "Close",
@@ -328,8 +334,13 @@ export const EN = {
     "ply": "Splats for splat viewers, in mm",
     "splat": "Splats, small, in mm",
     "gltf": "Splats as glTF, in metres",
-    "webm": "Video without instruments",
     "mp4": "Video without instruments",
+    "mp4-rock": "Video, turning to and fro",
+    "mp4-orbit": "Video, circling",
+    "mp4-stereo": "Video for 3D screens, both eyes side by side",
+    "webm": "Video for web pages",
+    "needs": "needs {what}",
+    "no_stereo": "the other eye is not known",
     "depth": "Depth of every frame, in mm, for NumPy",
     "tracks": "Where each point is over time, for NumPy",
     "ply-zip": "Splats of every frame, in mm",
@@ -833,6 +844,7 @@ export const EN = {
     "measure": "Measure, or end it",
     "full_screen": "Full screen",
     "copy_link": "Copy the link to this view",
+    "snapshot": "Save a picture of this view",
     "help": "Show or close this help"
   },
   "key": {

@@ -12,7 +12,7 @@ import { hasWords, words } from "./messages.js";
 /** In place of a status: no answer came, or only part of one. */
 const LOST = 0;
 /** The code of an error where the service tells only its status. */
-const CODES = { [LOST]: "lost", 413: "limit", 422: "input", 507: "store_full" };
+const CODES = { [LOST]: "lost", 413: "limit", 422: "input", 501: "missing_extra", 507: "store_full" };
 
 /** @param {string | null} [field] @returns {string} of "options.layout" its group: "options" */
 const groupOf = (field) => (field ?? "").split(".")[0];

@@ -61,7 +61,18 @@
  *   ssim: number | null,
  * }} DetailScores
  */
-/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"not_yet"|"out_of_memory"|"feeds_full"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
+/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"missing_extra"|"not_yet"|"out_of_memory"|"feeds_full"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
+/**
+ * @typedef {{
+ *   format: string,
+ *   about: string,
+ *   file_name: string,
+ *   media_type: string,
+ *   options: string[],
+ *   views?: "endoscope"|"orbit"|"rock"|"stereo"[],
+ *   needs?: string | null,
+ * }} ExportOffer
+ */
 /**
  * @typedef {{
  *   source?: string | null,

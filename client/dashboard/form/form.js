@@ -12,6 +12,7 @@ const PARTS = ["clip", "right", "calibration", "masks", "poses_file", "fov_mask"
 const CALIBRATION = /\.(json|ya?ml|xml|ini)$/i;
 const POSES = /\.(tum|txt|csv)$|(^|[^a-z])poses?[^a-z].*json$/i;
 const PICTURE = /\.png$/i;
+const SAVED_SCENE = /\.scene( ?\(\d+\))?\.zip$/i;
 const UNAUTHORISED = 401;
 /** tests/client/draw_example.py draws it. */
 const EXAMPLE = ["stereo.webm", "calibration.json", "masks.zip"];
@@ -39,8 +40,8 @@ export class ClipForm {
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
    * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined) => void, onShare: (share: number | null) => void,
-   *   onAsked: () => void}} told of the job that was made; that a clip is being sent; of the share that is sent, null at the
-   *   end; that something is asked of the user
+   *   onAsked: () => void, onScene: (file: File) => void}} told of the job that was made; that a clip is being sent; of the
+   *   share that is sent, null at the end; that something is asked of the user; of a scene that was saved and is dropped
    */
   constructor(parts, told) {
     Object.assign(this, parts, told);
@@ -162,8 +163,10 @@ export class ClipForm {
     document.addEventListener("drop", (event) => {
       hold(event, false);
       if (!this.isAllowed || event.dataTransfer.files.length === 0) return;
+      const files = [...event.dataTransfer.files];
+      if (files.length === 1 && SAVED_SCENE.test(files[0].name)) return this.onScene(files[0]);
       this.onAsked();
-      this.take([...event.dataTransfer.files]);
+      this.take(files);
     });
   }
 

@@ -1,71 +1,42 @@
 // The menu of files that a scene can be saved as, in plain words, and the saving itself.
 
-import { exportScene } from "../base/api.js";
+import { exportScene, listExports } from "../base/api.js";
 import { button, element } from "../base/element.js";
 import { words } from "../base/messages.js";
 import { showProblem } from "../base/problem.js";
+import { save } from "../base/save.js";
 
-/** The formats of docs/export.md, and what their files' names end in; those of one moment are of the one in view.
- * The scene itself is for keys that may download it. */
+/** The formats of docs/export.md, and views of videos; those of one moment are of the one in view. The scene itself is for
+ * keys that may download it. */
 const GROUPS = {
-  moment: {
-    "mesh-glb": "-mesh.glb",
-    "mesh-ply": "-mesh.ply",
-    "mesh-stl": "-mesh.stl",
-    "points": "-points.ply",
-    "ply": ".ply",
-    "splat": ".splat",
-    "gltf": ".glb",
-  },
-  clip: {
-    "webm": ".webm",
-    "mp4": ".mp4",
-    "depth": "-depth.npy",
-    "tracks": "-tracks.npz",
-    "ply-zip": "-ply.zip",
-    "tum": ".tum",
-  },
-  itself: {
-    "html": ".html",
-    "scene": ".scene.zip",
-  },
+  moment: [["mesh-glb"], ["mesh-ply"], ["mesh-stl"], ["points"], ["ply"], ["splat"], ["gltf"], ["mp4", "rock"]],
+  clip: [["mp4"], ["mp4", "rock"], ["mp4", "orbit"], ["mp4", "stereo"], ["webm"], ["depth"], ["tracks"], ["ply-zip"], ["tum"]],
+  itself: [["html"], ["scene"]],
 };
-const KEPT_MS = 10_000;
 
-/** @param {string} id of a scene @param {string} format @returns {string} the same for all formats of surfaces */
-const kindOf = (id, format) => `${id} ${format.split("-")[0]}`;
-
-/** @param {string} name of a scene @returns {string} the same as a file's name, without its ending */
-export const fileName = (name) => name.replace(/[^\p{L}\p{N}._-]+/gu, "_");
+/** @typedef {import("../base/wire.js").ExportOffer} ExportOffer */
 
 /**
- * Save what is loaded under a name. Not a link: a link sends no key.
- * @param {string} name
- * @param {() => Promise<Blob>} load
- */
-export async function save(name, load) {
-  const link = element("a");
-  link.href = URL.createObjectURL(await load());
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), KEPT_MS);
-}
-
-/**
- * Save it, and say how that goes.
- * @param {string} name
- * @param {() => Promise<Blob>} load
+ * Save a file, and say how that goes.
+ * @param {() => Promise<{blob: Blob, name: string}>} load
  * @param {HTMLElement} message
  */
-export async function download(name, load, message) {
+export async function download(load, message) {
   message.classList.remove("bad");
   message.replaceChildren(element("p", { text: words("download.making") }));
   try {
-    await save(name, load);
+    const { blob, name } = await load();
+    save(name, blob);
     message.replaceChildren();
   } catch (error) {
     showProblem(message, error);
   }
+}
+
+/** @param {ExportOffer} offer @param {string} [view] @returns {string} why it cannot be made; empty if it can */
+function whyNot(offer, view) {
+  if (offer.needs) return words("download.needs", { what: offer.needs });
+  return view && !offer.views.includes(view) ? words("download.no_stereo") : "";
 }
 
 export class Downloads {
@@ -77,53 +48,56 @@ export class Downloads {
    */
   constructor(dialog, message, scopes, momentOf) {
     Object.assign(this, { dialog, message, scopes, momentOf });
-    /** @type {Set<string>} scenes and kinds of files that this installation turned out not to make of them */
-    this.lacking = new Set();
     dialog.addEventListener("click", (event) => {
       if (event.target === dialog) dialog.close(); // beside it
     });
   }
 
   /** @param {string} id @param {string} name of the scene, as people call it */
-  open(id, name) {
+  async open(id, name) {
     const moment = this.momentOf(id);
     const t = Number(moment.t.toFixed(4));
     const close = button(words("download.close"), () => this.dialog.close());
+    const offered = element("div", { class: "message" });
     this.dialog.setAttribute("aria-label", words("download.title", { name }));
     this.dialog.replaceChildren(
       element("header", {}, element("h2", { text: words("download.title", { name }) }), close),
-      ...this.#group("moment", id, name, t, moment.seconds),
-      ...this.#group("clip", id, name),
-      ...(this.scopes.has("download") ? this.#group("itself", id, name) : []),
+      offered,
       element("p", { class: "quiet", text: words("download.research") }),
     );
     this.dialog.showModal();
+    try {
+      const offers = new Map((await listExports(id)).map((offer) => [offer.format, offer]));
+      offered.replaceWith(
+        ...this.#group("moment", id, offers, { t }, moment.seconds),
+        ...this.#group("clip", id, offers),
+        ...(this.scopes.has("download") ? this.#group("itself", id, offers) : []),
+      );
+    } catch (error) {
+      showProblem(offered, error);
+    }
   }
 
-  #group(group, id, name, t, seconds) {
-    const isMoment = group === "moment";
-    const title = isMoment ? words(t > 0 ? "download.moment" : "download.first", { seconds }) : words(`download.${group}`);
-    const buttons = Object.entries(GROUPS[group]).map(([format, suffix]) => {
-      const text = `${words(`download.${format}`)} (.${suffix.split(".").at(-1)})`;
-      const made = button(text, () => this.#save(id, name, format, suffix, t));
-      made.dataset.format = format;
-      made.disabled = this.lacking.has(kindOf(id, format));
-      if (made.disabled) made.title = words("problem.input:format");
+  #group(group, id, offers, moment = {}, seconds = "") {
+    const isFirst = moment.t === 0;
+    const title = words(isFirst ? "download.first" : `download.${group}`, { seconds });
+    const known = GROUPS[group].filter(([format]) => offers.has(format));
+    const buttons = known.map(([format, view]) => {
+      const offer = offers.get(format);
+      const why = whyNot(offer, view);
+      const text = `${words(`download.${[format, view].filter(Boolean).join("-")}`)} (.${offer.file_name.split(".").at(-1)})`;
+      const made = button(text, () => this.#save(id, { format, view, ...moment }));
+      Object.assign(made.dataset, { format, view: view ?? "" });
+      made.disabled = why !== "";
+      if (why) made.append(" ", element("small", { text: why }));
+      made.removeAttribute("aria-label"); // its text says it all
       return made;
     });
     return [element("h3", { text: title }), element("div", { class: "kinds" }, ...buttons)];
   }
 
-  #save(id, name, format, suffix, t) {
+  #save(id, wanted) {
     this.dialog.close();
-    const load = async () => {
-      try {
-        return await exportScene(id, { format, t });
-      } catch (error) {
-        if (error.document?.field === "format") this.lacking.add(kindOf(id, format));
-        throw error;
-      }
-    };
-    download(fileName(name) + suffix, load, this.message);
+    download(() => exportScene(id, wanted), this.message);
   }
 }

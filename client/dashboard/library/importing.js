@@ -15,7 +15,7 @@ export class SceneImport {
     Object.assign(this, parts);
     this.onJob = onJob;
     this.ask.addEventListener("click", () => this.file.click());
-    this.file.addEventListener("change", () => this.#send());
+    this.file.addEventListener("change", () => this.file.files[0] && this.send(this.file.files[0]));
   }
 
   /** @param {import("../base/scopes.js").Scopes} scopes of the user's key */
@@ -23,9 +23,8 @@ export class SceneImport {
     this.ask.hidden = !scopes.has("reconstruct");
   }
 
-  async #send() {
-    const [file] = this.file.files;
-    if (!file) return;
+  /** @param {File} file */
+  async send(file) {
     this.ask.disabled = true;
     closeBanner(this.message);
     this.message.append(element("p", { text: words("import.sending") }));

@@ -68,7 +68,7 @@ function correction(id, { masks }, message, onMasks) {
   if (!masks) return [];
   const send = button(words(masks.source === "none" ? "report.send_masks" : "report.send_better_masks"), () => onMasks(id));
   if (!areFound(masks) || !masks.share) return [send];
-  const save = button(words("report.save_masks"), () => download(`${id}-masks.zip`, () => getMasks(id), message));
+  const save = button(words("report.save_masks"), () => download(() => getMasks(id), message));
   return [save, send, element("p", { class: "quiet", text: words("report.how_to_correct") })];
 }
 

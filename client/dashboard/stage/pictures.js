@@ -3,6 +3,7 @@
 import { bodyOf, request } from "../base/api.js";
 import { keyEvents } from "../base/key.js";
 import { noticeWords, words } from "../base/messages.js";
+import { Line } from "./line.js";
 import { Stream } from "./stream.js";
 
 /** @typedef {import("./stream.js").View} View */
@@ -87,6 +88,7 @@ const pathOf = (view) =>
 export class Pictures {
   constructor() {
     this.stream = new Stream();
+    this.line = new Line();
     this.retryMs = FIRST_RETRY_MS;
     this.retryAt = 0;
     this.controller = new AbortController();
@@ -102,17 +104,33 @@ export class Pictures {
     this.stream.giveUp();
   }
 
+  /** @param {View} view @returns {number} how many pictures of such views may be under way at a time, while they change */
+  depthOf(view) {
+    return this.#isStreamed(view) ? this.line.depth : 1;
+  }
+
   /**
-   * The picture of a view; one at a time.
+   * The picture of a view; one at a time, or as many as depthOf() says. Where the line is slow it is smaller and coarser.
    * @param {View} view
+   * @param {{isFull?: boolean, width?: number}} how isFull: as large as it is; width: of the full picture, if it is known
    * @returns {Promise<Picture>}
    */
-  async ask(view) {
+  async ask(view, { isFull = true, width } = {}) {
     this.#keepOpen();
-    const isStreamed = this.stream.isOpen && view.layer !== RECORDED;
-    const picture = isStreamed ? await this.#fromStream(view) : await this.#fromPath(pathOf(view));
+    const { line } = this;
+    const level = isFull || view.layer === RECORDED ? 0 : line.level;
+    const wanted = { ...view, ...line.reduction(level, width) };
+    const began = performance.now();
+    const picture = this.#isStreamed(view) ? await this.#fromStream(wanted) : await this.#fromPath(pathOf(wanted));
     if (picture.scene !== view.scene) throw new Error(words("page.other_scene"));
+    if (view.layer !== RECORDED) line.note(picture.blob.size, performance.now() - began, picture.totalMs || 0, level);
+    picture.isReduced = level > 0;
     return picture;
+  }
+
+  /** @param {View} view */
+  #isStreamed(view) {
+    return this.stream.isOpen && view.layer !== RECORDED;
   }
 
   /** Have the stream back for the next picture. @returns {boolean} whether it would come another way than the last */

@@ -6,16 +6,18 @@ import { connectionLost, Problem, wrongKeyWords } from "../base/problem.js";
 /**
  * What is asked for; the query of GET /render.
  * @typedef {{scene: string, t: number, pose?: string, eye?: "right", layer: string, unseen: string, highlights: string,
- *   format: string, light?: "recorded", smoke?: "show", near_mm?: number, far_mm?: number}} View
+ *   format: string, light?: "recorded", smoke?: "show", near_mm?: number, far_mm?: number, width?: number,
+ *   quality?: number}} View
  */
 /**
  * What came: a file, or an image that this browser drew. way: how. isExtrapolated: it shows a guess, or a pose or time far
  * from the clip's. isRecorded: it is a frame of the clip, no render. Both are set by judged() of pictures.js.
  * depthRangeMm: of depth in false colours, of the brightest and of the darkest. isMoving: as of Shown in viewer.js.
+ * isReduced: it is smaller or coarser than asked for, because the line is slow.
  * @typedef {{blob?: Blob, image?: HTMLCanvasElement, scene: string, state: "running"|"done", t: number, iteration: number | null,
  *   unseen: number, codes: string[], totalMs: number, way: "stream"|"single"|"memory",
  *   camera: Camera | null, depthRangeMm?: [number, number] | null, isExtrapolated?: boolean, isRecorded?: boolean,
- *   isMoving?: boolean}} Picture
+ *   isMoving?: boolean, isReduced?: boolean}} Picture
  */
 /**
  * Where a picture was taken from, and through which lens: pixels of the picture as it came, and world_from_camera as 12
@@ -37,7 +39,8 @@ export class Stream {
   constructor() {
     this.socket = null;
     this.number = 0;
-    this.pending = null; // the one view that is under way
+    /** @type {Map<number, {resolve: (picture: Picture) => void, reject: (error: Error) => void}>} views under way, in order */
+    this.pending = new Map();
   }
 
   get isOpen() {
@@ -58,7 +61,7 @@ export class Stream {
     socket.addEventListener("close", () => socket === this.socket && this.giveUp());
   }
 
-  /** Wait no more for what was asked; its picture is not taken when it comes. */
+  /** Wait no more for what was asked; no picture of it is taken when it comes. */
   giveUp() {
     this.#fail(connectionLost());
   }
@@ -70,12 +73,15 @@ export class Stream {
     this.giveUp();
   }
 
-  /** @param {View} view @returns {Promise<Picture>} */
+  /**
+   * Ask for one more view. The service answers in order, and may leave out views that later ones have overtaken.
+   * @param {View} view
+   * @returns {Promise<Picture>}
+   */
   ask(view) {
-    this.giveUp();
     const id = ++this.number;
     return new Promise((resolve, reject) => {
-      this.pending = { id, resolve, reject };
+      this.pending.set(id, { resolve, reject });
       this.socket.send(JSON.stringify({ ...view, id }));
     });
   }
@@ -85,21 +91,33 @@ export class Stream {
       const document = JSON.parse(data);
       const problem = new Problem(document.status, document, document.retry_after_s);
       if (problem.status === 401 && key === currentKey()) askForKey(key ? wrongKeyWords(problem) : problem.message);
-      if (document.id === undefined || document.id === null || document.id === this.pending?.id) this.#fail(problem);
+      if (document.id === undefined || document.id === null) this.#fail(problem);
+      else this.#answered(document.id)?.reject(problem);
       return;
     }
     const [head, blob] = unpack(data);
-    if (head.id !== this.pending?.id) return; // of a view that nobody waits for any more
-    const { resolve } = this.pending;
-    this.pending = null;
+    const asked = this.#answered(head.id);
+    if (!asked) return; // of a view that nobody waits for any more
     const { scene, state, t, iteration, unseen, camera, depth_range_mm: depthRangeMm, warnings, total_ms: totalMs } = head;
     const codes = warnings.map(({ code }) => code);
-    resolve({ blob, scene, state, t, iteration, unseen, codes, totalMs, camera, depthRangeMm, way: "stream" });
+    asked.resolve({ blob, scene, state, t, iteration, unseen, codes, totalMs, camera, depthRangeMm, way: "stream" });
+  }
+
+  /** The view that is answered; those before it, which it has overtaken, get no answer. @param {number} id */
+  #answered(id) {
+    const asked = this.pending.get(id);
+    if (!asked) return undefined;
+    for (const [earlier, { reject }] of this.pending) {
+      if (earlier > id) break;
+      this.pending.delete(earlier);
+      if (earlier < id) reject(Object.assign(new Error("overtaken"), { isOvertaken: true }));
+    }
+    return asked;
   }
 
   #fail(problem) {
-    const pending = this.pending;
-    this.pending = null;
-    pending?.reject(problem);
+    const pending = [...this.pending.values()];
+    this.pending.clear();
+    for (const { reject } of pending) reject(problem);
   }
 }

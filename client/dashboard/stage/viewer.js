@@ -25,7 +25,7 @@ const COARSE = "coarse";
 /**
  * What a view shows. t: as shown, within the clip; pose: as the service spells it, null for the endoscope's own, of the eye;
  * camera: null where it is not known, as of recorded frames; way: how the picture came; isMoving: it was drawn at once, perhaps
- * with its Gaussians sorted for the view before, and an exact picture follows; hasDetail: this browser added that of recorded frames.
+ * with its Gaussians sorted for the view before, or came smaller over a slow line, and an exact picture follows; hasDetail: this browser added that of recorded frames.
  * @typedef {{scene: string, t: number, pose: string | null, eye: "left"|"right", layer: string, unseen: "mark"|"guess",
  *   highlights: "on"|"off", light: "steady"|"recorded", state: "running"|"done", way: "stream"|"single"|"memory",
  *   camera: import("./stream.js").Camera | null, depthRangeMm?: [number, number] | null, isMoving: boolean, hasDetail: boolean}} Shown
@@ -57,8 +57,10 @@ export class Viewer extends EventTarget {
     /** @type {Shown | null} what is on the screen */
     this.shown = null;
     this.visit = 0; // counts scenes opened: what was asked for in an earlier one is not shown in this
-    this.isBusy = false;
+    this.underWay = 0; // views that are asked for
+    this.asked = this.presented = 0; // counts them; the newest that is on the screen
     this.isWanted = false;
+    this.isFullWanted = false;
     this.askedAt = 0;
     this.isConfirming = false;
     this.isMoving = false;
@@ -74,7 +76,7 @@ export class Viewer extends EventTarget {
     this.memory = new Memory(mayDownload);
     this.drawnBy = new DrawnBy(parts.way, this.memory, () => this.refresh());
     this.screen = new Screen(parts);
-    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isBusy, () => this.screen.isStale);
+    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isWanted || this.#isFull, () => this.screen.isStale);
     this.clip = new Clip((cameras) => this.#know(cameras));
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
@@ -136,12 +138,25 @@ export class Viewer extends EventTarget {
     return this.isBusy && performance.now() - this.askedAt > AGAIN_MS;
   }
 
-  refresh() {
+  get isBusy() {
+    return this.underWay > 0;
+  }
+
+  /** Whether another view would have to wait for one that is under way. */
+  get #isFull() {
+    const isMany = this.isMoving && this.scene !== null && !this.#isDrawnHere;
+    return this.underWay >= (isMany ? this.pictures.depthOf(this.#view(this.scene)) : 1);
+  }
+
+  /** @param {boolean} [isFull] however slow the line is */
+  refresh(isFull = false) {
     const now = performance.now();
+    this.isFullWanted = isFull;
+    clearTimeout(this.resting);
     this.isMoving = this.isRunning || now - this.wishedAt < REST_MS;
     this.wishedAt = now;
     this.isWanted = true;
-    if (!this.isBusy) this.#work();
+    this.#work();
   }
 
   #know(cameras) {
@@ -204,12 +219,18 @@ export class Viewer extends EventTarget {
   }
 
   async #work() {
-    this.isBusy = true;
-    while (this.isWanted && this.scene) {
-      this.isWanted = false;
-      await this.#showOnce(this.scene, this.visit);
+    if (!this.isWanted || !this.scene || this.#isFull) return;
+    const restMs = this.isBusy ? this.askedAt + this.pictures.line.spacingMs - performance.now() : 0;
+    if (restMs > 0) {
+      clearTimeout(this.next);
+      this.next = setTimeout(() => this.#work(), restMs);
+      return;
     }
-    this.isBusy = false;
+    this.isWanted = false;
+    this.underWay += 1;
+    await this.#showOnce(this.scene, this.visit);
+    this.underWay -= 1;
+    this.#work();
   }
 
   async #showOnce(scene, visit) {
@@ -221,17 +242,21 @@ export class Viewer extends EventTarget {
     const layer = this.parts.layer.selectedOptions[0].text;
     const name = [RECORDED, ERROR].includes(view.layer) ? layer : `${layer}, ${this.#place}${guesses}${highlights}${light}`;
     const isDrawnHere = this.#isDrawnHere;
+    const number = ++this.asked;
+    const how = { isFull: this.isFullWanted, width: this.timeline.cameras?.intrinsics.width };
     try {
-      const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view)), view);
+      const picture = judged(await (isDrawnHere ? this.#draw(view) : this.pictures.ask(view, how)), view);
       const image = picture.image ?? (await createImageBitmap(picture.blob));
-      if (visit !== this.visit) return; // another was opened meanwhile: never its neighbour's picture
+      if (visit !== this.visit || number < this.presented) return; // another scene's, or older than what is shown
+      this.presented = number;
       this.pace.note();
       if (!picture.isRecorded) this.clip.follow(picture);
       this.#present(picture, image, view, name, began);
+      if (picture.isReduced && !this.isWanted) this.#completeAtRest();
       if (isDrawnHere) await this.#refine(view, visit, name, picture.hasDetail);
       else if (picture.state === "done") this.memory.want(view);
     } catch (error) {
-      if (visit !== this.visit) return;
+      if (visit !== this.visit || error.isOvertaken) return;
       if (isDrawnHere) {
         if (error.code !== "closed") this.memory.giveUp(error);
         this.isWanted = true;
@@ -241,6 +266,12 @@ export class Viewer extends EventTarget {
       else this.#fail(error);
       await pause(Math.max(AFTER_TROUBLE_MS, (error.turnInS ?? 0) * 1000));
     }
+  }
+
+  /** Ask for the full picture when the view has not changed for a while. */
+  #completeAtRest() {
+    clearTimeout(this.resting);
+    if (!this.timeline.isPlaying) this.resting = setTimeout(() => this.refresh(true), 2 * REST_MS);
   }
 
   /** Draw a view here: at once while it moves, and once more, exactly, when it rests. */
@@ -316,8 +347,9 @@ export class Viewer extends EventTarget {
     const pace = rate >= 1 && this.isRunning ? [words("readout.rate", { rate: figure(rate) })] : [];
     const iteration = picture.iteration === null ? [] : [words("readout.iteration", { iteration: picture.iteration })];
     const unseen = picture.unseen >= 0.005 ? [words("readout.unseen", { share: figure(100 * picture.unseen) })] : [];
+    const reduced = picture.isReduced ? [words("readout.reduced")] : [];
     const took = `${figure(tookMs)} ms${server}`;
-    this.parts.readout.textContent = [name, ...iteration, ...unseen, took, ...pace, words(`readout.${picture.way}`)].join(" · ");
+    this.parts.readout.textContent = [name, ...iteration, ...unseen, took, ...pace, words(`readout.${picture.way}`), ...reduced].join(" · ");
     this.#tellWay();
     this.drawnBy.tellFigures(pace, picture.camera);
   }
@@ -346,6 +378,6 @@ export class Viewer extends EventTarget {
 
 /** @param {import("./stream.js").View} view @param {import("./stream.js").Picture} picture @returns {Shown} */
 function shownOf({ scene, pose = null, eye = "left", layer, unseen, highlights, light = "steady" }, picture) {
-  const { t, state, way, camera, depthRangeMm, isMoving = false, hasDetail = false } = picture;
-  return { scene, t, pose, eye, layer, unseen, highlights, light, state, way, camera, depthRangeMm, isMoving, hasDetail };
+  const { t, state, way, camera, depthRangeMm, isMoving = false, hasDetail = false, isReduced = false } = picture;
+  return { scene, t, pose, eye, layer, unseen, highlights, light, state, way, camera, depthRangeMm, isMoving: isMoving || isReduced, hasDetail };
 }

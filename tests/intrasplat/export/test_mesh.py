@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import sys
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ import torch
 import trimesh
 from scipy.ndimage import binary_dilation
 
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, MissingExtraError
 from intrasplat.export import export_parts, surface
-from intrasplat.formats import ExportOptions
+from intrasplat.formats import EXTRA_MODULES, ExportOptions, missing_extras
 from intrasplat.outcome import scene_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.view.camera import endoscope_pose
@@ -129,8 +128,10 @@ def test_all_formats_hold_the_same_mesh(scene: TrainedScene) -> None:
 
 
 def test_without_scikit_image_the_remedy_is_told(scene: TrainedScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(InputError, match=r"intrasplat\[mesh\]"):
+    assert missing_extras() == ()
+    monkeypatch.setitem(EXTRA_MODULES, "mesh", "no_such_module")
+    monkeypatch.setattr("intrasplat.export.missing_extras", missing_extras.__wrapped__)
+    with pytest.raises(MissingExtraError, match=r"intrasplat\[mesh\]"):
         read(scene, "ply")
 
 

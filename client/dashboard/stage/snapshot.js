@@ -1,0 +1,127 @@
+// A picture of what is in view, for the record: a PNG with what it shows in lines below it, and in its own texts.
+
+import { getInfo } from "../base/api.js";
+import { dateTime } from "../base/element.js";
+import { figure, words } from "../base/messages.js";
+import { pause } from "../base/pause.js";
+import { withTexts } from "../base/pngtext.js";
+import { fileName, save } from "../base/save.js";
+
+/** Narrower pictures are enlarged, so that the lines can be read. */
+const MIN_WIDTH_PX = 640;
+const LINE_SHARE = 1 / 48;
+const LOOK_MS = 50;
+const PATIENCE_MS = 10_000;
+
+export class Snapshot {
+  /**
+   * @param {import("./viewer.js").Viewer} viewer
+   * @param {{stage: HTMLElement, recorded: HTMLCanvasElement, button: HTMLButtonElement}} parts
+   * @param {() => {name: string, badge: string, verdict: string, warning: string, seam: number}} facts of what is in view
+   * @param {(text: string) => void} tell what went wrong
+   */
+  constructor(viewer, parts, facts, tell) {
+    Object.assign(this, { viewer, parts, facts, tell });
+    parts.button.addEventListener("click", () => this.take());
+  }
+
+  /** Hold the moment in view, and save its picture. */
+  async take() {
+    const { viewer, parts } = this;
+    if (!viewer.shown || parts.button.disabled) return;
+    parts.button.disabled = true;
+    try {
+      viewer.timeline.play(false);
+      await this.#rested();
+      const { name, ...about } = this.facts();
+      const texts = await this.#texts(name, about);
+      const canvas = captioned(this.#picture(about.seam), texts.Description.split("\n"));
+      const png = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+      const seconds = viewer.timeline.momentOf(viewer.shown.t);
+      save(`${fileName(`${name}-${seconds}`)}.png`, withTexts(png, texts));
+    } catch (error) {
+      this.tell(error.message);
+    } finally {
+      parts.button.disabled = false;
+    }
+  }
+
+  /** Wait for the exact picture of the view. */
+  async #rested() {
+    const { viewer } = this;
+    const until = performance.now() + PATIENCE_MS;
+    while (viewer.isBusy || viewer.isWanted || viewer.shown?.isMoving) {
+      if (performance.now() > until) throw new Error(words("snapshot.too_slow"));
+      await pause(LOOK_MS);
+    }
+    if (!viewer.shown) throw new Error(words("screen.nothing"));
+  }
+
+  async #texts(name, { badge, verdict, warning }) {
+    const { shown, timeline, parts } = this.viewer;
+    const { version } = await getInfo();
+    const layer = parts.layer.selectedOptions[0].text;
+    const light = shown.light === "recorded" ? [words("picture.recorded_light")] : [];
+    const guesses = shown.unseen === "guess" ? [words("picture.guesses")] : [];
+    const seconds = timeline.momentOf(shown.t);
+    const view = [name, seconds, layer, this.viewer.orbit.words, ...guesses, ...light].filter(Boolean).join(" · ");
+    const trust = [badge, verdict, warning].filter(Boolean).join(" · ");
+    const made = [`intrasplat ${version}`, dateTime(Date.now()), words("page.notice")].join(" · ");
+    return {
+      Title: name,
+      Software: `intrasplat ${version}`,
+      "Creation Time": new Date().toISOString(),
+      Description: [view, trust, made].filter(Boolean).join("\n"),
+      View: JSON.stringify({ ...shown, codes: this.viewer.screen.shown?.codes ?? [] }),
+    };
+  }
+
+  /** What the stage shows: the model's picture, or the recorded frame over or beside it. */
+  #picture(seam) {
+    const { canvas } = this.viewer.parts;
+    const { stage, recorded } = this.parts;
+    const factor = Math.max(1, Math.ceil(MIN_WIDTH_PX / canvas.width));
+    const [width, height] = [canvas.width * factor, canvas.height * factor];
+    const isBeside = stage.dataset.compare === "side";
+    const made = Object.assign(document.createElement("canvas"), { width: isBeside ? 2 * width : width, height });
+    const context = made.getContext("2d");
+    context.drawImage(canvas, isBeside ? width : 0, 0, width, height);
+    if (stage.dataset.compare === undefined || recorded.hidden) return made;
+    const shownTo = isBeside ? width : (seam / 100) * width;
+    context.save();
+    context.beginPath();
+    context.rect(0, 0, shownTo, height);
+    context.clip();
+    context.drawImage(recorded, 0, 0, width, height);
+    context.restore();
+    return made;
+  }
+}
+
+/** A picture with lines of text below it. @param {HTMLCanvasElement} picture @param {string[]} lines */
+function captioned(picture, lines) {
+  const px = Math.max(13, Math.round(picture.width * LINE_SHARE));
+  const font = `${px}px system-ui, sans-serif`;
+  const measure = picture.getContext("2d");
+  measure.font = font;
+  const wrapped = lines.flatMap((line) => wrap(line, (text) => measure.measureText(text).width < picture.width - 2 * px));
+  const made = document.createElement("canvas");
+  Object.assign(made, { width: picture.width, height: Math.ceil(picture.height + px * (1.4 * wrapped.length + 1)) });
+  const context = made.getContext("2d");
+  context.fillRect(0, 0, made.width, made.height);
+  context.drawImage(picture, 0, 0);
+  Object.assign(context, { font, fillStyle: "white", textBaseline: "top" });
+  wrapped.forEach((line, index) => context.fillText(line, px, picture.height + px * (0.6 + 1.4 * index)));
+  return made;
+}
+
+/** @param {string} text @param {(text: string) => boolean} fits @returns {string[]} lines of whole words */
+function wrap(text, fits) {
+  const lines = [""];
+  for (const word of text.split(" ")) {
+    const longer = `${lines.at(-1)} ${word}`.trim();
+    if (lines.at(-1) === "" || fits(longer)) lines[lines.length - 1] = longer;
+    else lines.push(word);
+  }
+  return lines;
+}
