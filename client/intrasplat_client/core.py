@@ -386,15 +386,11 @@ def _json_of(response: httpx.Response) -> Any:
 
 
 def _search(
-    q: str | None,
-    metadata: Mapping[str, str] | None,
-    preset: str | None,
-    created_from_s: float | None,
-    created_until_s: float | None,
+    q: str | None, metadata: Mapping[str, str] | None, preset: str | None, from_s: float | None, until_s: float | None
 ) -> dict[str, Any]:
     """The query of a list, with None for unused conditions."""
     wanted = [f"{name}={value}" for name, value in (metadata or {}).items()]
-    dates = {"created_from_s": created_from_s, "created_until_s": created_until_s}
+    dates = {"created_from_s": from_s, "created_until_s": until_s}
     return {"q": q, "metadata": wanted or None, "preset": preset, **dates}
 
 

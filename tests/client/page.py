@@ -1,5 +1,6 @@
 """What the tests of the page stand on: a service that can end and come back, a painter, and a browser."""
 
+# long: an installation, its painter and its browser, which every test of the page needs together
 from __future__ import annotations
 
 import contextlib

@@ -37,6 +37,7 @@ def test_the_page_itself_may_use_the_service_and_nothing_from_elsewhere_may_run(
 OPERATIONS = {
     *("reconstruct", "check_clip", "list_jobs", "get_job", "label_job", "cancel_job", "retry_job", "watch_job"),
     "list_deliveries",
+    "list_exports",
     "send_again",
     *("describe_uploads", "create_upload", "get_upload", "append_to_upload", "delete_upload"),
     *(
