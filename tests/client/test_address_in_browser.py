@@ -118,7 +118,7 @@ def test_the_help_tells_every_key_and_gesture_in_both_languages(site: Site, page
     keys = page.driver.execute_async_script(KEYS)  # type: ignore[no-untyped-call]
     told = page.script("return [...document.querySelectorAll('#help kbd')].map((each) => each.textContent)")
     names = {"ArrowLeft": "←", "ArrowRight": "→", "ArrowUp": "↑", "ArrowDown": "↓"}
-    names |= {" ": say("key. ", language), "Home": say("key.Home", language)}
+    names |= {key: say(f"key.{key}", language) for key in (" ", "Home", "PageUp", "PageDown")}
     assert {names.get(key, key) for key in keys} <= set(told)
     assert "undefined" not in page.text("#help")
     assert "help." not in page.text("#help")

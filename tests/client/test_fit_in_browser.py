@@ -47,6 +47,7 @@ def test_the_picture_is_free_of_controls_and_all_over_it_follows(
             page.find(css)
             page.until(lambda css=css: is_free_of(page, css))  # type: ignore[misc]
         site.announce()
+        page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.timeline.goTo(0))")
         page.until(lambda: page.find("#scale .bar").is_displayed())
         length_mm, *_ = page.text("#scale .about").split()
         shown_px = box_of(page, "#scale .bar")[2] - box_of(page, "#scale .bar")[0]

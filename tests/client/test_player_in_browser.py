@@ -45,7 +45,7 @@ def page(site: Site, driver: webdriver.Chrome) -> Iterator[Drawn]:
 
 FILLS = """
 const { width, height } = document.querySelector("#picture");
-const { clientWidth, clientHeight } = document.querySelector("#stage");
+const { clientWidth, clientHeight } = document.querySelector("#fitted");
 return width === clientWidth || height === clientHeight;
 """
 VIEWS: list[dict[str, object]] = [
@@ -64,7 +64,7 @@ def test_the_page_shows_the_picture_that_the_service_would(site: Site, page: Dra
         page.until(lambda: (page.shown.get("pose", "") is None) == (wish["pose"] is None))  # noqa: B023
         height, width, _ = same_as_the_service(site, page).shape
         assert width / height == pytest.approx(64 / 48, rel=0.01)
-    page.until(lambda: page.script(FILLS))  # the screen; the clip is 64 x 48
+    page.until(lambda: page.script(FILLS))  # what is free of the screen; the clip is 64 x 48
 
 
 def test_a_picture_is_exact_again_when_playing_ends(site: Site, page: Drawn) -> None:
