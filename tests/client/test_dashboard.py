@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 import tomllib
 from html.parser import HTMLParser
@@ -14,6 +15,7 @@ from client.generate_page import PAGE_TYPES, generate
 from client.page import DASHBOARD
 from intrasplat.options import JobOptions
 from tests.client.words import table
+from tests.service.under_test import running_service
 
 SERVER_PROJECT = DASHBOARD.parents[1] / "service" / "pyproject.toml"
 SCRIPTS = sorted(DASHBOARD.rglob("*.js"))
@@ -123,3 +125,21 @@ def test_the_server_package_has_every_file_of_the_page() -> None:
     patterns = project["tool"]["setuptools"]["package-data"]["client"]
     packaged = {path for pattern in patterns for path in DASHBOARD.parent.glob(pattern) if path.is_file()}
     assert {path for path in DASHBOARD.rglob("*") if path.is_file()} <= packaged
+
+
+@pytest.mark.parametrize(("accepted", "language"), [("de-CH,de;q=0.9,en;q=0.8", "de"), ("fr, en", "en"), ("", "en")])
+def test_the_page_comes_with_its_words_and_the_names_of_all_its_modules(
+    tmp_path: Path, accepted: str, language: str
+) -> None:
+    for service in running_service(tmp_path, dashboard_dir=DASHBOARD):
+        answer = service.http.get("/", headers={"Accept-Language": accepted})
+        text, words = answer.text, table(language)
+        assert f'<html lang="{language}">' in text
+        assert "Accept-Language" in answer.headers["Vary"]
+        places = re.findall(r'data-words="(\w+)\.(\w+)"[^>]*>([^<]*)', text)
+        assert len(places) > 50
+        assert [html.unescape(shown) for *_, shown in places] == [words[section][code] for section, code, _ in places]
+        named = re.findall(r'rel="modulepreload" href="([^"]+)"', text)
+        assert any(each.endswith("/player/draw.js") for each in named)  # which only others import
+        assert {service.http.get("/" + each).status_code for each in named} == {200}
+        assert len(set(named)) == len(named)

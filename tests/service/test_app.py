@@ -48,6 +48,7 @@ OPERATIONS = {
         "get_masks",
         "get_recorded",
         "get_cameras",
+        "list_exports",
         "export_scene",
         "measure",
         "purge_scene",
