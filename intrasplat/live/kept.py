@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from intrasplat.errors import SceneError
 from intrasplat.files.durable import move_folder
-from intrasplat.live.window import ARRIVED_AT
+from intrasplat.live.window import ARRIVED_AT, WindowPictures
 from intrasplat.names import DETAIL, RECORDED
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.recorded_file import EYES, MASK, name_of
@@ -45,7 +45,7 @@ class KeptSegment:
 
     source_s, arrived_at  of its first and last frame: source times, and UNIX times, s
     path                  its folder; None: it is in memory alone
-    bytes                 on disk; in memory, of its model
+    bytes                 on disk; in memory, of its model and its recorded pictures
     """
 
     number: int
@@ -60,7 +60,7 @@ class KeptSegment:
         (first_s, last_s), (first_at, last_at) = (
             (float(times[0]), float(times[-1])) for times in (scene.frame_times_s, arrivals(scene))
         )
-        return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count)
+        return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count + _in_memory(scene.pictures))
 
     @classmethod
     def at(cls, path: Path) -> KeptSegment | None:
@@ -124,6 +124,11 @@ def _drawn(scene: TrainedScene) -> TrainedScene:
     return replace(
         scene, gaussians=gaussians, deformation=scene.deformation.select(rows), seen=scene.seen[rows].contiguous()
     )
+
+
+def _in_memory(pictures: TrainingPictures | None) -> int:
+    """Bytes of a window's pictures."""
+    return pictures.byte_count if isinstance(pictures, WindowPictures) else 0
 
 
 def _recorded(pictures: TrainingPictures | None) -> dict[str, bytes]:

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from intrasplat.errors import SceneError
@@ -37,7 +37,8 @@ class PastSpec:
     keep_s       a segment is deleted this long after its last frame came in
     max_bytes    of all segments: the oldest ones go first
     spare_bytes  segments are written only while more is free: the recording goes on for longer
-    cached       segments in memory beside those on disk: the last ones that were added or looked at
+    cached       segments in memory beside those on disk, or that keep their renderers: the last ones that were added or
+                 looked at
     """
 
     folder: Path | None = None
@@ -104,7 +105,7 @@ class Past:
         """The segment's scene; None: it is gone meanwhile, or damaged, and is deleted."""
         with self._lock:
             if segment.number in self._scenes:
-                self._scenes.move_to_end(segment.number)
+                self._cache(segment, self._scenes[segment.number])
                 return self._scenes[segment.number]
             found = next((each for each in self._segments if each.number == segment.number), None)
         if found is None or found.path is None:
@@ -142,6 +143,8 @@ class Past:
         self._scenes[segment.number] = scene
         self._scenes.move_to_end(segment.number)
         if self._spec.folder is None:
+            for number in [*self._scenes][: -self._spec.cached][-1:]:
+                self._scenes[number] = replace(self._scenes[number])  # without what was made to render it
             return
         on_disk = {each.number for each in self._segments if each.path is not None}
         for number in [each for each in self._scenes if each in on_disk][: -self._spec.cached]:

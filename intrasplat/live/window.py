@@ -94,6 +94,11 @@ class WindowPictures:
         )
         self._pictures = [[(eye.rgb[0], eye.tissue[0]) for eye in moment.clip.eyes] for moment in moments]
 
+    @property
+    def byte_count(self) -> int:
+        """Their bytes in memory."""
+        return sum(array.nbytes for moment in self._pictures for eye in moment for array in eye)
+
     def picture(self, eye: int, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """See TrainingPictures."""
         return self._pictures[frame][eye]

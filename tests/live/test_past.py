@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import shutil
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from intrasplat.live.state import FeedReason
 from intrasplat.live.times import LIVE, FeedTime, FeedTimeKind
 from intrasplat.live.window import ARRIVED_AT
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.view.renderer import _renderers, renderer_of
 from tests.intrasplat.scenes import random_scene
 from tests.live.conftest import until
 
@@ -158,6 +160,21 @@ def test_a_past_in_memory_is_bounded_by_bytes() -> None:
     assert [each.number for each in past.segments()] == [7, 8, 9]
     assert past.kept_bytes == 0
     assert len(past._scenes) == 3
+
+
+def test_a_past_in_memory_drops_what_was_made_to_render_it() -> None:
+    past = Past(PastSpec(keep_s=1000.0, cached=2))
+    for number in range(5):
+        past.add(scene(0.6 * number))
+    gc.collect()
+    before = len(_renderers)
+    for segment in past.segments():
+        shown = past.load(segment)
+        assert shown is not None
+        renderer_of(shown)
+    del shown
+    gc.collect()
+    assert len(_renderers) - before == 2
 
 
 def test_a_damaged_segment_is_left_out_and_the_nearest_one_is_shown(tmp_path: Path) -> None:
