@@ -113,7 +113,7 @@ async def end_feed(feed_id: str, response: Response, services: Services, caller:
     ended_at = utc_now()
     before = await _wish(services, caller, feed_id, FeedWish.END, AuditAction.FEED_ENDED)
     until_s = time.monotonic() + FOLLOWED_WITHIN_S
-    while await run_in_threadpool(services.queue.feed, feed_id) is not None:
+    while await run_in_threadpool(services.queue.tenant_of_feed, feed_id) is not None:
         if time.monotonic() > until_s:
             response.status_code = 202
             response.headers["Retry-After"] = str(RETRY_AFTER_S)

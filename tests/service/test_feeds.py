@@ -18,6 +18,7 @@ from contract.wire.feeds import FeedWish
 from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
 from intrasplat.live.state import FeedState
 from intrasplat.live.times import LIVE, FeedTime
+from tests.memory_queue import MemoryQueue
 from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
@@ -228,6 +229,28 @@ def test_files_that_are_left_are_not_denied(service: ServiceUnderTest) -> None:
     (service.store.data_dir / "feeds" / feed_id).mkdir(parents=True)
     receipt = service.http.delete(f"/feeds/{feed_id}").json()
     assert (receipt["record"], receipt["verified"]) == (True, False)
+
+
+def test_a_feed_whose_record_cannot_be_read_is_not_said_to_be_gone(
+    service: ServiceUnderTest, worker: FeedWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.feeds.FOLLOWED_WITHIN_S", 0.05)
+    worker.obeys = False
+    feed_id, queue = followed(service), service.queue
+    assert isinstance(queue, MemoryQueue)
+    wished = queue.wish_feed
+
+    def wish_and_spoil(feed_id: str, wish: FeedWish) -> None:
+        wished(feed_id, wish)
+        queue.stored_feeds.unreadable.add(feed_id)
+
+    monkeypatch.setattr(queue, "wish_feed", wish_and_spoil)
+    ended = service.http.delete(f"/feeds/{feed_id}")
+    assert (ended.status_code, ended.json()["record"], ended.json()["verified"]) == (202, False, False)
+    for method in ("GET", "DELETE"):
+        assert "cannot be read" in assert_problem(service.http.request(method, f"/feeds/{feed_id}"), 503)["detail"]
+    other = bearer(service, "ward-2", MAY_ALL)
+    assert_problem(service.http.request("DELETE", f"/feeds/{feed_id}", headers=other), 404, "feed_id")
 
 
 @pytest.mark.parametrize(
