@@ -13,6 +13,7 @@ import zmq
 from contract.queue.embedded import short_socket_path
 from contract.wire.rendering import CutRequest, PushRequest, RenderRequest, WorkerReply, WorkerRequest
 from intrasplat.errors import InputError
+from intrasplat.live.times import FeedTime
 from tests.answers import at_once
 from tests.worker.test_serve import answer, connected
 from worker.aside import MAX_WAITING, Aside
@@ -84,7 +85,7 @@ def test_a_push_is_refused_if_too_many_wait_and_an_error_ends_none_of_the_others
 
 
 def test_a_process_without_a_feed_refuses_pushes_and_cuts(endpoint: str) -> None:
-    cut = CutRequest(scene_id=FEED, from_s=1, to_s=2, export_id=secrets.token_hex(16))
+    cut = CutRequest(scene_id=FEED, begins=FeedTime.at(1), ends=FeedTime.at(2), export_id=secrets.token_hex(16))
     with RequestServer(endpoint, at_once(answer)), connected(endpoint) as socket:
         for message in (push(b"bytes"), [b"cut", WorkerRequest(request=cut).model_dump_json().encode()]):
             socket.send_multipart(message)
