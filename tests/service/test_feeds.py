@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -296,6 +297,27 @@ def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
     assert len(service.painter.requests) == 1
 
 
+def test_a_picture_that_has_not_changed_is_not_sent_again_and_not_logged(
+    service: ServiceUnderTest, worker: FeedWorker, caplog: pytest.LogCaptureFixture
+) -> None:
+    feed_id = followed(service)
+    path, query = f"/scenes/{feed_id}/recorded", {"t": "live", "masks": "off"}
+    caplog.set_level(logging.INFO, "intrasplat.access")
+    caplog.clear()
+    first = service.http.get(path, params=query)
+    assert (first.status_code, first.content) == (200, b"picture")
+    worker.newest_s += 1
+    again = service.http.get(path, params=query, headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert float(again.headers["x-intrasplat-source-s"]) == 61
+    assert again.headers["cache-control"] == "no-store"
+    other = service.http.get(path, params=query, headers={"If-None-Match": '"another"'})
+    assert (other.status_code, other.headers["etag"]) == (200, first.headers["etag"])
+    assert not caplog.records
+    service.http.get(path, params=query | {"t": "soon"})
+    assert len(caplog.records) == 1
+
+
 @pytest.mark.parametrize(
     ("path", "query"),
     [
@@ -372,8 +394,8 @@ def test_the_metrics_tell_of_feeds_without_their_labels(service: ServiceUnderTes
     text = service.http.get("/metrics").text
     for line in (
         'intrasplat_feeds{state="live"} 1.0',
-        f'intrasplat_feed_used_fps{{feed="{feed_id[:8]}"}} 5.0',
-        f'intrasplat_feed_dropped_total{{feed="{feed_id[:8]}"}} 7.0',
+        f'intrasplat_feed_used_fps{{feed="{feed_id}"}} 5.0',
+        f'intrasplat_feed_dropped_total{{feed="{feed_id}"}} 7.0',
         'intrasplat_workers{device="cpu",trains="yes"} 1.0',
     ):
         assert line in text
