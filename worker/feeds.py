@@ -132,7 +132,7 @@ class FeedHost:
             self._followed[record.feed_id] = _Followed(claim, record, None, ending=True)
             return
         logger.info("a feed is claimed", extra={"job_id": record.feed_id})
-        name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id[:8]}"
+        name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id}"
         try:
             folder = self._files.make(record.feed_id, record.created_at_s)
         except UnavailableError:

@@ -20,7 +20,7 @@ from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
 from intrasplat.live.source import Source
 from intrasplat.live.spec import SourceSpec
-from intrasplat.live.state import FeedReason, FeedReport, FeedState
+from intrasplat.live.state import FeedReason, FeedReport, FeedState, StateClock
 from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.live.tissue import TissueWatch
 from intrasplat.splat.backend import CPU, Device
@@ -98,7 +98,7 @@ class Feed:
         self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
         self._looking = threading.Lock()
         self._seen: FeedPair | None = None
-        self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())
+        self._state = StateClock(FeedState.CONNECTING)
 
     def __enter__(self) -> Self:
         return self
@@ -139,7 +139,7 @@ class Feed:
             state=state,
             reason=reason,
             text=text,
-            since=self._since(state, reason),
+            since=self._state.since(state, reason),
             recording=status.recording or self._past.problem,
             numbers=numbers,
             model=self._model.numbers(),
@@ -218,9 +218,3 @@ class Feed:
             self._watch.end()
         self._source.close()
         self._past.close()
-
-    def _since(self, state: FeedState, reason: FeedReason | None) -> float:
-        """The UNIX time, s, at which this state was found first."""
-        if self._state[:2] != (state, reason):
-            self._state = (state, reason, time.time())
-        return self._state[2]

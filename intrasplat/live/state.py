@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -56,6 +58,21 @@ class FeedReason(StrEnum):
     DISK_FAILS = "disk_fails"
     DISK_SLOW = "disk_slow"
     NOT_RECORDABLE = "not_recordable"
+
+
+class StateClock:
+    """When a state began. Any thread may call it."""
+
+    def __init__(self, state: FeedState) -> None:
+        self._lock = threading.Lock()
+        self._found: tuple[FeedState, FeedReason | None, float] = (state, None, time.time())
+
+    def since(self, state: FeedState, reason: FeedReason | None) -> float:
+        """The UNIX time, s, at which this state, which is that of now, was found first."""
+        with self._lock:
+            if self._found[:2] != (state, reason):
+                self._found = (state, reason, time.time())
+            return self._found[2]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.feed import Feed
 from intrasplat.live.follow import Follower
 from intrasplat.live.spec import SourceSpec
-from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.live.state import FeedReason, FeedState, StateClock
 from intrasplat.live.times import FeedTime
 from intrasplat.names import Detail
 from intrasplat.splat.metrics import psnr_tissue
@@ -210,3 +210,19 @@ def test_a_source_that_is_none_is_refused_and_leaves_nothing_behind(sender: Phan
     with pytest.raises(InputError):
         Feed(SourceSpec("ftp://nowhere"), sender.calibration, replace(FEED, segments=tmp_path))
     assert threading.active_count() == before
+
+
+def test_the_last_state_that_was_found_is_that_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, later = StateClock(FeedState.CONNECTING), list[threading.Thread]()
+
+    def interrupted() -> float:
+        if not later:  # another thread finds the next state while this one notes the first
+            later.append(threading.Thread(target=clock.since, args=(FeedState.STALLED, None)))
+            later[0].start()
+            later[0].join(0.1)
+        return 1.0
+
+    monkeypatch.setattr("intrasplat.live.state.time.time", interrupted)
+    clock.since(FeedState.LIVE, None)
+    later[0].join()
+    assert clock._found[0] is FeedState.STALLED

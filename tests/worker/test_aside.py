@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import threading
 import time
@@ -92,3 +93,24 @@ def test_a_process_without_a_feed_refuses_pushes_and_cuts(endpoint: str) -> None
             head = received(socket)[1]
             assert head.error is not None
             assert head.error.kind == "scene"
+
+
+def test_a_close_leaves_no_pipe_and_an_answer_that_comes_later_does_no_harm() -> None:
+    answering, go_on = threading.Event(), threading.Event()
+
+    def take(request: PushRequest, content: bytes) -> Reply:
+        answering.set()
+        assert go_on.wait(10)
+        return Reply(b"", "application/octet-stream", 0.0)
+
+    aside = Aside({PushRequest: take})
+    aside.take_in(b"caller", b"1", PushRequest(scene_id=FEED, push_id="1" * 32), b"")
+    assert answering.wait(10)
+    ends = aside.descriptor, aside._wake
+    aside.close()
+    for end in ends:
+        with pytest.raises(OSError, match="Bad file"):
+            os.fstat(end)
+    go_on.set()
+    assert aside._ready.get(timeout=10).caller == b"caller"
+    aside.close()

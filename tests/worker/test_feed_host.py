@@ -60,7 +60,7 @@ def test_a_feed_is_claimed_followed_announced_and_paused(started: Start) -> None
     hosted = started()
     record = hosted.open(feed_record(None))
     eventually(lambda: hosted.state(record.feed_id) == "live")
-    assert hosted.endpoint(record.feed_id).endswith("worker-1-feed-" + record.feed_id[:8] + ".sock")
+    assert hosted.endpoint(record.feed_id).endswith(f"worker-1-feed-{record.feed_id}.sock")
     address = hosted.queue.workers()[0]
     assert (address.feed_id, address.renders_only, address.job_id) == (record.feed_id, True, None)
     hosted.queue.wish_feed(record.feed_id, FeedWish.PAUSE)
