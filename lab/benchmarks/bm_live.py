@@ -18,9 +18,7 @@ import argparse
 import os
 import resource
 import signal
-import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -44,6 +42,7 @@ from intrasplat.splat.backend import Device, choose_device
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.view.render import render_frame
 from lab.benchmarks.bm_follow import Played, played_of
+from lab.benchmarks.send_stream import sending
 from lab.evaluate.rows import adding_alone, commit, machine, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, source_of
 
@@ -106,36 +105,9 @@ def encode(played: Played, path: Path) -> None:
         container.mux(stream.encode(None))
 
 
-def send(path: Path, fps: float, port: int) -> None:
-    """Serve the stream in a file again and again, in real time, to whoever connects."""
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        template = container.streams.video[0]
-        listener = socket.create_server(("127.0.0.1", port))
-        print(listener.getsockname()[1], flush=True)
-        while True:
-            connection, _ = listener.accept()
-            with suppress(OSError, av.error.FFmpegError), connection, connection.makefile("wb", buffering=0) as sink:
-                _send(packets, template, fps, sink)
-
-
-def _send(packets: Sequence[Any], template: Any, fps: float, sink: Any) -> None:
-    began_s, tick = time.monotonic(), Fraction(1, 90_000)
-    with av.open(sink, "w", format="mpegts", options={"flush_packets": "1"}) as container:
-        stream = container.add_stream_from_template(template)
-        for number in range(sys.maxsize):
-            packet = packets[number % len(packets)]
-            again: Any = av.Packet(bytes(packet))
-            again.pts = again.dts = round(number / fps / tick)
-            again.time_base, again.is_keyframe, again.stream = tick, packet.is_keyframe, stream
-            container.mux(again)
-            time.sleep(max(0.0, began_s + (number + 1) / fps - time.monotonic()))
-
-
 def followed(played: Played, stream: Path, options: argparse.Namespace, device: Device) -> dict[str, object]:
     """Follow the sent clip for some seconds; what was measured."""
-    command = [sys.executable, "-m", "lab.benchmarks.bm_live", "--send", str(stream), "--fps", str(options.fps)]
-    sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    sender = subprocess.Popen(sending(stream, options.fps), stdout=subprocess.PIPE, text=True)
     try:
         assert sender.stdout is not None
         url = f"tcp://127.0.0.1:{int(sender.stdout.readline())}"
@@ -244,12 +216,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kill", type=int, default=0)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu")
     parser.add_argument("--out", type=Path, default=Path("lab/rows/live.csv"))
-    parser.add_argument("--send", type=Path, help=argparse.SUPPRESS)
     return parser
 
 
 if __name__ == "__main__":
-    if (sent := _parser().parse_args()).send is not None:
-        send(sent.send, sent.fps, 0)
-    else:
-        main()
+    main()
