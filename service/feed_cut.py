@@ -28,7 +28,7 @@ from intrasplat.options import JobOptions, parse_options
 from service.bodies import CUT_BODY
 from service.deps import AnyCaller, Deps, Services, owned_feed
 from service.exports import next_part
-from service.moments import moment_of
+from service.moments import feed_time
 from service.problems import RETRY_AFTER_S, Problem, disk_full_for_upload
 from service.reconstruct import IdempotencyKey, accept_clip, forecast_of, hash_of, read_json
 from service.renders import problem_of_reply
@@ -119,7 +119,7 @@ def _range(given: GivenCut, feed: FeedRecord, most_s: float) -> tuple[FeedTime, 
 
 def _moment(field: str, asked: float | str) -> FeedTime:
     try:
-        return moment_of(asked)
+        return feed_time(asked)
     except InputError as error:
         raise InputError(field, error.problem, error.remedy) from None
 

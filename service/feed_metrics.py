@@ -21,7 +21,7 @@ GAUGES: dict[str, tuple[str, Callable[[FeedView], float | None]]] = {
         "From the arrival of a pair to its picture.",
         lambda feed: feed.decode_lag_s,
     ),
-    "intrasplat_feed_kept_bytes": ("Recording and past of the model on disk.", lambda feed: feed.kept_bytes),
+    "intrasplat_feed_stored_bytes": ("Recording and past of the model on disk.", lambda feed: feed.stored_bytes),
 }
 COUNTERS: dict[str, tuple[str, Callable[[FeedView], float]]] = {
     "intrasplat_feed_dropped": (

@@ -122,9 +122,9 @@ async def end_feed(feed_id: str, response: Response, services: Services, caller:
     services.feeds.forget(feed_id)
     is_gone = response.status_code != 202
     has_files = feed_id in await run_in_threadpool(services.feed_files.ids)
-    kept_bytes = before.report.kept_bytes if before.report else 0
+    stored_bytes = before.report.stored_bytes if before.report else 0
     return FeedReceipt(
-        feed_id=feed_id, ended_at=ended_at, bytes=kept_bytes, record=is_gone, verified=is_gone and not has_files
+        feed_id=feed_id, ended_at=ended_at, bytes=stored_bytes, record=is_gone, verified=is_gone and not has_files
     )
 
 

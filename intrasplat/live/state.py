@@ -122,7 +122,7 @@ class FeedNumbers:
     decode_lag_s   from the arrival of a packet to its decoded picture; None before the first
     reconnects     connections after the first
     last_frame_at  UNIX time, s, at which the newest packet came in; None before the first
-    kept_bytes     bytes of the recording on disk
+    stored_bytes     bytes of the recording on disk
     model_age_s    from the arrival of the newest pair that the model knows until now; None without a model
     """
 
@@ -132,7 +132,7 @@ class FeedNumbers:
     decode_lag_s: float | None
     reconnects: int
     last_frame_at: float | None
-    kept_bytes: int
+    stored_bytes: int
     model_age_s: float | None = None
 
 
@@ -164,7 +164,7 @@ class PastRange:
 
 
 @dataclass(frozen=True)
-class FeedReport:
+class LiveReport:
     """A feed and its model.
 
     state, reason, text, since, recording  as in FeedStatus, but of both; recording covers segments of the model, too

@@ -178,10 +178,10 @@ class Window:
         for slot in range(1, end - 1, MOTION_EVERY):
             camera, tissue = self.moments[slot].frames[0].camera, self.moments[slot].clip.tissue[0]
             own = self.model.render(camera, float(slot))[:3, tissue].copy()
-            kept = weights[slot].clone()
+            learnt = weights[slot].clone()
             weights[slot] = (weights[slot - 1] + weights[slot + 1]) / 2
             errors.append(float(np.square(255 * (self.model.render(camera, float(slot))[:3, tissue] - own)).mean()))
-            weights[slot] = kept
+            weights[slot] = learnt
         return BETWEEN * float(np.nanmean(errors)) if errors else 0.0
 
     def scene(self, end: int, seen: NDArray[np.float32], motion_error: float, *, seed: int = 0) -> TrainedScene:

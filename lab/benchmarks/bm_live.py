@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.spec import RecordingSpec, SourceSpec
-from intrasplat.live.state import FeedReport
+from intrasplat.live.state import LiveReport
 from intrasplat.splat.backend import Device, choose_device
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.view.render import render_frame
@@ -65,7 +65,7 @@ class Found:
     """What was seen: (seconds since the start, age in s) of each shown picture; reports; seconds until back."""
 
     shown: list[tuple[float, float]] = field(default_factory=list)
-    reports: list[tuple[float, FeedReport]] = field(default_factory=list)
+    reports: list[tuple[float, LiveReport]] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
     child_kib: int = 0
 
@@ -145,7 +145,7 @@ def _look(
     feed: Feed, found: Found, ended: threading.Event, began_s: float, views_hz: float, detail: Any, device: Device
 ) -> None:
     while not ended.wait(1 / views_hz if found.shown else 0.02):
-        view = feed.view_of()
+        view = feed.moment()
         if view is not None:
             render_frame(view.scene, view.t, device=device, detail=detail)
             found.shown.append((time.monotonic() - began_s, time.time() - view.captured_at))
@@ -156,7 +156,7 @@ def _killed(feed: Feed) -> float:
     killed_at = time.time()
     if (pid := _reading_pid(feed)) is not None:
         os.kill(pid, signal.SIGKILL)
-    while (view := feed.view_of()) is None or view.captured_at <= killed_at:
+    while (view := feed.moment()) is None or view.captured_at <= killed_at:
         time.sleep(0.02)
     return time.time() - killed_at
 
@@ -196,7 +196,7 @@ def _summary(found: Found, seconds: float) -> dict[str, object]:
         "decode_lag_s": median(each.numbers.decode_lag_s or 0.0 for each in reports),
         "rss_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         "child_mib": round(found.child_kib / 1024),
-        "disk_mb": last.numbers.kept_bytes / 1e6,
+        "disk_mb": last.numbers.stored_bytes / 1e6,
         "past_s": last.past.ends_s - last.past.begins_s,
         "behind_share": sum(each.state.value == "behind" for each in reports) / len(reports),
         "back_s": max(found.back_s) if found.back_s else None,

@@ -77,7 +77,7 @@ class FeedWorker:
             dropped=7,
             model_age_s=0.4,
             last_frame_at_s=ends_s,
-            kept_bytes=12345,
+            stored_bytes=12345,
             begins_s=BEGAN_S,
             ends_s=ends_s,
             source_begins_s=0.0,

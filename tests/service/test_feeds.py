@@ -88,7 +88,7 @@ def test_a_feed_shows_what_its_worker_says(service: ServiceUnderTest, worker: Fe
     feed_id = followed(service)
     wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
     feed = service.http.get(f"/feeds/{feed_id}").json()
-    assert (feed["received_fps"], feed["used_fps"], feed["dropped"], feed["kept_bytes"]) == (30.0, 5.0, 7, 12345)
+    assert (feed["received_fps"], feed["used_fps"], feed["dropped"], feed["stored_bytes"]) == (30.0, 5.0, 7, 12345)
     assert feed["model_age_s"] >= 0.4
     assert feed["links"]["video"] == f"/feeds/{feed_id}/video"
 

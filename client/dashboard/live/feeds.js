@@ -7,7 +7,7 @@ import { ServerEvents } from "../base/events.js";
  * A feed as the service shows it. Moments are UNIX times, s.
  * @typedef {{id: string, label: string | null, state: string, reason: string | null, text: string, since_s: number,
  *   recording: string | null, received_fps: number, used_fps: number, dropped: number, model_age_s: number | null,
- *   decode_lag_s: number | null, reconnects: number, last_frame_at_s: number | null, kept_bytes: number,
+ *   decode_lag_s: number | null, reconnects: number, last_frame_at_s: number | null, stored_bytes: number,
  *   begins_s: number | null, ends_s: number | null, gaussians: number, wish: string,
  *   options: {source: string | null, keep_s: number, layout: string}}} Feed
  */

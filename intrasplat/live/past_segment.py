@@ -40,7 +40,7 @@ LEAST_LOGIT = -10.0
 
 
 @dataclass(frozen=True, eq=False)
-class KeptSegment:
+class PastSegment:
     """A segment of the model.
 
     source_s, arrived_at  of its first and last frame: source times, and UNIX times, s
@@ -55,7 +55,7 @@ class KeptSegment:
     bytes: int = 0
 
     @classmethod
-    def of(cls, number: int, scene: TrainedScene) -> KeptSegment:
+    def of(cls, number: int, scene: TrainedScene) -> PastSegment:
         """The segment of a scene, in memory."""
         (first_s, last_s), (first_at, last_at) = (
             (float(times[0]), float(times[-1])) for times in (scene.frame_times_s, arrivals(scene))
@@ -63,7 +63,7 @@ class KeptSegment:
         return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count + _in_memory(scene.pictures))
 
     @classmethod
-    def at(cls, path: Path) -> KeptSegment | None:
+    def at(cls, path: Path) -> PastSegment | None:
         """The segment that a folder is; None if it is none."""
         match = NAME.fullmatch(path.name)
         if match is None or not path.is_dir():
@@ -78,7 +78,7 @@ class KeptSegment:
         times = "-".join(str(round(each * MICRO)) for each in (*self.source_s, *self.arrived_at))
         return f"{self.number:08d}-{times}"
 
-    def written(self, folder: Path, scene: TrainedScene) -> KeptSegment:
+    def written(self, folder: Path, scene: TrainedScene) -> PastSegment:
         """The segment on disk, in `folder`, when this returns.
 
         Raises:
