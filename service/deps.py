@@ -22,6 +22,7 @@ from contract.store.shelf import is_job_id
 from contract.store.store import Store
 from contract.wire.feeds import FeedRecord
 from contract.wire.job import JobRecord
+from intrasplat.errors import UnavailableError
 from service.access import Access, AccessRefusal, Caller, key_missing
 from service.audit import Audit
 from service.done import DoneJobs
@@ -139,10 +140,17 @@ def owned_scene(services: Deps, caller: Caller, scene_id: str) -> JobRecord:
 
 
 def owned_feed(services: Deps, caller: Caller, feed_id: str) -> FeedRecord:
-    """As owned_job(), for a live feed, as the queue has it now."""
+    """As owned_job(), for a live feed, as the queue has it now.
+
+    Raises:
+        UnavailableError: its record cannot be read.
+    """
     record = services.queue.feed(feed_id) if is_job_id(feed_id) else None
     if record is not None and caller.owns(record):
         return record
+    if record is None and is_job_id(feed_id) and services.queue.tenant_of_feed(feed_id) == caller.tenant:
+        problem = f"The record of feed {feed_id} cannot be read."
+        raise UnavailableError(problem, "Start service and worker from the same version, and ask again.")
     raise not_found(f"There is no feed {feed_id[:40]!r}.", "feed_id", "GET /feeds lists what there is.", caller, record)
 
 

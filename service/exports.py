@@ -28,7 +28,7 @@ from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.filenames import attachment
-from service.moments import AskedTime, moment_of, scene_time
+from service.moments import AskedTime, feed_time, scene_time
 from service.renders import image_response, problem_of_reply
 from service.scenes import file_stem, find_finished, finished_job
 from service.shown import Shown
@@ -137,7 +137,7 @@ def _request_of(shown: Shown, query: ExportQuery) -> ExportRequest:
     return ExportRequest(
         scene_id=shown.scene_id,
         attempt=shown.attempt or 0,
-        moment=moment_of(query.t) if shown.is_feed else None,
+        moment=feed_time(query.t) if shown.is_feed else None,
         format=query.format,
         options=check_export(query.format, given | {"t": asked}),
         export_id=uuid.uuid4().hex,

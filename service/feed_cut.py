@@ -23,12 +23,12 @@ from contract.wire.feeds import CutJob, CutRange, FeedRecord, GivenCut
 from contract.wire.labels import parse_labels
 from contract.wire.rendering import CutRequest
 from intrasplat.errors import InputError, LimitError, UnavailableError
-from intrasplat.live.times import LIVE, FeedTimeKind
+from intrasplat.live.times import LIVE, FeedTime, FeedTimeKind
 from intrasplat.options import JobOptions, parse_options
 from service.bodies import CUT_BODY
 from service.deps import AnyCaller, Deps, Services, owned_feed
 from service.exports import next_part
-from service.moments import moment_of
+from service.moments import feed_time
 from service.problems import RETRY_AFTER_S, Problem, disk_full_for_upload
 from service.reconstruct import IdempotencyKey, accept_clip, forecast_of, hash_of, read_json
 from service.renders import problem_of_reply
@@ -62,7 +62,7 @@ async def cut_feed(
     caller.require(KeyScope.RECONSTRUCT)
     feed = await run_in_threadpool(owned_feed, services, caller, feed_id)
     given = await read_json(request, services, GivenCut, MAX_BODY_BYTES, REMEDY)
-    from_s, to_s = _range(given, feed, services.settings.max_clip_s)
+    begins, ends = _range(given, feed, services.settings.max_clip_s)
     received = Received(
         options=json.dumps(_options(given, feed)),
         callback_url=given.callback_url,
@@ -74,7 +74,7 @@ async def cut_feed(
         try:
             outcome = f"ok (job {job_id})"
             await run_in_threadpool(services.audit.record, AuditAction.FEED_CUT, caller, feed_id, outcome)
-            asked = CutRequest(scene_id=feed_id, from_s=from_s, to_s=to_s, export_id=uuid.uuid4().hex)
+            asked = CutRequest(scene_id=feed_id, begins=begins, ends=ends, export_id=uuid.uuid4().hex)
             cut = await _fetch(services, asked, folder, received)
             await run_in_threadpool(_add, folder, feed, received)
             key = hash_of(idempotency_key)
@@ -97,28 +97,35 @@ def _options(given: GivenCut, feed: FeedRecord) -> dict[str, object]:
     return {**known, **given.options}
 
 
-def _range(given: GivenCut, feed: FeedRecord, most_s: float) -> tuple[float, float]:
-    """The UNIX times that a cut is to lie between.
+def _range(given: GivenCut, feed: FeedRecord, most_s: float) -> tuple[FeedTime, FeedTime]:
+    """The UNIX times, or the seconds of the source, that a cut is to lie between.
 
     Raises:
         InputError: they name no moments, or no range.
         LimitError: it is longer than a clip may be.
         Problem: 409: nothing was recorded yet.
     """
-    from_s, to_s = _at_s("from", given.from_, feed), _at_s("to", given.to, feed)
+    begins, ends = _moment("from", given.from_), _moment("to", given.to)
+    from_s, to_s = _at_s("from", begins, feed), _at_s("to", ends, feed)
     if not from_s < to_s:
         raise InputError("from", f"{given.from_!r} is not before {given.to!r}.", "Give an earlier moment.")
     if to_s - from_s > most_s + REPORTED_WITHIN_S:
         problem = f"the part lasts {to_s - from_s:.1f} s; a clip may last {most_s:g} s."
         raise LimitError("from", problem, "Ask for a shorter part.")
-    return from_s, to_s
+    # The worker knows seconds of the source exactly: on both sides of a jump arrivals differ from them by other times.
+    begins = begins if begins.kind is FeedTimeKind.SOURCE else FeedTime.at(from_s)
+    return begins, ends if ends.kind is FeedTimeKind.SOURCE else FeedTime.at(to_s)
 
 
-def _at_s(field: str, asked: float | str, feed: FeedRecord) -> float:
+def _moment(field: str, asked: float | str) -> FeedTime:
     try:
-        moment = moment_of(asked)
+        return feed_time(asked)
     except InputError as error:
         raise InputError(field, error.problem, error.remedy) from None
+
+
+def _at_s(field: str, moment: FeedTime, feed: FeedRecord) -> float:
+    """The UNIX time of a moment; of seconds of the source, as far from the newest moment as these are."""
     if moment.kind is FeedTimeKind.UNIX:
         return moment.seconds
     report = feed.report

@@ -1,4 +1,4 @@
-"""Figures of live feeds for Prometheus. The label `feed` is the beginning of its id, never what its caller calls it."""
+"""Figures of live feeds for Prometheus. The label `feed` is its id, never what its caller calls it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from contract.wire.feeds import FeedRecord, FeedView
 from intrasplat.live.state import FeedState
-
-ID_CHARACTERS = 8
 
 GAUGES: dict[str, tuple[str, Callable[[FeedView], float | None]]] = {
     "intrasplat_feed_received_fps": ("Pairs that come in a second.", lambda feed: feed.received_fps),
@@ -23,7 +21,7 @@ GAUGES: dict[str, tuple[str, Callable[[FeedView], float | None]]] = {
         "From the arrival of a pair to its picture.",
         lambda feed: feed.decode_lag_s,
     ),
-    "intrasplat_feed_kept_bytes": ("Recording and past of the model on disk.", lambda feed: feed.kept_bytes),
+    "intrasplat_feed_stored_bytes": ("Recording and past of the model on disk.", lambda feed: feed.stored_bytes),
 }
 COUNTERS: dict[str, tuple[str, Callable[[FeedView], float]]] = {
     "intrasplat_feed_dropped": (
@@ -44,16 +42,16 @@ def of_feeds(records: Sequence[FeedRecord], now_s: float) -> Iterator[Metric]:
     yield open_feeds
     is_in = GaugeMetricFamily("intrasplat_feed_state", "1: the feed is in this state.", labels=("feed", "state"))
     for feed in feeds:
-        is_in.add_metric((feed.id[:ID_CHARACTERS], feed.state.value), 1)
+        is_in.add_metric((feed.id, feed.state.value), 1)
     yield is_in
     for name, (about, gauge_of) in GAUGES.items():
         gauge = GaugeMetricFamily(name, about, labels=("feed",))
         for feed in feeds:
             if (value := gauge_of(feed)) is not None:
-                gauge.add_metric((feed.id[:ID_CHARACTERS],), value)
+                gauge.add_metric((feed.id,), value)
         yield gauge
     for name, (about, count_of) in COUNTERS.items():
         counter = CounterMetricFamily(name, about, labels=("feed",))
         for feed in feeds:
-            counter.add_metric((feed.id[:ID_CHARACTERS],), count_of(feed))
+            counter.add_metric((feed.id,), count_of(feed))
         yield counter

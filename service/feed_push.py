@@ -13,11 +13,12 @@ A sender with at most two pictures unanswered keeps the delay short. With keys, 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 
-from fastapi import APIRouter, Request, WebSocket
+from fastapi import APIRouter, Request, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -31,7 +32,7 @@ from service.access import Caller, key_missing
 from service.bodies import VIDEO_BODY
 from service.deps import AnyCaller, Deps, EarlyCaller, Services, address_of, owned_feed
 from service.problems import Problem, problem_of
-from service.pushing import Push
+from service.pushing import Push, SilentError, hand_on
 from service.sockets import FAULT, GONE, MALFORMED, NOT_ALLOWED, NOT_TEXT, Entrance, HangUpError, document_of
 
 router = APIRouter(prefix="/feeds", tags=["feeds"])
@@ -39,6 +40,7 @@ router = APIRouter(prefix="/feeds", tags=["feeds"])
 KEY_PERIOD_S = 2.0
 """How often the key of a push is checked again."""
 MAX_PICTURE_BYTES = 8 * 2**20
+GOING_AWAY = 1001
 FRAMING_REMEDY = "Send for each picture its time (float64), its length (uint32), both little-endian, and its bytes."
 
 
@@ -60,9 +62,12 @@ async def push_video(feed_id: str, request: Request, services: Services, caller:
     still = _StillAllowed(lambda: services.access.caller(request.headers, address) or _no_key(address))
     try:
         async with Push(services, feed_id, pictures=False) as push:
-            async for piece in services.intake.body(request):
+
+            async def take(piece: bytes) -> None:
                 still.check()
                 await push.send(piece)
+
+            await hand_on(services.intake.body(request), take)
     except ClientDisconnect:
         raise Problem(400, "The connection was closed.", field="body", remedy="Connect again.") from None
     return Pushed(bytes=push.bytes)
@@ -96,31 +101,38 @@ async def _take_pictures(services: Deps, feed_id: str, entrance: Entrance) -> No
         if message["type"] == "websocket.disconnect":
             return
         entrance.authorize(document_of(message.get("text") or ""))
+    silence_s = services.settings.upload_silence_s
     try:
         await run_in_threadpool(_begin, services, entrance.caller(), feed_id)
         async with Push(services, feed_id, pictures=True) as push:
-            still, pictures, taken = _StillAllowed(entrance.caller), PictureStream(), 0
-            while (piece := await _piece(entrance, services.settings.upload_silence_s)) is not None:
+            still, pictures, taken = _StillAllowed(entrance.caller), PictureStream(), itertools.count(1)
+
+            async def take(piece: bytes) -> None:
                 still.check()
                 for picture in pictures.add(piece):
                     await push.send(picture)
-                    taken += 1
-                    await entrance.send(json.dumps({"taken": taken}))
+                    await entrance.send(json.dumps({"taken": next(taken)}))
+
+            await hand_on(_pieces(entrance), take, silence_s)
+    except SilentError:
+        problem = Problem(408, f"Nothing came in {silence_s:g} s.", remedy="Connect again.")
+        raise HangUpError(NOT_ALLOWED, problem) from None
     except (Problem, UnavailableError) as error:
-        problem = problem_of(error)
-        assert problem is not None
-        raise HangUpError(NOT_ALLOWED if problem.status < 500 else FAULT, problem) from None
+        found = problem_of(error)
+        assert found is not None
+        raise HangUpError(NOT_ALLOWED if found.status < 500 else FAULT, found) from None
 
 
-async def _piece(entrance: Entrance, silence_s: float) -> bytes | None:
-    """The next binary message; None at the end of the connection."""
+async def _pieces(entrance: Entrance) -> AsyncGenerator[bytes]:
+    """The binary messages. Raises WebSocketDisconnect at the end of the connection."""
     while True:
-        message = await entrance.receive(silence_s)
+        message = await entrance.receive()
         if message["type"] == "websocket.disconnect":
-            return None
+            raise WebSocketDisconnect(message.get("code", GOING_AWAY))
         piece: bytes | None = message.get("bytes")
         if piece is not None:
-            return piece
+            yield piece
+            continue
         document = document_of(message.get("text") or "")
         if not entrance.is_key(document):
             raise HangUpError(NOT_TEXT, Problem(422, "A text message is no picture.", remedy=FRAMING_REMEDY))

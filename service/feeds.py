@@ -113,7 +113,7 @@ async def end_feed(feed_id: str, response: Response, services: Services, caller:
     ended_at = utc_now()
     before = await _wish(services, caller, feed_id, FeedWish.END, AuditAction.FEED_ENDED)
     until_s = time.monotonic() + FOLLOWED_WITHIN_S
-    while await run_in_threadpool(services.queue.feed, feed_id) is not None:
+    while await run_in_threadpool(services.queue.tenant_of_feed, feed_id) is not None:
         if time.monotonic() > until_s:
             response.status_code = 202
             response.headers["Retry-After"] = str(RETRY_AFTER_S)
@@ -122,9 +122,9 @@ async def end_feed(feed_id: str, response: Response, services: Services, caller:
     services.feeds.forget(feed_id)
     is_gone = response.status_code != 202
     has_files = feed_id in await run_in_threadpool(services.feed_files.ids)
-    kept_bytes = before.report.kept_bytes if before.report else 0
+    stored_bytes = before.report.stored_bytes if before.report else 0
     return FeedReceipt(
-        feed_id=feed_id, ended_at=ended_at, bytes=kept_bytes, record=is_gone, verified=is_gone and not has_files
+        feed_id=feed_id, ended_at=ended_at, bytes=stored_bytes, record=is_gone, verified=is_gone and not has_files
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -104,7 +104,7 @@ class Intake:
         slots = sum(slot.reserved_bytes for slot in self._slots if tenant in (None, slot.tenant))
         return slots + promised_bytes(self._store, tenant)
 
-    async def body(self, request: Request, slot: UploadSlot | None = None) -> AsyncIterator[bytes]:
+    async def body(self, request: Request, slot: UploadSlot | None = None) -> AsyncGenerator[bytes]:
         """The pieces of a request's body as they arrive.
 
         Raises:

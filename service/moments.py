@@ -48,7 +48,7 @@ def scene_time(asked: float | str | None) -> float:
     return asked
 
 
-def moment_of(asked: float | str | None) -> FeedTime:
+def feed_time(asked: float | str | None) -> FeedTime:
     """The moment of a feed that is asked for; the newest if none is.
 
     Raises:

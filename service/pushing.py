@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import time
 import uuid
+from collections.abc import AsyncGenerator, Callable, Coroutine
 from types import TracebackType
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
@@ -22,6 +24,39 @@ RETRY_S = 0.2
 END_TIMEOUT_S = 2.0
 MPEG_TS = 0x47
 """The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
+
+
+class SilentError(Exception):
+    """A sender sends nothing."""
+
+
+async def hand_on(
+    pieces: AsyncGenerator[bytes], take: Callable[[bytes], Coroutine[Any, Any, None]], silence_s: float | None = None
+) -> None:
+    """Let `take` have each piece in turn. The next one is waited for meanwhile, so that an error of `pieces`, as when
+    the caller has gone, ends a `take` that waits.
+
+    Raises:
+        SilentError: no piece came within silence_s after the last one was taken.
+    """
+    coming = asyncio.ensure_future(anext(pieces, None))
+    taking: asyncio.Future[None] | None = None
+    try:
+        while True:
+            if not (await asyncio.wait({coming}, timeout=silence_s))[0]:
+                raise SilentError
+            if (piece := coming.result()) is None:
+                return
+            coming, taking = asyncio.ensure_future(anext(pieces, None)), asyncio.ensure_future(take(piece))
+            await asyncio.wait({coming, taking}, return_when=asyncio.FIRST_COMPLETED)
+            if coming.done() and (error := coming.exception()) is not None:
+                raise error
+            await taking
+    finally:
+        unfinished = [each for each in (coming, taking) if each is not None]
+        for each in unfinished:
+            each.cancel()
+        await asyncio.gather(*unfinished, return_exceptions=True)
 
 
 class Push:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from contract.wire.rendering import RecordedRequest, WorkerReply
@@ -15,7 +16,7 @@ from service.bodies import BINARY
 from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.moments import AskedTime
-from service.renders import FEED_HEADERS, image_response
+from service.renders import FEED_HEADERS, image_response, matches
 from service.shown import find_shown
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
@@ -38,7 +39,8 @@ Masks = Annotated[
             "description": "the frame",
             "content": {"image/jpeg": BINARY, "image/png": BINARY},
             "headers": FEED_HEADERS,
-        }
+        },
+        304: {"description": "it is the one that the caller has"},
     },
 )
 async def get_recorded(
@@ -48,10 +50,12 @@ async def get_recorded(
     t: Annotated[AskedTime, Query()] = None,
     eye: OfEye = "left",
     masks: Masks = RecordedMasks.MARKED,
+    if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """The recorded frame nearest to t as the model's camera sees it; also while the job trains, and of a live feed.
 
-    X-Intrasplat-T is the frame's time. `recorded` of GET /scenes/{id} lists the frames that a finished scene keeps.
+    X-Intrasplat-T is the frame's time, and the ETag the picture's SHA-256. `recorded` of GET /scenes/{id} lists the
+    frames that a finished scene keeps.
     """
     shown = await find_shown(services, caller, scene_id, with_feeds=True)
     request = RecordedRequest(scene_id=scene_id, attempt=shown.attempt, **shown.time_fields(t), eye=eye, masks=masks)
@@ -61,6 +65,10 @@ async def get_recorded(
         answer = await run_in_threadpool(_as_stored, services, request, request.attempt)
     response = image_response(scene_id, answer)
     response.headers["Cache-Control"] = "no-store"
+    tag = response.headers["ETag"] = f'"{hashlib.sha256(answer.body).hexdigest()}"'
+    if matches(if_none_match, tag):
+        del response.headers["content-length"], response.headers["content-type"]
+        return Response(status_code=304, headers=response.headers)
     return response
 
 

@@ -28,8 +28,9 @@ REQUEST_ID = "X-Request-Id"
 ACCEPTED_REQUEST_ID = re.compile(r"[0-9a-fA-F-]{8,64}")
 """A caller's request id is used if it is a UUID or trace id. The id is logged, and words in it could name somebody."""
 
-QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Routes that machines poll every few seconds. They are logged only when their status changes from or to a failure."""
+QUIET_ROUTES = frozenset({"/healthz", "/readyz", "/metrics", "/scenes/{scene_id}/recorded"})
+"""Routes that machines and viewers of feeds poll. They are logged only when their status changes from or to a failure;
+the audit says who looked."""
 
 MAX_OPEN = 512
 """Maximum requests, event streams and WebSockets at a time. Each may occupy a connection for long."""

@@ -17,7 +17,7 @@ from service.access import AccessRefusal, Caller
 from service.deps import Deps, no_such_scene, owned_scene
 from service.filenames import stem_of
 from service.listing import SceneSearch
-from service.moments import moment_of, scene_time
+from service.moments import feed_time, scene_time
 from service.problems import Problem
 
 
@@ -42,7 +42,7 @@ class Shown:
         Raises:
             InputError: it is no time of a scene, or no moment of a feed.
         """
-        return {"t": 0.0, "moment": moment_of(asked)} if self.is_feed else {"t": scene_time(asked)}
+        return {"t": 0.0, "moment": feed_time(asked)} if self.is_feed else {"t": scene_time(asked)}
 
 
 async def find_shown(services: Deps, caller: Caller, scene: str | None, *, with_feeds: bool = False) -> Shown:

@@ -67,20 +67,17 @@ class Entrance:
         """Whether the client has shown who it is."""
         return self._caller is not None
 
-    async def receive(self, silence_s: float | None = None) -> Message:
+    async def receive(self) -> Message:
         """The client's next message.
 
         Raises:
-            HangUpError: its key does not come within AUTHORIZE_TIMEOUT_S, or later nothing within silence_s.
+            HangUpError: its key does not come within AUTHORIZE_TIMEOUT_S.
         """
         try:
-            async with asyncio.timeout(AUTHORIZE_TIMEOUT_S if self._caller is None else silence_s):
+            async with asyncio.timeout(AUTHORIZE_TIMEOUT_S if self._caller is None else None):
                 return await self._websocket.receive()
         except TimeoutError:
-            if self._caller is None:
-                raise HangUpError(NOT_ALLOWED, key_missing(self._address)) from None
-            problem = Problem(408, f"Nothing came in {silence_s:g} s.", remedy="Connect again.")
-            raise HangUpError(NOT_ALLOWED, problem) from None
+            raise HangUpError(NOT_ALLOWED, key_missing(self._address)) from None
 
     async def send(self, content: str | bytes) -> None:
         """Send a message. Raises one of GONE."""

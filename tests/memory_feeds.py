@@ -16,12 +16,15 @@ class MemoryFeeds:
         self._records: dict[str, FeedRecord] = {}
         self._lease_ends_s: dict[str, float] = {}
         self._left: set[tuple[FeedClaim, bool]] = set()
+        self.unreadable: set[str] = set()
+        """Feeds whose records cannot be read."""
 
     def open(self, record: FeedRecord, most: int, most_of_tenant: int) -> FeedRecord:
         if record.feed_id not in self._records:
             of_tenant = len(self.all(record.tenant))
             check_feeds(len(self._records), most, of_tenant, most_of_tenant)
             self._records[record.feed_id] = record
+            self._left = {each for each in self._left if each[0].feed_id != record.feed_id}
         return self._records[record.feed_id]
 
     def claim(self, owner: str, *, to_end: bool) -> FeedRecord | None:
@@ -67,8 +70,11 @@ class MemoryFeeds:
         return self.one(feed_id)
 
     def one(self, feed_id: str) -> FeedRecord | None:
-        record = self._records.get(feed_id)
+        record = None if feed_id in self.unreadable else self._records.get(feed_id)
         return record and record.model_copy(update={"owner": self._owner(record)})
+
+    def tenant(self, feed_id: str) -> str | None:
+        return self._records[feed_id].tenant if feed_id in self._records else None
 
     def all(self, tenant: str | None) -> list[FeedRecord]:
         found = [self.one(each) for each in self._records]

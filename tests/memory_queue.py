@@ -81,7 +81,7 @@ class MemoryQueue:
         """By tenant: the number of the last claim that gave it a new job."""
         self._workers: dict[str, tuple[WorkerAddress, float]] = {}
         self._deliveries = MemoryDeliveries()
-        self._feeds = MemoryFeeds(feed_lease_s)
+        self.stored_feeds = MemoryFeeds(feed_lease_s)
 
     def submit(self, record: JobRecord, admission: Admission | None = None) -> JobRecord:
         with self._changed:
@@ -253,35 +253,39 @@ class MemoryQueue:
 
     def open_feed(self, record: FeedRecord, most: int, most_of_tenant: int) -> FeedRecord:
         with self._changed:
-            return self._feeds.open(record, most, most_of_tenant)
+            return self.stored_feeds.open(record, most, most_of_tenant)
 
     def claim_feed(self, owner: str, *, to_end: bool = False) -> FeedRecord | None:
         with self._changed:
-            return self._feeds.claim(owner, to_end=to_end)
+            return self.stored_feeds.claim(owner, to_end=to_end)
 
     def beat_feed(self, claim: FeedClaim, report: FeedReport) -> FeedWish | None:
         with self._changed:
-            return self._feeds.beat(claim, report)
+            return self.stored_feeds.beat(claim, report)
 
     def release_feed(self, claim: FeedClaim) -> bool:
         with self._changed:
-            return self._feeds.leave(claim, has_ended=False)
+            return self.stored_feeds.leave(claim, has_ended=False)
 
     def forget_feed(self, claim: FeedClaim) -> bool:
         with self._changed:
-            return self._feeds.leave(claim, has_ended=True)
+            return self.stored_feeds.leave(claim, has_ended=True)
 
     def wish_feed(self, feed_id: str, wish: FeedWish) -> FeedRecord | None:
         with self._changed:
-            return self._feeds.wish(feed_id, wish)
+            return self.stored_feeds.wish(feed_id, wish)
 
     def feed(self, feed_id: str) -> FeedRecord | None:
         with self._changed:
-            return self._feeds.one(feed_id)
+            return self.stored_feeds.one(feed_id)
+
+    def tenant_of_feed(self, feed_id: str) -> str | None:
+        with self._changed:
+            return self.stored_feeds.tenant(feed_id)
 
     def feeds(self, tenant: str | None = None) -> list[FeedRecord]:
         with self._changed:
-            return self._feeds.all(tenant)
+            return self.stored_feeds.all(tenant)
 
     def announce(self, address: WorkerAddress) -> None:
         with self._changed:

@@ -52,6 +52,7 @@ class Aside:
         self.descriptor, self._wake = os.pipe()
         for end in (self.descriptor, self._wake):
             os.set_blocking(end, False)
+        self._waking, self._is_closed = threading.Lock(), False
         self._queues: dict[type, queue.SimpleQueue[_Waiting | None]] = {}
         for kind, answer in answers.items():
             self._queues[kind] = queue.SimpleQueue()
@@ -86,6 +87,11 @@ class Aside:
         """Answer nothing more; an answer in progress is not waited for."""
         for each in self._queues.values():
             each.put(None)
+        with self._waking:
+            if not self._is_closed:
+                self._is_closed = True
+                os.close(self.descriptor)
+                os.close(self._wake)
 
     def _run(self, waiting: queue.SimpleQueue[_Waiting | None], answer: Answer) -> None:
         while (next_one := waiting.get()) is not None:
@@ -96,5 +102,6 @@ class Aside:
                 outcome = error
             seconds = time.monotonic() - next_one.arrived_s
             self._ready.put(Done(next_one.caller, next_one.request_id, outcome, seconds))
-            with contextlib.suppress(BlockingIOError):
-                os.write(self._wake, b"\0")
+            with self._waking, contextlib.suppress(BlockingIOError):
+                if not self._is_closed:
+                    os.write(self._wake, b"\0")

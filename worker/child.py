@@ -20,6 +20,7 @@ from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
 from contract.wire.job import JobProgress
 from intrasplat.machine.hooks import ignore
 from worker.hang import HangDetector
+from worker.order_writer import OrderWriter
 from worker.orders import (
     Advanced,
     CachedScenes,
@@ -30,7 +31,6 @@ from worker.orders import (
     Scored,
     StopJob,
     Stopped,
-    line_of,
     read_report,
 )
 
@@ -72,6 +72,8 @@ class DeviceChild:
         self.ready: Ready | None = None
         self.scenes: tuple[str, ...] = ()
         self.is_nice = False
+        assert process.stdin is not None
+        self._orders = OrderWriter(process.stdin)
         self._reports: queue.SimpleQueue[JobReport] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, name="reports", daemon=True)
         self._reader.start()
@@ -83,11 +85,8 @@ class DeviceChild:
         return None if status is None else Ended(cause_of(status))
 
     def send(self, order: DeviceOrder) -> None:
-        """Give an order. If the child is dead, nothing happens; next_report() returns its end."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError, ValueError):
-            self.process.stdin.write(line_of(order))
-            self.process.stdin.flush()
+        """Give an order; do not wait until the child reads it. If it is dead, next_report() returns its end."""
+        self._orders.send(order)
 
     def next_report(self, timeout_s: float) -> JobReport | Ended | None:
         """The next report on the job; after the last one, the child's end. None if nothing comes within timeout_s."""
@@ -114,6 +113,7 @@ class DeviceChild:
                     self.scenes = report.scenes
                 else:
                     self._reports.put(report)
+        self._orders.end()
 
 
 def watch(

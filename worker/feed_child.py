@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import queue
 import subprocess
 import threading
 import time
@@ -17,7 +15,7 @@ from contract.wire.rendering import WorkerAddress
 from intrasplat.formats import missing_extras
 from intrasplat.live.state import FeedReason, FeedState
 from worker.feed_orders import FeedReady, FollowFeed, WishFeed, read_feed_message
-from worker.orders import Message, line_of
+from worker.order_writer import OrderWriter
 
 MAX_START_S = 240.0
 """Time to import torch and compile all kernels on a slow machine with an empty cache."""
@@ -37,28 +35,16 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class FeedProcess:
-    """One running process, and what it said last. Any thread may read it."""
+    """One running process, what it said last, and its orders. Any thread may use it."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
         self.ready: FeedReady | None = None
         self.report: FeedReport | None = None
         self.said_s = time.monotonic()
-        self._orders: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        assert process.stdin is not None
+        self.orders = OrderWriter(process.stdin)
         threading.Thread(target=self._read, name="feed-reports", daemon=True).start()
-        threading.Thread(target=self._write, name="feed-orders", daemon=True).start()
-
-    def send(self, order: Message) -> None:
-        """Give an order and do not wait until the process reads it; nothing happens if the process is dead."""
-        self._orders.put(order)
-
-    def _write(self) -> None:
-        """Write the orders: a first one that is larger than the pipe waits until the process has started."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError, ValueError):
-            while (order := self._orders.get()) is not None:
-                self.process.stdin.write(line_of(order))
-                self.process.stdin.flush()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -73,7 +59,7 @@ class FeedProcess:
                     self.ready = message
                 else:
                     self.report = message.report
-        self._orders.put(None)
+        self.orders.end()
 
 
 class FeedChild:
@@ -118,7 +104,7 @@ class FeedChild:
         if self._running is None or self._running.process is not process:
             self._running = FeedProcess(process)
             record = self._record.model_copy(update={"wish": self.wish})
-            self._running.send(FollowFeed(record=record, folder=self._folder, endpoints=self._endpoints))
+            self._running.orders.send(FollowFeed(record=record, folder=self._folder, endpoints=self._endpoints))
         if self._running.report is not None:
             self._last = self._running.report
         if (cause := self._hang()) is not None:
@@ -136,7 +122,7 @@ class FeedChild:
         """Let the process run or pause the feed."""
         self.wish = wish
         if self._running is not None:
-            self._running.send(WishFeed(wish=wish))
+            self._running.orders.send(WishFeed(wish=wish))
 
     def address(self, name: str) -> WorkerAddress | None:
         """Where the process answers; None while it does not."""

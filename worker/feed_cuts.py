@@ -13,6 +13,7 @@ from contract.wire.rendering import CutRequest
 from intrasplat.errors import InputError, SceneError
 from intrasplat.live.cut import FIELD, Cut
 from intrasplat.live.parts import Part
+from intrasplat.live.times import FeedTime, FeedTimeKind
 from worker.exports import OpenExports
 from worker.hosted_feed import HostedFeed
 from worker.reply import Reply
@@ -60,7 +61,7 @@ class FeedCuts:
     def _parts(self, request: CutRequest) -> Generator[bytes]:
         feed = self._hosted.feed
         path, recorded = self._folder / request.export_id, feed.recorded()
-        from_s, to_s = _source_times(recorded, request.from_s, request.to_s)
+        from_s, to_s = _source_times(recorded, request.begins, request.ends)
         making: Future[Cut] = self._makers.submit(feed.cut, from_s, to_s, path)
         try:
             while not wait([making], PATIENCE_S).done:
@@ -77,17 +78,27 @@ class FeedCuts:
             self._found.pop(request.export_id, None)
 
 
-def _source_times(recorded: Sequence[Part], from_at: float, to_at: float) -> tuple[float, float]:
-    """Source times of the recorded frames that arrived in [from_at, to_at], UNIX s."""
-    within = [each for each in recorded if each.last_arrived_at >= from_at and each.first_arrived_at <= to_at]
-    if not within or from_at >= to_at:
-        ends = (recorded[0].first_arrived_at, recorded[-1].last_arrived_at) if recorded else ()
-        there = " to ".join(time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(each)) for each in ends)
+def _source_times(recorded: Sequence[Part], begins: FeedTime, ends: FeedTime) -> tuple[float, float]:
+    """Source times of the recorded frames between two moments, each a UNIX time of arrival or one of the source."""
+    within = [each for each in recorded if begins.seconds <= _span(each, begins)[1]]
+    within = [each for each in within if ends.seconds >= _span(each, ends)[0]]
+    if not within:
+        arrived = (recorded[0].first_arrived_at, recorded[-1].last_arrived_at) if recorded else ()
+        there = " to ".join(time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(each)) for each in arrived)
         raise InputError(FIELD, "nothing of this range is recorded.", f"There is {there or 'nothing'}.")
-    first, last = within[0], within[-1]
-    from_s = first.from_s + max(0.0, from_at - first.first_arrived_at)
-    to_s = last.from_s + max(0.0, to_at - last.first_arrived_at)
-    return min(from_s, first.to_s), min(to_s, last.to_s)
+    return _source_s(within[0], begins), _source_s(within[-1], ends)
+
+
+def _span(part: Part, moment: FeedTime) -> tuple[float, float]:
+    """What a part covers, in the time of a moment."""
+    if moment.kind is FeedTimeKind.SOURCE:
+        return part.from_s, part.to_s
+    return part.first_arrived_at, part.last_arrived_at
+
+
+def _source_s(part: Part, moment: FeedTime) -> float:
+    """The source time of a moment in or beside a part."""
+    return min(part.from_s + max(0.0, moment.seconds - _span(part, moment)[0]), part.to_s)
 
 
 def _arrival(recorded: Sequence[Part], source_s: float) -> float:

@@ -62,7 +62,7 @@ class FeedViews:
                 return self._pictured(picture, request.eye)
             if self._hosted.state is FeedState.NO_TISSUE:
                 raise NotYetError("The endoscope shows no tissue.")
-        view = self._view(request)
+        view = self._moment(request)
         if isinstance(request, RenderRequest):
             reply = yield from self._rendered(view, request, level)
         else:
@@ -82,13 +82,13 @@ class FeedViews:
         self._exports.forget()
         self._drop_ended()
 
-    def _view(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedMoment:
+    def _moment(self, request: RenderRequest | ExportRequest | RecordedRequest | MeasureRequest) -> FeedMoment:
         """The moment that a request is for; that of an export stays that of its first part."""
         if isinstance(request, ExportRequest) and request.part > 0:
             if request.export_id not in self._exported:
                 raise SceneError(f"The export of feed {request.scene_id} has ended.")
             return self._exported[request.export_id]
-        view = self._hosted.feed.view_of(request.moment or LIVE)
+        view = self._hosted.feed.moment(request.moment or LIVE)
         if view is None:
             raise NotYetError("The feed shows nothing yet.")
         if isinstance(request, ExportRequest):

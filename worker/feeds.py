@@ -132,9 +132,9 @@ class FeedHost:
             self._followed[record.feed_id] = _Followed(claim, record, None, ending=True)
             return
         logger.info("a feed is claimed", extra={"job_id": record.feed_id})
-        name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id[:8]}"
+        name = f"{self._owner.rpartition('.')[0]}-feed-{record.feed_id}"
         try:
-            folder = self._files.make(record.feed_id)
+            folder = self._files.make(record.feed_id, record.created_at_s)
         except UnavailableError:
             self._queue.release_feed(claim)  # another worker's disk may take it
             raise
@@ -185,7 +185,7 @@ class FeedHost:
     def _tidy(self) -> None:
         """Delete files of feeds that are not in the queue any more."""
         for feed_id in self._files.ids():
-            if feed_id not in self._followed and self._queue.feed(feed_id) is None:
+            if feed_id not in self._followed and self._queue.tenant_of_feed(feed_id) is None:
                 self._files.remove(feed_id)
                 logger.info("the files of a feed that has ended are deleted", extra={"job_id": feed_id})
 

@@ -13,8 +13,7 @@ from intrasplat.errors import InputError
 from intrasplat.intake.calibration.text import parse_text, read_calibration
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.spec import FIELD, RecordingSpec, SourceSpec
-from intrasplat.live.state import FeedReason, FeedState
-from intrasplat.live.state import FeedReport as LiveReport
+from intrasplat.live.state import FeedReason, FeedState, LiveReport
 from intrasplat.splat.backend import CPU, Device
 from worker.reply import NotYetError
 
@@ -149,7 +148,7 @@ def _report_of(report: LiveReport) -> FeedReport:
         decode_lag_s=numbers.decode_lag_s,
         reconnects=numbers.reconnects,
         last_frame_at_s=numbers.last_frame_at,
-        kept_bytes=numbers.kept_bytes,
+        stored_bytes=numbers.stored_bytes,
         begins_s=None if past is None else past.begins_at,
         ends_s=None if past is None else past.ends_at,
         source_begins_s=None if past is None else past.begins_s,

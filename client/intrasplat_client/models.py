@@ -420,7 +420,7 @@ class FeedView(Model):
     """connections after the first"""
     last_frame_at_s: float | None = None
     """when the newest pair arrived"""
-    kept_bytes: int = 0
+    stored_bytes: int = 0
     """bytes of the recording and of the model's past on disk"""
     begins_s: float | None = None
     """the oldest moment that can be viewed; null: none yet"""

@@ -83,6 +83,10 @@ class Feeds(Protocol):
         """
         ...
 
+    def tenant_of_feed(self, feed_id: str) -> str | None:
+        """The tenant of the feed, also where its record cannot be read; None: there is no such feed."""
+        ...
+
     def feeds(self, tenant: str | None = None) -> list[FeedRecord]:
         """The feeds of one tenant or of all, newest first. Records that cannot be read are skipped."""
         ...

@@ -57,6 +57,11 @@ class RedisFeeds:
         found = self._feeds([feed_id])
         return found[0] if found else None
 
+    def tenant_of_feed(self, feed_id: str) -> str | None:
+        with reachable():
+            tenant: str | None = self._client.hget(f"{self._prefix}feed:{feed_id}", "tenant")
+        return tenant
+
     def feeds(self, tenant: str | None = None) -> list[FeedRecord]:
         index = f"{self._prefix}feeds" if tenant is None else f"{self._prefix}feeds:{tenant}"
         with reachable():

@@ -8,9 +8,11 @@ from pathlib import Path
 from contract.store.local import remove_tree
 from contract.store.shelf import is_job_id
 from intrasplat.files.disk_errors import disk_errors
-from intrasplat.files.durable import flush
+from intrasplat.files.durable import flush, replace_file
 
 FEEDS = "feeds"
+OPENED = "opened"
+"""A file in a feed's folder: when the feed was opened."""
 
 
 class FeedFiles:
@@ -30,10 +32,18 @@ class FeedFiles:
         return self._folder / feed_id
 
     @disk_errors()
-    def make(self, feed_id: str) -> Path:
-        """The folder of a feed, which exists from now on."""
+    def make(self, feed_id: str, created_at_s: float) -> Path:
+        """The folder of a feed that was opened at a UNIX time, which exists from now on.
+
+        What an earlier feed has left in it is removed: an Idempotency-Key that is used again gives the same id.
+        """
         folder = self.folder(feed_id)
+        opened, text = folder / OPENED, repr(created_at_s).encode()
+        if folder.exists() and not (opened.is_file() and opened.read_bytes() == text):
+            self.remove(feed_id)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not opened.exists():
+            replace_file(opened, text)
         return folder
 
     @disk_errors()

@@ -82,7 +82,7 @@ class FeedReport(BaseModel):
     decode_lag_s: float | None = Field(default=None, description="from the arrival of a pair to its picture")
     reconnects: int = Field(default=0, description="connections after the first")
     last_frame_at_s: float | None = Field(default=None, description="when the newest pair arrived")
-    kept_bytes: int = Field(default=0, description="bytes of the recording and of the model's past on disk")
+    stored_bytes: int = Field(default=0, description="bytes of the recording and of the model's past on disk")
     begins_s: float | None = Field(default=None, description="the oldest moment that can be viewed; null: none yet")
     ends_s: float | None = Field(default=None, description="the newest moment that can be viewed")
     source_begins_s: float | None = Field(default=None, description="begins_s in seconds of the source")

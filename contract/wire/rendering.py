@@ -161,16 +161,16 @@ class MeasureRequest(BaseModel):
 class CutRequest(BaseModel):
     """One part of the recording of a live feed as a video file, asked for one after the other while `more` follow.
 
-    from_s and to_s are UNIX times of the arrival of pairs. The file begins and ends at key frames. media_type is
-    video/mp4 or video/x-matroska. A first part without bytes says that the file is being made.
+    begins and ends are UNIX times of the arrival of pairs, or seconds of the source. The file begins and ends at key
+    frames. media_type is video/mp4 or video/x-matroska. A first part without bytes says that the file is being made.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["cut"] = "cut"
     scene_id: str = Field(pattern=JOB_ID_PATTERN)
-    from_s: float
-    to_s: float
+    begins: FeedTime
+    ends: FeedTime
     export_id: str = Field(pattern=r"^[0-9a-f]{32}$")
     """Chosen by the asker, the same for all parts."""
     part: int = Field(default=0, ge=0)

@@ -18,7 +18,7 @@ from intrasplat.errors import InputError, IntrasplatError
 
 if TYPE_CHECKING:
     from intrasplat.live.followed import LiveScene
-    from intrasplat.live.state import FeedReport
+    from intrasplat.live.state import LiveReport
 
 PERIOD_S = 1.0
 CUT = "cut.mp4"
@@ -86,7 +86,7 @@ def _print_reports(live: LiveScene, ended: threading.Event, seconds: float | Non
             break
 
 
-def line_of(report: FeedReport) -> str:
+def line_of(report: LiveReport) -> str:
     """A report as a line for people."""
     numbers, model, past = report.numbers, report.model, report.past
     parts = [report.state.value + (f" ({report.text})" if report.text else "")]
@@ -97,8 +97,8 @@ def line_of(report: FeedReport) -> str:
         parts.append(f"{model.width}x{model.height}, {model.gaussians} Gaussians, {model.pair_steps:.0f} steps a pair")
     if past is not None:
         parts.append(f"{past.ends_s - past.begins_s:.0f} s of past")
-    if numbers.kept_bytes:
-        parts.append(f"{numbers.kept_bytes / 1e6:.0f} MB kept")
+    if numbers.stored_bytes:
+        parts.append(f"{numbers.stored_bytes / 1e6:.0f} MB kept")
     if report.recording is not None:
         parts.append(f"not recorded: {report.recording.value}")
     return "  ".join(parts)

@@ -3,5 +3,5 @@
 `feed` joins them: `source` hands over the newest pair of a source that a confined process reads, and records it;
 `model` gives pairs that show tissue to the follower of `follow`; `past` keeps what that knew; `looking` finds times.
 
-Verbs: Feed.report, .view_of, .wait_for_newer, .cut, .pause, .resume, .close; followed.follow for users.
+Verbs: Feed.report, .moment, .wait_for_newer, .cut, .pause, .resume, .close; followed.follow for users.
 """

@@ -12,15 +12,15 @@ from typing import Literal, Self
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
-from intrasplat.live.kept import KeptSegment
-from intrasplat.live.looking import FeedMoment, find_view, range_of
+from intrasplat.live.looking import FeedMoment, find_moment, range_of
 from intrasplat.live.model import FeedModel
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.parts import Part
 from intrasplat.live.past import Past, PastSpec
+from intrasplat.live.past_segment import PastSegment
 from intrasplat.live.source import Source
 from intrasplat.live.spec import SourceSpec
-from intrasplat.live.state import FeedReason, FeedReport, FeedState
+from intrasplat.live.state import FeedReason, FeedState, LiveReport, StateClock
 from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.live.tissue import TissueWatch
 from intrasplat.splat.backend import CPU, Device
@@ -72,7 +72,7 @@ class Feed:
     Example:
         with Feed(SourceSpec("rtsp://camera.example.org/stereo"), calibration) as feed:
             newest_s = feed.wait_for_newer(-1.0, timeout_s=10.0)
-            shown = feed.view_of(FeedTime.before_live(2.0))
+            shown = feed.moment(FeedTime.before_live(2.0))
             view = render_frame(shown.scene, shown.t)
     """
 
@@ -98,7 +98,7 @@ class Feed:
         self._model = FeedModel(self._source, calibration, of_follower, self._past, device, budget_s, self._watch)
         self._looking = threading.Lock()
         self._seen: FeedPair | None = None
-        self._state: tuple[FeedState, FeedReason | None, float] = (FeedState.CONNECTING, None, time.time())
+        self._state = StateClock(FeedState.CONNECTING)
 
     def __enter__(self) -> Self:
         return self
@@ -108,7 +108,7 @@ class Feed:
     ) -> None:
         self.close()
 
-    def report(self) -> FeedReport:
+    def report(self) -> LiveReport:
         """State, numbers, model and past of now."""
         status, numbers, window = self._source.status, self._source.numbers(), self._model.span()
         past = range_of(window, self._past)
@@ -132,14 +132,14 @@ class Feed:
             numbers,
             used_fps=self._model.used_fps(),
             dropped=numbers.dropped + self._model.left_out,
-            kept_bytes=numbers.kept_bytes + self._past.kept_bytes,
+            stored_bytes=numbers.stored_bytes + self._past.stored_bytes,
             model_age_s=age_s,
         )
-        return FeedReport(
+        return LiveReport(
             state=state,
             reason=reason,
             text=text,
-            since=self._since(state, reason),
+            since=self._state.since(state, reason),
             recording=status.recording or self._past.problem,
             numbers=numbers,
             model=self._model.numbers(),
@@ -147,13 +147,13 @@ class Feed:
             segment=self._source.segment,
         )
 
-    def view_of(self, when: FeedTime = LIVE) -> FeedMoment | None:
+    def moment(self, when: FeedTime = LIVE) -> FeedMoment | None:
         """The moment of a time, to be rendered; None: nothing is known yet.
 
         Raises:
             InputError: the time lies before the past that is stored; its field is "t".
         """
-        return find_view(when, self._model.scene(), self._past, self.settings.max_age_s)
+        return find_moment(when, self._model.scene(), self._past, self.settings.max_age_s)
 
     def picture(self) -> FeedPair | None:
         """The newest pair that came in, whether or not the model learns it. None: there is none since this feed was
@@ -179,7 +179,7 @@ class Feed:
             with self._model.changed:
                 self._model.changed.wait(min(left_s, 0.1))
 
-    def segments(self) -> tuple[KeptSegment, ...]:
+    def segments(self) -> tuple[PastSegment, ...]:
         """The past's segments, oldest first."""
         return self._past.segments()
 
@@ -219,9 +219,3 @@ class Feed:
             self._watch.end()
         self._source.close()
         self._past.close()
-
-    def _since(self, state: FeedState, reason: FeedReason | None) -> float:
-        """The UNIX time, s, at which this state was found first."""
-        if self._state[:2] != (state, reason):
-            self._state = (state, reason, time.time())
-        return self._state[2]

@@ -94,7 +94,7 @@ class FollowSettings:
     first_steps      steps for the first pair, if steps are given
     opening          steps in which the rates fall to those that they keep
     camera           whether the endoscope moves; "fixed": its motion counts as the tissue's
-    keep_s           seconds of the past that are kept as segments
+    keep_s           seconds of the past that are segments
     seed             of the order of frames
     """
 
@@ -312,9 +312,9 @@ class Follower:
     def _keep(self, segment: TrainedScene) -> None:
         """Add a segment, and forget those before keep_s."""
         self._on_segment(segment)
-        kept = [*self.segments, segment]
+        all_of_them = [*self.segments, segment]
         begins_s = segment.frame_times_s[-1] - self.settings.keep_s
-        self.segments = tuple(each for each in kept if each.frame_times_s[-1] >= begins_s)
+        self.segments = tuple(each for each in all_of_them if each.frame_times_s[-1] >= begins_s)
 
     def _rehearse(self, reading: Future[_Ready | Added]) -> None:
         """Train frames of the window: half the steps given or, if None, until the pair is read."""

@@ -17,7 +17,7 @@ from intrasplat.live.cut import Cut
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.looking import FeedMoment
 from intrasplat.live.spec import FeedLayout, RecordingSpec, SourceSpec
-from intrasplat.live.state import FeedReport
+from intrasplat.live.state import LiveReport
 from intrasplat.live.times import FeedTime
 from intrasplat.names import DeviceName
 from intrasplat.reconstruction import AnyPose, lens_of, world_from_camera_of
@@ -47,7 +47,7 @@ class LiveScene:
     ) -> None:
         self.close()
 
-    def report(self) -> FeedReport:
+    def report(self) -> LiveReport:
         """State with reason, rates, the model's age and size, and what can be looked at."""
         return self.feed.report()
 
@@ -57,7 +57,7 @@ class LiveScene:
 
     def moment(self, t: str | float = "live") -> FeedMoment:
         """The moment of a time, with its age and source time; raises as view()."""
-        found = self.feed.view_of(FeedTime.parse(t))
+        found = self.feed.moment(FeedTime.parse(t))
         if found is None:
             raise InputError("t", "nothing is known yet.", "Wait until wait() answers True.")
         return found

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from intrasplat.errors import InputError
-from intrasplat.live.kept import KeptSegment, arrivals
 from intrasplat.live.past import Past
+from intrasplat.live.past_segment import PastSegment, arrivals
 from intrasplat.live.state import PastRange
 from intrasplat.live.times import FIELD, LIVE, FeedTime, FeedTimeKind
 from intrasplat.notices import Notice, NoticeCode
@@ -48,7 +48,7 @@ class FeedMoment:
     notices: tuple[Notice, ...] = ()
 
 
-def range_of(window: KeptSegment | None, past: Past) -> PastRange | None:
+def range_of(window: PastSegment | None, past: Past) -> PastRange | None:
     """What can be looked at; None: nothing. window: what the newest frames cover."""
     spans = _spans(window, past)
     if not spans:
@@ -57,13 +57,13 @@ def range_of(window: KeptSegment | None, past: Past) -> PastRange | None:
     return PastRange(first.source_s[0], last.source_s[1], first.arrived_at[0], last.arrived_at[1])
 
 
-def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedMoment | None:
-    """The view of a time; None: nothing is known yet.
+def find_moment(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedMoment | None:
+    """The moment of a time; None: nothing is known yet.
 
     Raises:
         InputError: the time lies before the past that is stored.
     """
-    newest = None if window is None else KeptSegment.of(WINDOW, window)
+    newest = None if window is None else PastSegment.of(WINDOW, window)
     while spans := _spans(newest, past):
         newest_s = spans[-1].source_s[1]
         axis: Axis = "arrived_at" if asked.kind is FeedTimeKind.UNIX else "source_s"
@@ -76,11 +76,11 @@ def find_view(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_
         chosen = _chosen(spans, axis, wanted)
         scene = window if chosen is newest else past.load(chosen)
         if scene is not None:
-            return _view(asked, scene, axis, wanted, newest_s, max_age_s)
+            return _moment(asked, scene, axis, wanted, newest_s, max_age_s)
     return None
 
 
-def _spans(window: KeptSegment | None, past: Past) -> list[KeptSegment]:
+def _spans(window: PastSegment | None, past: Past) -> list[PastSegment]:
     """What each scene covers, oldest first."""
     spans = [*past.segments()]
     if window is not None and (not spans or spans[-1].source_s[1] < window.source_s[1]):
@@ -88,7 +88,7 @@ def _spans(window: KeptSegment | None, past: Past) -> list[KeptSegment]:
     return spans
 
 
-def _chosen(spans: list[KeptSegment], axis: Axis, wanted: float) -> KeptSegment:
+def _chosen(spans: list[PastSegment], axis: Axis, wanted: float) -> PastSegment:
     """The newest span that begins before a time, or the next one if that is nearer."""
     before = max((i for i, span in enumerate(spans) if getattr(span, axis)[0] <= wanted), default=0)
     after = min(before + 1, len(spans) - 1)
@@ -96,7 +96,7 @@ def _chosen(spans: list[KeptSegment], axis: Axis, wanted: float) -> KeptSegment:
     return spans[after] if wanted > ends and begins - wanted < wanted - ends else spans[before]
 
 
-def _view(
+def _moment(
     asked: FeedTime, scene: TrainedScene, axis: Axis, wanted: float, newest_s: float, max_age_s: float
 ) -> FeedMoment:
     times = {"source_s": np.asarray(scene.frame_times_s), "arrived_at": arrivals(scene)}
@@ -120,7 +120,7 @@ def _side(shown: float, wanted: float) -> str:
     return "before" if shown < wanted else "after"
 
 
-def _too_early(asked: FeedTime, spans: list[KeptSegment]) -> InputError:
+def _too_early(asked: FeedTime, spans: list[PastSegment]) -> InputError:
     first, last = spans[0], spans[-1]
     problem = "it lies before the past that is stored."
     if asked.kind is FeedTimeKind.UNIX:

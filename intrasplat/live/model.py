@@ -16,10 +16,10 @@ from statistics import median
 from intrasplat.errors import InputError
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.follow import MIN_STEPS, Added, Follower, FollowSettings
-from intrasplat.live.kept import KeptSegment
 from intrasplat.live.looking import WINDOW
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past import Past
+from intrasplat.live.past_segment import PastSegment
 from intrasplat.live.source import Source
 from intrasplat.live.state import FeedReason, FeedState, ModelNumbers
 from intrasplat.live.tissue import TissueWatch, has_colours_of_tissue, is_near
@@ -117,14 +117,14 @@ class FeedModel:
         found = None if follower is None else follower.scene_at()
         return None if found is None else found[0]
 
-    def span(self) -> KeptSegment | None:
+    def span(self) -> PastSegment | None:
         """What the scene of the newest frames covers."""
         follower = self._follower
         found = None if follower is None else follower.span
         if found is None:
             return None
         first, newest = found
-        return KeptSegment(WINDOW, (first.source_s, newest.source_s), (first.arrived_at, newest.arrived_at))
+        return PastSegment(WINDOW, (first.source_s, newest.source_s), (first.arrived_at, newest.arrived_at))
 
     def used_fps(self) -> float:
         """Pairs that were learnt a second, over the last seconds."""

@@ -93,7 +93,7 @@ class Parts:
         self._clear_incoming(is_all=True)
 
     @property
-    def kept_bytes(self) -> int:
+    def stored_bytes(self) -> int:
         """Bytes of all parts."""
         with self._lock:
             return sum(each.bytes for each in self._parts)

@@ -12,12 +12,12 @@ import shutil
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from intrasplat.errors import SceneError
 from intrasplat.files.disk_errors import DISK_FULL_ERRNOS
-from intrasplat.live.kept import KeptSegment
+from intrasplat.live.past_segment import PastSegment
 from intrasplat.live.state import FeedReason
 from intrasplat.scene.scene import TrainedScene
 
@@ -37,7 +37,8 @@ class PastSpec:
     keep_s       a segment is deleted this long after its last frame came in
     max_bytes    of all segments: the oldest ones go first
     spare_bytes  segments are written only while more is free: the recording goes on for longer
-    cached       segments in memory beside those on disk: the last ones that were added or looked at
+    cached       segments in memory beside those on disk, or that keep their renderers: the last ones that were added or
+                 looked at
     """
 
     folder: Path | None = None
@@ -58,14 +59,14 @@ class Past:
         self._spec = spec
         self.problem: FeedReason | None = None
         self._lock = threading.Lock()
-        self._segments: list[KeptSegment] = []
+        self._segments: list[PastSegment] = []
         self._scenes: OrderedDict[int, TrainedScene] = OrderedDict()
-        self._queue: queue.SimpleQueue[tuple[KeptSegment, TrainedScene] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[PastSegment, TrainedScene] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         if spec.folder is not None:
             spec.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             for path in sorted(spec.folder.iterdir()):
-                if (segment := KeptSegment.at(path)) is not None:
+                if (segment := PastSegment.at(path)) is not None:
                     self._segments.append(segment)
                 else:
                     shutil.rmtree(path, ignore_errors=True)  # of a run that ended while it wrote
@@ -75,12 +76,12 @@ class Past:
         self.prune()
 
     @property
-    def kept_bytes(self) -> int:
+    def stored_bytes(self) -> int:
         """Bytes of all segments on disk."""
         with self._lock:
             return sum(each.bytes for each in self._segments if each.path is not None)
 
-    def segments(self) -> tuple[KeptSegment, ...]:
+    def segments(self) -> tuple[PastSegment, ...]:
         """All segments, oldest first."""
         with self._lock:
             return tuple(self._segments)
@@ -88,7 +89,7 @@ class Past:
     def add(self, scene: TrainedScene) -> None:
         """Keep a scene of the model as the newest segment."""
         with self._lock:
-            segment = KeptSegment.of(self._number, scene)
+            segment = PastSegment.of(self._number, scene)
             self._number += 1
             self._segments.append(segment)
             self._cache(segment, scene)
@@ -100,11 +101,11 @@ class Past:
                 self.problem = FeedReason.DISK_SLOW
         self._queue.put((segment, scene))
 
-    def load(self, segment: KeptSegment) -> TrainedScene | None:
+    def load(self, segment: PastSegment) -> TrainedScene | None:
         """The segment's scene; None: it is gone meanwhile, or damaged, and is deleted."""
         with self._lock:
             if segment.number in self._scenes:
-                self._scenes.move_to_end(segment.number)
+                self._cache(segment, self._scenes[segment.number])
                 return self._scenes[segment.number]
             found = next((each for each in self._segments if each.number == segment.number), None)
         if found is None or found.path is None:
@@ -137,11 +138,13 @@ class Past:
             self._queue.put(None)
             self._thread.join(CLOSE_S)
 
-    def _cache(self, segment: KeptSegment, scene: TrainedScene) -> None:
+    def _cache(self, segment: PastSegment, scene: TrainedScene) -> None:
         """Keep a scene in memory, and drop those that are on disk and were not looked at for long."""
         self._scenes[segment.number] = scene
         self._scenes.move_to_end(segment.number)
         if self._spec.folder is None:
+            for number in [*self._scenes][: -self._spec.cached][-1:]:
+                self._scenes[number] = replace(self._scenes[number])  # without what was made to render it
             return
         on_disk = {each.number for each in self._segments if each.path is not None}
         for number in [each for each in self._scenes if each in on_disk][: -self._spec.cached]:
@@ -151,7 +154,7 @@ class Past:
             self._segments = [each for each in self._segments if each.number != number]
             del self._scenes[number]
 
-    def _forget(self, segments: list[KeptSegment]) -> None:
+    def _forget(self, segments: list[PastSegment]) -> None:
         numbers = {each.number for each in segments}
         with self._lock:
             gone = [each for each in self._segments if each.number in numbers]
@@ -169,7 +172,7 @@ class Past:
                 continue  # it was forgotten meanwhile
             self.problem = self._written(segment, scene)
 
-    def _written(self, segment: KeptSegment, scene: TrainedScene) -> FeedReason | None:
+    def _written(self, segment: PastSegment, scene: TrainedScene) -> FeedReason | None:
         """Write a segment; why it is not on disk, if it is not."""
         folder = self._spec.folder
         assert folder is not None
@@ -183,9 +186,9 @@ class Past:
             logger.exception("a segment of a feed cannot be stored")
             return FeedReason.FAULT
         with self._lock:
-            kept = [written if each.number == segment.number else each for each in self._segments]
+            updated = [written if each.number == segment.number else each for each in self._segments]
             if segment.number in {each.number for each in self._segments}:
-                self._segments = kept
+                self._segments = updated
                 return None
         shutil.rmtree(written.path or folder / written.name, ignore_errors=True)  # it was forgotten meanwhile
         return None

@@ -13,7 +13,7 @@ from intrasplat.errors import UnavailableError
 POLL_S = 0.1
 
 
-class Push:
+class PushPipe:
     """One caller's way to the process that reads. A push begins with its first bytes.
 
     is_wanted  whether somebody pushes and no process reads yet

@@ -17,7 +17,7 @@ from intrasplat.live.cut import Cut, cut_parts
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.parts import Keeps, Part, Parts
 from intrasplat.live.process import HandedOver, Numbers, ReadingProcess
-from intrasplat.live.push import Push
+from intrasplat.live.push import PushPipe
 from intrasplat.live.spec import FIELD, PICTURE_HEADER, SourceKind, SourceSpec
 from intrasplat.live.state import FeedNumbers, FeedReason, FeedState, FeedStatus, Segment
 
@@ -71,7 +71,7 @@ class Source:
         self._segment: Segment | None = None
         self._window: deque[tuple[float, int, int]] = deque()
         is_pushed = self._target.kind in PUSHED
-        self._push = Push(self._changed, lambda: self._is_deaf) if is_pushed else None
+        self._push = PushPipe(self._changed, lambda: self._is_deaf) if is_pushed else None
         self._thread = threading.Thread(target=self._run, name="live-source", daemon=True)
         self._thread.start()
 
@@ -107,7 +107,7 @@ class Source:
                 decode_lag_s=newest.lag_s if newest.place else None,
                 reconnects=self._reconnects,
                 last_frame_at=newest.last_at,
-                kept_bytes=self.parts.kept_bytes if self.parts else 0,
+                stored_bytes=self.parts.stored_bytes if self.parts else 0,
             )
 
     def newest(self, after_sequence: int = 0, timeout_s: float = 1.0) -> FeedPair | None:

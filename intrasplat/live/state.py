@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -58,6 +60,21 @@ class FeedReason(StrEnum):
     NOT_RECORDABLE = "not_recordable"
 
 
+class StateClock:
+    """When a state began. Any thread may call it."""
+
+    def __init__(self, state: FeedState) -> None:
+        self._lock = threading.Lock()
+        self._found: tuple[FeedState, FeedReason | None, float] = (state, None, time.time())
+
+    def since(self, state: FeedState, reason: FeedReason | None) -> float:
+        """The UNIX time, s, at which this state, which is that of now, was found first."""
+        with self._lock:
+            if self._found[:2] != (state, reason):
+                self._found = (state, reason, time.time())
+            return self._found[2]
+
+
 @dataclass(frozen=True)
 class FeedStatus:
     """The state of a source.
@@ -105,7 +122,7 @@ class FeedNumbers:
     decode_lag_s   from the arrival of a packet to its decoded picture; None before the first
     reconnects     connections after the first
     last_frame_at  UNIX time, s, at which the newest packet came in; None before the first
-    kept_bytes     bytes of the recording on disk
+    stored_bytes     bytes of the recording on disk
     model_age_s    from the arrival of the newest pair that the model knows until now; None without a model
     """
 
@@ -115,7 +132,7 @@ class FeedNumbers:
     decode_lag_s: float | None
     reconnects: int
     last_frame_at: float | None
-    kept_bytes: int
+    stored_bytes: int
     model_age_s: float | None = None
 
 
@@ -147,7 +164,7 @@ class PastRange:
 
 
 @dataclass(frozen=True)
-class FeedReport:
+class LiveReport:
     """A feed and its model.
 
     state, reason, text, since, recording  as in FeedStatus, but of both; recording covers segments of the model, too

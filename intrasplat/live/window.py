@@ -94,6 +94,11 @@ class WindowPictures:
         )
         self._pictures = [[(eye.rgb[0], eye.tissue[0]) for eye in moment.clip.eyes] for moment in moments]
 
+    @property
+    def byte_count(self) -> int:
+        """Their bytes in memory."""
+        return sum(array.nbytes for moment in self._pictures for eye in moment for array in eye)
+
     def picture(self, eye: int, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """See TrainingPictures."""
         return self._pictures[frame][eye]
@@ -173,10 +178,10 @@ class Window:
         for slot in range(1, end - 1, MOTION_EVERY):
             camera, tissue = self.moments[slot].frames[0].camera, self.moments[slot].clip.tissue[0]
             own = self.model.render(camera, float(slot))[:3, tissue].copy()
-            kept = weights[slot].clone()
+            learnt = weights[slot].clone()
             weights[slot] = (weights[slot - 1] + weights[slot + 1]) / 2
             errors.append(float(np.square(255 * (self.model.render(camera, float(slot))[:3, tissue] - own)).mean()))
-            weights[slot] = kept
+            weights[slot] = learnt
         return BETWEEN * float(np.nanmean(errors)) if errors else 0.0
 
     def scene(self, end: int, seen: NDArray[np.float32], motion_error: float, *, seed: int = 0) -> TrainedScene:

@@ -18,7 +18,6 @@ import argparse
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -39,11 +38,12 @@ from numpy.typing import NDArray
 
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.spec import RecordingSpec, SourceSpec
-from intrasplat.live.state import FeedReport
+from intrasplat.live.state import LiveReport
 from intrasplat.splat.backend import Device, choose_device
 from intrasplat.splat.cpu import compile_kernels
 from intrasplat.view.render import render_frame
 from lab.benchmarks.bm_follow import Played, played_of
+from lab.benchmarks.send_stream import sending
 from lab.evaluate.rows import adding_alone, commit, machine, read_rows, replace_row, texts_of
 from lab.evaluate.sources import DATA_VARIABLE, source_of
 
@@ -70,7 +70,7 @@ class Found:
     """What was seen: (seconds since the start, age in s) of each shown picture; reports; seconds until back."""
 
     shown: list[tuple[float, float]] = field(default_factory=list)
-    reports: list[tuple[float, FeedReport]] = field(default_factory=list)
+    reports: list[tuple[float, LiveReport]] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
     child_kib: int = 0
 
@@ -140,36 +140,9 @@ def encode(played: Played, path: Path) -> None:
         container.mux(stream.encode(None))
 
 
-def send(path: Path, fps: float, port: int) -> None:
-    """Serve the stream in a file again and again, in real time, to whoever connects."""
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        template = container.streams.video[0]
-        listener = socket.create_server(("127.0.0.1", port))
-        print(listener.getsockname()[1], flush=True)
-        while True:
-            connection, _ = listener.accept()
-            with suppress(OSError, av.error.FFmpegError), connection, connection.makefile("wb", buffering=0) as sink:
-                _send(packets, template, fps, sink)
-
-
-def _send(packets: Sequence[Any], template: Any, fps: float, sink: Any) -> None:
-    began_s, tick = time.monotonic(), Fraction(1, 90_000)
-    with av.open(sink, "w", format="mpegts", options={"flush_packets": "1"}) as container:
-        stream = container.add_stream_from_template(template)
-        for number in range(sys.maxsize):
-            packet = packets[number % len(packets)]
-            again: Any = av.Packet(bytes(packet))
-            again.pts = again.dts = round(number / fps / tick)
-            again.time_base, again.is_keyframe, again.stream = tick, packet.is_keyframe, stream
-            container.mux(again)
-            time.sleep(max(0.0, began_s + (number + 1) / fps - time.monotonic()))
-
-
 def followed(played: Played, stream: Path, options: argparse.Namespace, device: Device) -> dict[str, object]:
     """Follow the sent clip for some seconds; what was measured."""
-    command = [sys.executable, "-m", "lab.benchmarks.bm_live", "--send", str(stream), "--fps", str(options.fps)]
-    sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    sender = subprocess.Popen(sending(stream, options.fps), stdout=subprocess.PIPE, text=True)
     try:
         assert sender.stdout is not None
         url = f"tcp://127.0.0.1:{int(sender.stdout.readline())}"
@@ -207,7 +180,7 @@ def _look(
     feed: Feed, found: Found, ended: threading.Event, began_s: float, views_hz: float, detail: Any, device: Device
 ) -> None:
     while not ended.wait(1 / views_hz if found.shown else 0.02):
-        view = feed.view_of()
+        view = feed.moment()
         if view is not None:
             render_frame(view.scene, view.t, device=device, detail=detail)
             found.shown.append((time.monotonic() - began_s, time.time() - view.captured_at))
@@ -218,7 +191,7 @@ def _killed(feed: Feed) -> float:
     killed_at = time.time()
     if (pid := _reading_pid(feed)) is not None:
         os.kill(pid, signal.SIGKILL)
-    while (view := feed.view_of()) is None or view.captured_at <= killed_at:
+    while (view := feed.moment()) is None or view.captured_at <= killed_at:
         time.sleep(0.02)
     return time.time() - killed_at
 
@@ -258,7 +231,7 @@ def _summary(found: Found, seconds: float) -> dict[str, object]:
         "decode_lag_s": median(each.numbers.decode_lag_s or 0.0 for each in reports),
         "rss_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         "child_mib": round(found.child_kib / 1024),
-        "disk_mb": last.numbers.kept_bytes / 1e6,
+        "disk_mb": last.numbers.stored_bytes / 1e6,
         "past_s": last.past.ends_s - last.past.begins_s,
         "behind_share": sum(each.state.value == "behind" for each in reports) / len(reports),
         "back_s": max(found.back_s) if found.back_s else None,
@@ -279,12 +252,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--feeds", type=int, default=1)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu")
     parser.add_argument("--out", type=Path, default=Path("lab/rows/live.csv"))
-    parser.add_argument("--send", type=Path, help=argparse.SUPPRESS)
     return parser
 
 
 if __name__ == "__main__":
-    if (sent := _parser().parse_args()).send is not None:
-        send(sent.send, sent.fps, 0)
-    else:
-        main()
+    main()

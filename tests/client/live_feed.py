@@ -113,7 +113,7 @@ class LivePainter(FeedWorker):
             decode_lag_s=PICTURE_LAG_S,
             reconnects=2,
             last_frame_at_s=arrived_s,
-            kept_bytes=12_300_000,
+            stored_bytes=12_300_000,
             begins_s=self.began_s if self.has_model else None,
             ends_s=model_s if self.has_model else None,
             source_begins_s=0.0 if self.has_model else None,

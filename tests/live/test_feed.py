@@ -15,7 +15,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.feed import Feed
 from intrasplat.live.follow import Follower
 from intrasplat.live.spec import SourceSpec
-from intrasplat.live.state import FeedReason, FeedState
+from intrasplat.live.state import FeedReason, FeedState, StateClock
 from intrasplat.live.times import FeedTime
 from intrasplat.names import Detail
 from intrasplat.splat.metrics import psnr_tissue
@@ -30,10 +30,10 @@ OFF: Detail = "off"
 def test_a_feed_becomes_live_and_shows_the_newest_moment(followed: Follow, sender: PhantomSender) -> None:
     feed = followed()
     assert feed.report().state is FeedState.CONNECTING
-    assert feed.view_of() is None
+    assert feed.moment() is None
     until(lambda: feed.report().state is FeedState.LIVE, feed.report)
     until_known(feed, 1.0)
-    report, view = feed.report(), feed.view_of()
+    report, view = feed.report(), feed.moment()
     assert view is not None
     assert view.is_live
     assert not view.is_stale
@@ -53,7 +53,7 @@ def test_the_newest_picture_is_that_of_the_source_and_counts_as_no_used_one(foll
     before = feed.report().numbers
     pictures, late_s = [], []
     for _ in range(20):
-        picture, view = feed.picture(), feed.view_of()
+        picture, view = feed.picture(), feed.moment()
         assert picture is not None
         assert view is not None
         late_s.append(picture.arrived_at - view.captured_at)
@@ -88,12 +88,12 @@ def test_every_way_to_name_a_moment_shows_the_same_one(followed: Follow) -> None
     feed = followed(replace(FEED, keep_s=60.0))
     until_known(feed, 2.5)
     feed.pause()
-    live = feed.view_of()
+    live = feed.moment()
     assert live is not None
-    ago = feed.view_of(FeedTime.before_live(1.2))
+    ago = feed.moment(FeedTime.before_live(1.2))
     assert ago is not None
     for same in (FeedTime.of_source(live.source_s - 1.2), FeedTime.at(ago.captured_at)):
-        shown = feed.view_of(same)
+        shown = feed.moment(same)
         assert shown is not None
         assert shown.source_s == pytest.approx(ago.source_s, abs=0.02)
         assert not shown.is_live
@@ -101,9 +101,9 @@ def test_every_way_to_name_a_moment_shows_the_same_one(followed: Follow) -> None
     assert ago.source_s == pytest.approx(live.source_s - 1.2, abs=0.02)
     assert ago.captured_at == pytest.approx(live.captured_at - 1.2, abs=0.2)
     with pytest.raises(InputError) as refused:
-        feed.view_of(FeedTime.before_live(100.0))
+        feed.moment(FeedTime.before_live(100.0))
     assert refused.value.field == "t"
-    later = feed.view_of(FeedTime.of_source(live.source_s + 30.0))
+    later = feed.moment(FeedTime.of_source(live.source_s + 30.0))
     assert later is not None
     assert later.source_s == live.source_s
     assert [each.code for each in later.notices] == ["time_in_gap"]
@@ -114,7 +114,7 @@ def test_a_feed_that_is_away_keeps_its_last_model_which_grows_old(followed: Foll
     until_known(feed, 0.5)
     feed.pause()
     time.sleep(1.6)
-    report, view = feed.report(), feed.view_of()
+    report, view = feed.report(), feed.moment()
     assert (report.state, report.reason) == (FeedState.PAUSED, FeedReason.BY_HAND)
     assert view is not None
     assert view.is_stale
@@ -125,7 +125,7 @@ def test_a_feed_that_is_away_keeps_its_last_model_which_grows_old(followed: Foll
     newer_s = feed.wait_for_newer(known_s, 15.0)
     assert newer_s is not None
     until(lambda: feed.report().state in (FeedState.LIVE, FeedState.BEHIND), feed.report)
-    gap = feed.view_of(FeedTime.of_source(known_s + 0.4))
+    gap = feed.moment(FeedTime.of_source(known_s + 0.4))
     assert gap is not None
     assert [each.code for each in gap.notices] == ["time_in_gap"]
     assert gap.source_s == pytest.approx(known_s, abs=0.01) or gap.source_s >= newer_s - 0.5
@@ -151,7 +151,7 @@ def test_a_fault_of_the_follower_is_a_state_and_another_one_begins(
     monkeypatch.setattr(Follower, "add", fail)
     until(lambda: feed.report().reason is FeedReason.FAULT, feed.report)
     assert feed.report().state is FeedState.STALLED
-    known = feed.view_of()
+    known = feed.moment()
     assert known is not None
     monkeypatch.setattr(Follower, "add", add)
     assert feed.wait_for_newer(known.source_s, 15.0) is not None
@@ -170,7 +170,7 @@ def test_the_past_is_there_again_after_a_restart(followed: Follow, tmp_path: Pat
     assert there is not None
     assert (there.begins_s, there.ends_s) == pytest.approx((before.begins_s, before.ends_s), abs=1e-4)
     assert there.ends_at == pytest.approx(before.ends_at, abs=1e-3)
-    old, new = (each.view_of(FeedTime.of_source(before.begins_s + 0.3)) for each in (feed, again))
+    old, new = (each.moment(FeedTime.of_source(before.begins_s + 0.3)) for each in (feed, again))
     assert old is not None
     assert new is not None
     for detail, most in ((OFF, 0.0), (ON, 2.0)):  # recorded pictures are coded again
@@ -181,7 +181,7 @@ def test_the_past_is_there_again_after_a_restart(followed: Follow, tmp_path: Pat
     after = again.report().past
     assert after is not None
     assert after.ends_s - before.ends_s == pytest.approx(after.ends_at - before.ends_at, abs=0.5)
-    assert again.report().numbers.kept_bytes > 1000
+    assert again.report().numbers.stored_bytes > 1000
 
 
 def test_a_pushed_stream_is_followed(sender: PhantomSender) -> None:
@@ -210,3 +210,19 @@ def test_a_source_that_is_none_is_refused_and_leaves_nothing_behind(sender: Phan
     with pytest.raises(InputError):
         Feed(SourceSpec("ftp://nowhere"), sender.calibration, replace(FEED, segments=tmp_path))
     assert threading.active_count() == before
+
+
+def test_the_last_state_that_was_found_is_that_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, later = StateClock(FeedState.CONNECTING), list[threading.Thread]()
+
+    def interrupted() -> float:
+        if not later:  # another thread finds the next state while this one notes the first
+            later.append(threading.Thread(target=clock.since, args=(FeedState.STALLED, None)))
+            later[0].start()
+            later[0].join(0.1)
+        return 1.0
+
+    monkeypatch.setattr("intrasplat.live.state.time.time", interrupted)
+    clock.since(FeedState.LIVE, None)
+    later[0].join()
+    assert clock._found[0] is FeedState.STALLED

@@ -15,6 +15,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.eyes import EyesSettings
 from intrasplat.live.follow import Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
+from intrasplat.live.past_segment import PastSegment
 from intrasplat.scene.scene import TrainedScene, check
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.render import render_frame
@@ -92,6 +93,8 @@ def test_a_segment_does_not_change_and_can_be_stored() -> None:
     for number in range(7):
         follower.add(_pair(phantom, number))
     check(segments[0])
+    pictures = len(segments[0].frame_times_s) * 2 * 4 * HEIGHT * WIDTH  # of both eyes: R G B, and where tissue is
+    assert PastSegment.of(0, segments[0]).bytes == segments[0].byte_count + pictures
     before = render_frame(segments[0], 0.25).rgb
     for number in range(7, 13):
         follower.add(_pair(phantom, number))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import shutil
 import signal
 import subprocess
@@ -16,14 +17,15 @@ import numpy as np
 import pytest
 
 from intrasplat.errors import InputError
-from intrasplat.live.kept import WRITING, KeptSegment
-from intrasplat.live.looking import find_view, range_of
+from intrasplat.live.looking import find_moment, range_of
 from intrasplat.live.model import chosen_width
 from intrasplat.live.past import MAX_WAITING, Past, PastSpec
+from intrasplat.live.past_segment import WRITING, PastSegment
 from intrasplat.live.state import FeedReason
 from intrasplat.live.times import LIVE, FeedTime, FeedTimeKind
 from intrasplat.live.window import ARRIVED_AT
 from intrasplat.scene.scene import TrainedScene
+from intrasplat.view.renderer import _renderers, renderer_of
 from tests.intrasplat.scenes import random_scene
 from tests.live.conftest import until
 
@@ -82,7 +84,7 @@ def test_a_moment_is_looked_up_in_segments_gaps_and_the_window() -> None:
     window = scene(5.6, frames=6)
 
     def at(when: FeedTime) -> tuple[float, int]:
-        view = find_view(when, window, past, 1.0)
+        view = find_moment(when, window, past, 1.0)
         assert view is not None
         assert view.captured_at == pytest.approx(NOW - 20.0 + view.source_s, abs=1e-4)
         return view.source_s, len(view.notices)
@@ -103,7 +105,7 @@ def test_between_frames_that_are_far_apart_the_nearer_one_is_shown() -> None:
     past = Past(PastSpec(keep_s=1000.0))
     past.add(scene(0.0, step_s=4.0))
     for wanted_s, shown_s in ((1.5, 0.0), (2.5, 4.0)):
-        view = find_view(FeedTime.of_source(wanted_s), None, past, 1.0)
+        view = find_moment(FeedTime.of_source(wanted_s), None, past, 1.0)
         assert view is not None
         assert view.source_s == pytest.approx(shown_s)
         assert view.t * 4 == pytest.approx(round(view.t * 4))
@@ -113,7 +115,7 @@ def test_between_frames_that_are_far_apart_the_nearer_one_is_shown() -> None:
 def test_nothing_is_known_at_first() -> None:
     past = Past(PastSpec())
     assert range_of(None, past) is None
-    assert find_view(LIVE, None, past, 1.0) is None
+    assert find_moment(LIVE, None, past, 1.0) is None
 
 
 def test_segments_are_stored_and_loaded_when_they_are_looked_at(tmp_path: Path) -> None:
@@ -128,7 +130,7 @@ def test_segments_are_stored_and_loaded_when_they_are_looked_at(tmp_path: Path) 
     assert loaded is not None
     assert np.allclose(loaded.frame_times_s, scene(0.0).frame_times_s)
     past.close()
-    assert past.kept_bytes == sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+    assert past.stored_bytes == sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     again = Past(PastSpec(tmp_path, keep_s=1000.0))
     assert np.allclose([each.source_s for each in again.segments()], [each.source_s for each in past.segments()])
     again.close()
@@ -139,7 +141,7 @@ def test_old_and_too_many_segments_are_deleted(tmp_path: Path) -> None:
     for number in range(4):
         past.add(scene(0.6 * number))
     past.close()
-    size = past.kept_bytes // 4
+    size = past.stored_bytes // 4
     fewer = Past(PastSpec(tmp_path, keep_s=1000.0, max_bytes=2 * size + size // 2))
     assert [round(each.source_s[0], 1) for each in fewer.segments()] == [1.2, 1.8]
     fewer.close()
@@ -156,8 +158,23 @@ def test_a_past_in_memory_is_bounded_by_bytes() -> None:
         past.add(scene(0.6 * number))
         past.prune()
     assert [each.number for each in past.segments()] == [7, 8, 9]
-    assert past.kept_bytes == 0
+    assert past.stored_bytes == 0
     assert len(past._scenes) == 3
+
+
+def test_a_past_in_memory_drops_what_was_made_to_render_it() -> None:
+    past = Past(PastSpec(keep_s=1000.0, cached=2))
+    for number in range(5):
+        past.add(scene(0.6 * number))
+    gc.collect()
+    before = len(_renderers)
+    for segment in past.segments():
+        shown = past.load(segment)
+        assert shown is not None
+        renderer_of(shown)
+    del shown
+    gc.collect()
+    assert len(_renderers) - before == 2
 
 
 def test_a_damaged_segment_is_left_out_and_the_nearest_one_is_shown(tmp_path: Path) -> None:
@@ -169,7 +186,7 @@ def test_a_damaged_segment_is_left_out_and_the_nearest_one_is_shown(tmp_path: Pa
     damaged = again.segments()[1].path
     assert damaged is not None
     (damaged / "scene.safetensors").write_bytes(b"no")
-    view = find_view(FeedTime.of_source(5.2), None, again, 1.0)
+    view = find_moment(FeedTime.of_source(5.2), None, again, 1.0)
     assert view is not None
     assert view.source_s == pytest.approx(0.6)
     assert len(again.segments()) == 2
@@ -199,7 +216,7 @@ def test_a_disk_that_refuses_leaves_no_draft(tmp_path: Path, monkeypatch: pytest
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr("intrasplat.live.kept.move_folder", refuse)
+    monkeypatch.setattr("intrasplat.live.past_segment.move_folder", refuse)
     past.add(scene(0.0))
     until(lambda: past.problem is FeedReason.DISK_FULL)
     past.close()
@@ -209,11 +226,11 @@ def test_a_disk_that_refuses_leaves_no_draft(tmp_path: Path, monkeypatch: pytest
 WRITER = """
 import itertools, sys
 from pathlib import Path
-from intrasplat.live.kept import KeptSegment
+from intrasplat.live.past_segment import PastSegment
 from tests.live.test_past import scene
 for number in itertools.count():
     segment = scene(0.6 * number)
-    KeptSegment.of(number, segment).written(Path(sys.argv[1]), segment)
+    PastSegment.of(number, segment).written(Path(sys.argv[1]), segment)
     print(number, flush=True)
 """
 
@@ -234,7 +251,7 @@ def test_after_a_kill_every_segment_that_was_acknowledged_is_there(tmp_path: Pat
 
 def test_a_name_that_is_none_is_no_segment(tmp_path: Path) -> None:
     (tmp_path / "00000001-0-600000").mkdir()
-    assert KeptSegment.at(tmp_path / "00000001-0-600000") is None
+    assert PastSegment.at(tmp_path / "00000001-0-600000") is None
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def test_the_index_is_in_order_and_found_again(source: Source, recording: Record
     for part, following in pairwise(index):
         assert part.from_s <= part.to_s < following.from_s
         assert part.first_arrived_at <= part.last_arrived_at <= time.time()
-    assert source.numbers().kept_bytes == sum(part.path.stat().st_size for part in index)
+    assert source.numbers().stored_bytes == sum(part.path.stat().st_size for part in index)
     source.close()
     assert Parts(recording).index() == index
     assert remove_all(recording) == sum(part.bytes for part in index)
@@ -151,7 +151,7 @@ def test_old_parts_go_unless_a_cut_reads_them(tmp_path: Path) -> None:
         assert [part.number for part in parts.index()] == [0, 3, 4, 5]
     parts.prune()
     assert [part.number for part in parts.index()] == [3, 4, 5]
-    assert parts.kept_bytes == 3000
+    assert parts.stored_bytes == 3000
     few = Parts(RecordingSpec(tmp_path, keep_s=10.0, max_bytes=2500))
     few.prune()
     assert [part.number for part in few.index()] == [4, 5]

@@ -104,7 +104,7 @@ def test_nothing_is_kept_of_what_the_endoscope_sees_outside(
     until(lambda: feed._source.index(), feed.report)
     sender.cover = _both(OUTSIDE["a person"])
     until(lambda: feed.report().state is FeedState.NO_TISSUE, feed.report)
-    view, range_before = feed.view_of(), feed.report().past
+    view, range_before = feed.moment(), feed.report().past
     assert view is not None
     assert range_before is not None
     tissue_until_s = view.source_s
@@ -120,7 +120,7 @@ def test_nothing_is_kept_of_what_the_endoscope_sees_outside(
         each for each in feed._source.index() if each.from_s < newer_s - 0.2 and each.to_s > tissue_until_s + 0.2
     ]
     assert outside == []
-    between = feed.view_of(FeedTime.of_source((tissue_until_s + newer_s) / 2))
+    between = feed.moment(FeedTime.of_source((tissue_until_s + newer_s) / 2))
     assert between is not None
     assert [each.code for each in between.notices] == ["time_in_gap"]
     assert not any(tissue_until_s + 0.01 < time_s < newer_s - 0.3 for time_s in _times(feed.segments()))

@@ -77,7 +77,7 @@ class FeedWorker:
             dropped=7,
             model_age_s=0.4,
             last_frame_at_s=ends_s,
-            kept_bytes=12345,
+            stored_bytes=12345,
             begins_s=BEGAN_S,
             ends_s=ends_s,
             source_begins_s=0.0,
@@ -146,7 +146,7 @@ class FeedWorker:
                 raise UnavailableError("The push was cut off.", "Begin it anew.")
             self.pushed[request.push_id] = self.pushed.get(request.push_id, b"") + content
             return Reply(b"", "application/octet-stream", 0.0)
-        if request.from_s < BEGAN_S:
+        if request.begins.kind is FeedTimeKind.UNIX and request.begins.seconds < BEGAN_S:
             raise InputError("from", "This is not recorded.", "Give a later moment.")
         if request.part == 0:
             return Reply(b"", "video/mp4", 0.0, more=True)  # it is being made

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from contract.wire.rendering import CutRequest
+from intrasplat.live.times import FeedTime, FeedTimeKind
 from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
 from tests.service.test_feeds import RECTIFIED, actions, followed
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, running_service
@@ -36,7 +37,7 @@ def test_a_cut_becomes_a_job_with_the_calibration(service: ServiceUnderTest, wor
     assert (job["state"], job["label"], job["options"]["layout"]) == ("queued", "the bleeding", "sbs")
     assert job["cut"] == {"from_s": BEGAN_S + 30, "to_s": BEGAN_S + 60, "frames": 900, "is_whole": True}
     requests = [each for each in worker.asked if isinstance(each, CutRequest)]
-    assert {(each.from_s, each.to_s) for each in requests} == {(BEGAN_S + 30, BEGAN_S + 60)}
+    assert {(each.begins, each.ends) for each in requests} == {(FeedTime.at(BEGAN_S + 30), FeedTime.at(BEGAN_S + 60))}
     assert [each.part for each in requests] == [0, 1, 2]
     folder = service.store.spool_folder(job["id"])
     assert (folder / "clip.mp4").read_bytes() == CLIP
@@ -49,9 +50,10 @@ def test_a_cut_until_live_ends_with_the_newest_pairs(service: ServiceUnderTest, 
     wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
     response = service.http.post(f"/feeds/{feed_id}/cut", json={"from": 20})
     assert response.status_code == 202, response.text
-    (asked,) = {(each.from_s, each.to_s) for each in worker.asked if isinstance(each, CutRequest)}
-    assert asked[0] == BEGAN_S + 20
-    assert 60 <= asked[1] - BEGAN_S < 65
+    (asked,) = {(each.begins, each.ends) for each in worker.asked if isinstance(each, CutRequest)}
+    assert asked[0] == FeedTime.of_source(20)  # which its worker finds where the clock has jumped, too
+    assert asked[1].kind is FeedTimeKind.UNIX
+    assert 60 <= asked[1].seconds - BEGAN_S < 65
 
 
 @pytest.mark.parametrize(

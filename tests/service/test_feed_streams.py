@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import struct
 import threading
 import time
@@ -117,6 +118,23 @@ def test_a_push_ends_with_its_reason(service: LiveService, worker: FeedWorker) -
 
     response = httpx.put(f"{service.url}/feeds/{feed_id}/video", content=body(), timeout=TIMEOUT_S)
     assert (response.status_code, response.json()["field"]) == (409, "push")
+
+
+def test_a_push_that_waits_for_a_worker_ends_with_its_caller(service: LiveService) -> None:
+    feed_id = opened(service)
+
+    def pushes() -> bool:
+        return "intrasplat_feed_pushes 1.0" in httpx.get(f"{service.url}/metrics").text
+
+    head = f"PUT /feeds/{feed_id}/video HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n4\r\nG123\r\n"
+    with socket.create_connection(("127.0.0.1", service.port)) as caller:
+        caller.sendall(head.encode())
+        wait_until(pushes)
+    wait_until(lambda: not pushes(), timeout_s=5.0)
+    with connected(service, f"/feeds/{feed_id}/pictures") as caller:
+        caller.send(picture(b"jpeg"))
+        wait_until(pushes)
+    wait_until(lambda: not pushes(), timeout_s=5.0)
 
 
 def test_a_silent_push_is_ended(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from contract.wire.feeds import FeedWish
 from contract.wire.rendering import ExportRequest, MeasureRequest, RecordedRequest, RenderRequest
 from intrasplat.live.state import FeedState
 from intrasplat.live.times import LIVE, FeedTime
+from tests.memory_queue import MemoryQueue
 from tests.service.feed_worker import BEGAN_S, FeedWorker, following, wait_until
 from tests.service.under_test import CLIP, ServiceUnderTest, assert_problem, bearer, running_service
 
@@ -86,7 +88,7 @@ def test_a_feed_shows_what_its_worker_says(service: ServiceUnderTest, worker: Fe
     feed_id = followed(service)
     wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
     feed = service.http.get(f"/feeds/{feed_id}").json()
-    assert (feed["received_fps"], feed["used_fps"], feed["dropped"], feed["kept_bytes"]) == (30.0, 5.0, 7, 12345)
+    assert (feed["received_fps"], feed["used_fps"], feed["dropped"], feed["stored_bytes"]) == (30.0, 5.0, 7, 12345)
     assert feed["model_age_s"] >= 0.4
     assert feed["links"]["video"] == f"/feeds/{feed_id}/video"
 
@@ -230,6 +232,28 @@ def test_files_that_are_left_are_not_denied(service: ServiceUnderTest) -> None:
     assert (receipt["record"], receipt["verified"]) == (True, False)
 
 
+def test_a_feed_whose_record_cannot_be_read_is_not_said_to_be_gone(
+    service: ServiceUnderTest, worker: FeedWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.feeds.FOLLOWED_WITHIN_S", 0.05)
+    worker.obeys = False
+    feed_id, queue = followed(service), service.queue
+    assert isinstance(queue, MemoryQueue)
+    wished = queue.wish_feed
+
+    def wish_and_spoil(feed_id: str, wish: FeedWish) -> None:
+        wished(feed_id, wish)
+        queue.stored_feeds.unreadable.add(feed_id)
+
+    monkeypatch.setattr(queue, "wish_feed", wish_and_spoil)
+    ended = service.http.delete(f"/feeds/{feed_id}")
+    assert (ended.status_code, ended.json()["record"], ended.json()["verified"]) == (202, False, False)
+    for method in ("GET", "DELETE"):
+        assert "cannot be read" in assert_problem(service.http.request(method, f"/feeds/{feed_id}"), 503)["detail"]
+    other = bearer(service, "ward-2", MAY_ALL)
+    assert_problem(service.http.request("DELETE", f"/feeds/{feed_id}", headers=other), 404, "feed_id")
+
+
 @pytest.mark.parametrize(
     ("t", "moment", "shown_s"),
     [
@@ -271,6 +295,27 @@ def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
     assert service.http.get("/render", params={"scene": scene, "t": "0.5"}).content == b"png"
     assert len(worker.asked) == 3
     assert len(service.painter.requests) == 1
+
+
+def test_a_picture_that_has_not_changed_is_not_sent_again_and_not_logged(
+    service: ServiceUnderTest, worker: FeedWorker, caplog: pytest.LogCaptureFixture
+) -> None:
+    feed_id = followed(service)
+    path, query = f"/scenes/{feed_id}/recorded", {"t": "live", "masks": "off"}
+    caplog.set_level(logging.INFO, "intrasplat.access")
+    caplog.clear()
+    first = service.http.get(path, params=query)
+    assert (first.status_code, first.content) == (200, b"picture")
+    worker.newest_s += 1
+    again = service.http.get(path, params=query, headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert float(again.headers["x-intrasplat-source-s"]) == 61
+    assert again.headers["cache-control"] == "no-store"
+    other = service.http.get(path, params=query, headers={"If-None-Match": '"another"'})
+    assert (other.status_code, other.headers["etag"]) == (200, first.headers["etag"])
+    assert not caplog.records
+    service.http.get(path, params=query | {"t": "soon"})
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(
@@ -349,8 +394,8 @@ def test_the_metrics_tell_of_feeds_without_their_labels(service: ServiceUnderTes
     text = service.http.get("/metrics").text
     for line in (
         'intrasplat_feeds{state="live"} 1.0',
-        f'intrasplat_feed_used_fps{{feed="{feed_id[:8]}"}} 5.0',
-        f'intrasplat_feed_dropped_total{{feed="{feed_id[:8]}"}} 7.0',
+        f'intrasplat_feed_used_fps{{feed="{feed_id}"}} 5.0',
+        f'intrasplat_feed_dropped_total{{feed="{feed_id}"}} 7.0',
         'intrasplat_workers{device="cpu",trains="yes"} 1.0',
     ):
         assert line in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import threading
 import time
@@ -13,6 +14,7 @@ import zmq
 from contract.queue.embedded import short_socket_path
 from contract.wire.rendering import CutRequest, PushRequest, RenderRequest, WorkerReply, WorkerRequest
 from intrasplat.errors import InputError
+from intrasplat.live.times import FeedTime
 from tests.answers import at_once
 from tests.worker.test_serve import answer, connected
 from worker.aside import MAX_WAITING, Aside
@@ -84,10 +86,31 @@ def test_a_push_is_refused_if_too_many_wait_and_an_error_ends_none_of_the_others
 
 
 def test_a_process_without_a_feed_refuses_pushes_and_cuts(endpoint: str) -> None:
-    cut = CutRequest(scene_id=FEED, from_s=1, to_s=2, export_id=secrets.token_hex(16))
+    cut = CutRequest(scene_id=FEED, begins=FeedTime.at(1), ends=FeedTime.at(2), export_id=secrets.token_hex(16))
     with RequestServer(endpoint, at_once(answer)), connected(endpoint) as socket:
         for message in (push(b"bytes"), [b"cut", WorkerRequest(request=cut).model_dump_json().encode()]):
             socket.send_multipart(message)
             head = received(socket)[1]
             assert head.error is not None
             assert head.error.kind == "scene"
+
+
+def test_a_close_leaves_no_pipe_and_an_answer_that_comes_later_does_no_harm() -> None:
+    answering, go_on = threading.Event(), threading.Event()
+
+    def take(request: PushRequest, content: bytes) -> Reply:
+        answering.set()
+        assert go_on.wait(10)
+        return Reply(b"", "application/octet-stream", 0.0)
+
+    aside = Aside({PushRequest: take})
+    aside.take_in(b"caller", b"1", PushRequest(scene_id=FEED, push_id="1" * 32), b"")
+    assert answering.wait(10)
+    ends = aside.descriptor, aside._wake
+    aside.close()
+    for end in ends:
+        with pytest.raises(OSError, match="Bad file"):
+            os.fstat(end)
+    go_on.set()
+    assert aside._ready.get(timeout=10).caller == b"caller"
+    aside.close()

@@ -60,7 +60,7 @@ def test_a_feed_is_claimed_followed_announced_and_paused(started: Start) -> None
     hosted = started()
     record = hosted.open(feed_record(None))
     eventually(lambda: hosted.state(record.feed_id) == "live")
-    assert hosted.endpoint(record.feed_id).endswith("worker-1-feed-" + record.feed_id[:8] + ".sock")
+    assert hosted.endpoint(record.feed_id).endswith(f"worker-1-feed-{record.feed_id}.sock")
     address = hosted.queue.workers()[0]
     assert (address.feed_id, address.renders_only, address.job_id) == (record.feed_id, True, None)
     hosted.queue.wish_feed(record.feed_id, FeedWish.PAUSE)
@@ -97,7 +97,7 @@ def test_what_another_worker_left_to_end_is_ended_without_a_free_place(started: 
     record = hosted.open(feed_record(None))
     claimed = hosted.queue.claim_feed("worker-2.b")
     assert claimed is not None
-    (hosted.files.make(record.feed_id) / "patient").write_text("")
+    (hosted.files.make(record.feed_id, record.created_at_s) / "patient").write_text("")
     hosted.queue.release_feed(FeedClaim(record.feed_id, claimed.epoch, "worker-2.b"))
     hosted.queue.wish_feed(record.feed_id, FeedWish.END)
     eventually(lambda: hosted.queue.feed(record.feed_id) is None)
@@ -130,9 +130,30 @@ def test_files_of_a_feed_that_ended_elsewhere_are_deleted(tmp_path: Path) -> Non
     hosted = Hosted(tmp_path, command=FEED_STANDIN, places=0)
     known, gone = hosted.open(feed_record(None)), feed_record(None)
     for each in (known, gone):
-        (hosted.files.make(each.feed_id) / "patient").write_text("")
+        (hosted.files.make(each.feed_id, each.created_at_s) / "patient").write_text("")
     hosted.host.step()
     assert hosted.files.ids() == [known.feed_id]
+
+
+def test_files_of_a_feed_whose_record_cannot_be_read_stay(tmp_path: Path) -> None:
+    hosted = Hosted(tmp_path, command=FEED_STANDIN, places=0)
+    record = hosted.open(feed_record(None))
+    hosted.files.make(record.feed_id, record.created_at_s)
+    hosted.queue.stored_feeds.unreadable.add(record.feed_id)
+    hosted.host.step()
+    assert hosted.files.ids() == [record.feed_id]
+
+
+def test_a_feed_that_is_opened_again_under_its_id_has_no_earlier_past(started: Start) -> None:
+    hosted, ended = started(), feed_record(None)
+    folder = hosted.files.make(ended.feed_id, ended.created_at_s)  # ended on another machine a moment ago
+    (folder / "earlier").write_text("")
+    again = hosted.open(ended.model_copy(update={"created_at_s": ended.created_at_s + 1}))
+    eventually(lambda: hosted.state(again.feed_id) == "live")
+    assert not (folder / "earlier").exists()
+    (folder / "own").write_text("")
+    assert hosted.files.make(again.feed_id, again.created_at_s) == folder
+    assert (folder / "own").exists()
 
 
 def test_a_killed_process_is_replaced_and_the_feed_says_so_meanwhile(started: Start) -> None:
@@ -209,7 +230,7 @@ def test_processes_answer_at_ports_after_that_of_the_worker(tmp_path: Path) -> N
 
 
 def child_of(hosted: Hosted, record: FeedRecord, command: Sequence[str]) -> FeedChild:
-    return FeedChild(record, hosted.files.make(record.feed_id), (), command, None)
+    return FeedChild(record, hosted.files.make(record.feed_id, record.created_at_s), (), command, None)
 
 
 def test_a_feed_that_is_taken_over_is_not_reported_as_another_worker_left_it(tmp_path: Path) -> None:
@@ -237,7 +258,7 @@ def test_a_feed_whose_folder_the_disk_refuses_is_left_to_other_workers(
     started: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hosted = started()
-    hosted.queue._feeds._lease_s = 600.0  # without a release nobody could claim the feed again
+    hosted.queue.stored_feeds._lease_s = 600.0  # without a release nobody could claim the feed again
     refused: list[str] = []
 
     def refuse(feed_id: str) -> Path:
@@ -245,7 +266,7 @@ def test_a_feed_whose_folder_the_disk_refuses_is_left_to_other_workers(
         raise UnavailableError("The disk is read-only.", "Mount it again.")
 
     with monkeypatch.context() as patched:
-        patched.setattr(type(hosted.files), "make", lambda _, feed_id: refuse(feed_id))
+        patched.setattr(type(hosted.files), "make", lambda _, feed_id, __: refuse(feed_id))
         record = hosted.open(feed_record(None))
         eventually(lambda: len(refused) >= 2)
     eventually(lambda: hosted.state(record.feed_id) == "live")

@@ -152,7 +152,8 @@ def check_cut(asker: Asker, hosted: Hosted, feed_id: str) -> int:
     assert report is not None
     assert report.begins_s is not None
     assert report.ends_s is not None
-    request = CutRequest(scene_id=feed_id, from_s=report.begins_s, to_s=report.ends_s, export_id=secrets.token_hex(16))
+    begins, ends = FeedTime.at(report.begins_s), FeedTime.at(report.ends_s)
+    request = CutRequest(scene_id=feed_id, begins=begins, ends=ends, export_id=secrets.token_hex(16))
     content, part, found, more = b"", 0, None, True
     while more:
         head, body = asker.ask(request.model_copy(update={"part": part}))
@@ -164,7 +165,9 @@ def check_cut(asker: Asker, hosted: Hosted, feed_id: str) -> int:
     assert found.from_s == pytest.approx(report.begins_s, abs=0.5)
     assert found.to_s <= report.ends_s + 0.5
     assert content[4:8] == b"ftyp"
-    nothing, _ = asker.ask(request.model_copy(update={"from_s": 1.0, "to_s": 2.0, "export_id": "0" * 32}))
+    nothing, _ = asker.ask(
+        request.model_copy(update={"begins": FeedTime.at(1.0), "ends": FeedTime.at(2.0), "export_id": "0" * 32})
+    )
     assert nothing.error is not None
     assert (nothing.error.kind, nothing.error.field) == ("input", "from")
     return found.frames

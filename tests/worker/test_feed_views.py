@@ -25,12 +25,12 @@ FEED_ID = "0" * 32
 def views_of_new_scenes(scenes: list[weakref.ref[Any]]) -> FeedViews:
     """Answers from a feed of which every look shows a new scene, to which `scenes` gets a weak reference."""
 
-    def view_of(when: FeedTime) -> FeedMoment:
+    def moment(when: FeedTime) -> FeedMoment:
         scene = random_scene()
         scenes.append(weakref.ref(scene))
         return FeedMoment(scene, 0.0, 1.0, time.time(), 0.0, is_live=True, is_stale=False)
 
-    hosted = SimpleNamespace(feed_id=FEED_ID, state=FeedState.LIVE, feed=SimpleNamespace(view_of=view_of))
+    hosted = SimpleNamespace(feed_id=FEED_ID, state=FeedState.LIVE, feed=SimpleNamespace(moment=moment))
     return FeedViews(hosted)  # type: ignore[arg-type]
 
 

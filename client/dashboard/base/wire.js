@@ -108,7 +108,7 @@
  *   decode_lag_s?: number | null,
  *   reconnects?: number,
  *   last_frame_at_s?: number | null,
- *   kept_bytes?: number,
+ *   stored_bytes?: number,
  *   begins_s?: number | null,
  *   ends_s?: number | null,
  *   source_begins_s?: number | null,

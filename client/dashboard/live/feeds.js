@@ -7,15 +7,20 @@ import { ServerEvents } from "../base/events.js";
  * A feed as the service shows it. Moments are UNIX times, s.
  * @typedef {{id: string, label: string | null, state: string, reason: string | null, text: string, since_s: number,
  *   recording: string | null, received_fps: number, used_fps: number, dropped: number, model_age_s: number | null,
- *   decode_lag_s: number | null, reconnects: number, last_frame_at_s: number | null, kept_bytes: number,
+ *   decode_lag_s: number | null, reconnects: number, last_frame_at_s: number | null, stored_bytes: number,
  *   begins_s: number | null, ends_s: number | null, gaussians: number, wish: string,
  *   options: {source: string | null, keep_s: number, layout: string}}} Feed
  */
-/** @typedef {{blob: Blob, capturedAtS: number, ageS: number, sentMs: number, receivedMs: number}} LiveImage */
+/**
+ * blob: null: it is the one that the caller has.
+ * @typedef {{blob: Blob | null, tag: string, capturedAtS: number, ageS: number, sentMs: number,
+ *   receivedMs: number}} LiveImage
+ */
 
 const RETRY_MS = 500;
 /** Numbers come once a second. */
 const SILENCE_MS = 4000;
+const NOT_MODIFIED = 304;
 const GONE = 404;
 /** Longer than a picture takes on a slow line. */
 const PICTURE_MS = 5000;
@@ -59,15 +64,21 @@ export function cutFeed(id, part) {
   return json(`/feeds/${id}/cut`, posted(part, { "Idempotency-Key": key }));
 }
 
-/** The newest picture of the left eye. @param {string} id @returns {Promise<LiveImage>} */
-export async function getLivePicture(id) {
+/**
+ * The newest picture of the left eye.
+ * @param {string} id
+ * @param {string | null} tag of the picture that the caller has
+ * @returns {Promise<LiveImage>}
+ */
+export async function getLivePicture(id, tag) {
   const sentMs = performance.now();
-  const signal = AbortSignal.timeout(PICTURE_MS);
-  const response = await request(`/scenes/${id}/recorded?t=live&masks=off`, { signal });
+  const options = { signal: AbortSignal.timeout(PICTURE_MS), headers: tag ? { "If-None-Match": tag } : {} };
+  const response = await request(`/scenes/${id}/recorded?t=live&masks=off`, options);
   const receivedMs = performance.now();
   const [capturedAt, age] = ["Captured-At", "Age-S"].map((name) => response.headers.get(`X-Intrasplat-${name}`));
-  const blob = await bodyOf(response, "blob");
-  return { blob, capturedAtS: Date.parse(capturedAt) / 1000, ageS: Number(age), sentMs, receivedMs };
+  const blob = response.status === NOT_MODIFIED ? null : await bodyOf(response, "blob");
+  const times = { capturedAtS: Date.parse(capturedAt) / 1000, ageS: Number(age), sentMs, receivedMs };
+  return { blob, tag: response.headers.get("ETag"), ...times };
 }
 
 /** Follows what a feed says of itself until it has ended; comes again after a lost connection. */

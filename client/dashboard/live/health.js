@@ -37,7 +37,7 @@ function rowsOf(feed, modelAgeS, sentRate) {
     [words("live.lag"), seconds(feed.decode_lag_s)],
     [words("live.model_age"), seconds(modelAgeS)],
     [words("live.reconnects"), figure(feed.reconnects)],
-    [words("live.stored"), words("live.megabytes", { mb: figure(feed.kept_bytes / MB, 1) })],
+    [words("live.stored"), words("live.megabytes", { mb: figure(feed.stored_bytes / MB, 1) })],
   ];
   return Number.isNaN(sentRate) ? rows : [[words("live.sent"), rate(sentRate)], ...rows];
 }

@@ -237,7 +237,7 @@ function askToEnd() {
   if (feed === null) return;
   const dialog = get("confirm");
   const pastS = Math.max(0, clock.nowS - (feed.begins_s ?? clock.nowS));
-  const about = { min: figure(pastS / 60, 1), mb: figure(feed.kept_bytes / 1e6, 1) };
+  const about = { min: figure(pastS / 60, 1), mb: figure(feed.stored_bytes / 1e6, 1) };
   setText(get("confirm-question"), words("live.end_question", about));
   dialog.showModal();
 }

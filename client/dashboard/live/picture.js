@@ -23,6 +23,8 @@ export class LivePicture extends EventTarget {
     this.isBlank = true;
     /** @type {number | null} of what is on the screen */
     this.capturedAtS = null;
+    /** @type {string | null} its ETag */
+    this.tag = null;
     /** @type {Error | null} in place of the newest answer */
     this.problem = null;
     this.canvas.hidden = true;
@@ -60,13 +62,14 @@ export class LivePicture extends EventTarget {
   /** @returns {Promise<boolean>} whether a picture has come */
   async #once(id, visit) {
     try {
-      const image = await getLivePicture(id);
+      const image = await getLivePicture(id, this.tag);
       if (visit !== this.visit) return false;
       this.clock.note(image.capturedAtS + image.ageS, image.receivedMs, image.sentMs);
       this.dispatchEvent(new Event("answered"));
       this.problem = null;
       if (image.capturedAtS === this.capturedAtS || !this.mayShow) return true;
-      this.#show(await createImageBitmap(image.blob), image.capturedAtS, visit);
+      if (image.blob) this.#show(await createImageBitmap(image.blob), image, visit);
+      else if (image.tag === this.tag) this.#note(image);
       return true;
     } catch (error) {
       if (visit !== this.visit) return false;
@@ -76,7 +79,7 @@ export class LivePicture extends EventTarget {
     }
   }
 
-  #show(bitmap, capturedAtS, visit) {
+  #show(bitmap, image, visit) {
     if (visit === this.visit && this.mayShow) {
       const { canvas } = this;
       if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
@@ -85,9 +88,14 @@ export class LivePicture extends EventTarget {
       canvas.getContext("2d").drawImage(bitmap, 0, 0);
       canvas.hidden = false;
       this.isBlank = false;
-      this.capturedAtS = capturedAtS;
-      this.dispatchEvent(new Event("shown"));
+      this.#note(image);
     }
     bitmap.close();
+  }
+
+  /** What is on the screen is this picture. */
+  #note({ capturedAtS, tag }) {
+    Object.assign(this, { capturedAtS, tag });
+    this.dispatchEvent(new Event("shown"));
   }
 }

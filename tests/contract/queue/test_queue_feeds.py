@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import pytest
+import redis
 
 from contract.queue.feeds import FeedClaim, FeedsFullError
 from contract.queue.interface import Queue
+from contract.queue.redis_queue import PREFIX, RedisQueue
 from contract.store.shelf import new_job_id
 from contract.wire.feeds import FeedOptions, FeedRecord, FeedReport, FeedWish
 from intrasplat.live.state import FeedReason, FeedState
@@ -135,6 +137,23 @@ def test_a_feed_that_no_worker_ever_claimed_ends_at_once(queue: Queue) -> None:
     assert queue.feeds() == []
     assert queue.claim_feed("worker-1.a") is None
     assert opened(queue, record).epoch == 0
+
+
+def test_a_feed_that_is_opened_again_under_its_id_is_another_one(queue: Queue) -> None:
+    record = feed()
+    for _ in range(2):
+        opened(queue, record)
+        claim = claimed(queue)
+        queue.wish_feed(record.feed_id, FeedWish.END)
+        assert queue.forget_feed(claim)
+        assert queue.tenant_of_feed(record.feed_id) is None
+
+
+def test_a_record_that_cannot_be_read_is_there(served: RedisQueue, client: redis.Redis) -> None:
+    record = opened(served)
+    client.hset(f"{PREFIX}feed:{record.feed_id}", "report", '{"state": "of a later version", "since_s": 1}')
+    assert served.feed(record.feed_id) is None
+    assert served.tenant_of_feed(record.feed_id) == "ward-1"
 
 
 def test_a_worker_without_a_free_place_claims_what_is_to_end_alone(queue: Queue) -> None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from intrasplat.errors import SceneError
 from intrasplat.files.durable import move_folder
-from intrasplat.live.window import ARRIVED_AT
+from intrasplat.live.window import ARRIVED_AT, WindowPictures
 from intrasplat.names import DETAIL, RECORDED
 from intrasplat.scene.checkpoint import load_scene, save_scene
 from intrasplat.scene.recorded_file import EYES, MASK, name_of
@@ -40,12 +40,12 @@ LEAST_LOGIT = -10.0
 
 
 @dataclass(frozen=True, eq=False)
-class KeptSegment:
+class PastSegment:
     """A segment of the model.
 
     source_s, arrived_at  of its first and last frame: source times, and UNIX times, s
     path                  its folder; None: it is in memory alone
-    bytes                 on disk; in memory, of its model
+    bytes                 on disk; in memory, of its model and its recorded pictures
     """
 
     number: int
@@ -55,15 +55,15 @@ class KeptSegment:
     bytes: int = 0
 
     @classmethod
-    def of(cls, number: int, scene: TrainedScene) -> KeptSegment:
+    def of(cls, number: int, scene: TrainedScene) -> PastSegment:
         """The segment of a scene, in memory."""
         (first_s, last_s), (first_at, last_at) = (
             (float(times[0]), float(times[-1])) for times in (scene.frame_times_s, arrivals(scene))
         )
-        return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count)
+        return cls(number, (first_s, last_s), (first_at, last_at), bytes=scene.byte_count + _in_memory(scene.pictures))
 
     @classmethod
-    def at(cls, path: Path) -> KeptSegment | None:
+    def at(cls, path: Path) -> PastSegment | None:
         """The segment that a folder is; None if it is none."""
         match = NAME.fullmatch(path.name)
         if match is None or not path.is_dir():
@@ -78,7 +78,7 @@ class KeptSegment:
         times = "-".join(str(round(each * MICRO)) for each in (*self.source_s, *self.arrived_at))
         return f"{self.number:08d}-{times}"
 
-    def written(self, folder: Path, scene: TrainedScene) -> KeptSegment:
+    def written(self, folder: Path, scene: TrainedScene) -> PastSegment:
         """The segment on disk, in `folder`, when this returns.
 
         Raises:
@@ -124,6 +124,11 @@ def _drawn(scene: TrainedScene) -> TrainedScene:
     return replace(
         scene, gaussians=gaussians, deformation=scene.deformation.select(rows), seen=scene.seen[rows].contiguous()
     )
+
+
+def _in_memory(pictures: TrainingPictures | None) -> int:
+    """Bytes of a window's pictures."""
+    return pictures.byte_count if isinstance(pictures, WindowPictures) else 0
 
 
 def _recorded(pictures: TrainingPictures | None) -> dict[str, bytes]:
