@@ -37,6 +37,11 @@ MICRO = 1_000_000
 WRITING = "writing-"
 LEAST_LOGIT = -10.0
 """A Gaussian of less opacity is a spare one that is not drawn: it is not stored."""
+HALVED = frozenset(f"gaussians.{name}" for name in ("quaternion", "log_scale", "opacity_logit", "sh", "gloss")) | {
+    "deformation.weight",
+    "seen",
+}
+"""Stored as float16. Centres stay float32: they lie up to a hundred units away, where float16 has steps of 1 / 16."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,7 @@ class PastSegment:
         """
         target, draft = folder / self.name, folder / f"{WRITING}{self.name}"
         try:
-            save_scene(draft, _drawn(scene), _recorded(scene.pictures))
+            save_scene(draft, _drawn(scene), _recorded(scene.pictures), halved=HALVED)
             move_folder(draft, target)
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)

@@ -1,7 +1,7 @@
 """A finished scene on disk.
 
     directory/
-    ├── scene.safetensors   "exact": all tensors, gaussians.*, deformation.*, seen; "compact": the tensors of compact.py
+    ├── scene.safetensors   "exact", "half": gaussians.*, deformation.* and seen; "compact": the tensors of compact.py
     ├── ...                 files that rendering does not need, such as recorded.zip
     └── manifest.json       format, camera, poses, times, settings; shape and type of each tensor, SHA-256 of each file
 
@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from safetensors.torch import save
 from torch import Tensor
 
 from intrasplat.camera import Intrinsics
@@ -35,28 +37,33 @@ FORMAT = "intrasplat-scene"
 FORMAT_VERSION = 2
 """It rises when an older reader would misread what is written."""
 EXACT, COMPACT = "exact", "compact"
+HALF = "half"
+"""As exact, with some tensors as float16: segments of a live feed (intrasplat/live/past_segment.py)."""
 SCENE_FILE, MANIFEST_FILE = SCENE, MANIFEST
 MISFITS = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """Errors that reading raises where a manifest's entry or a tensor has the wrong shape or type."""
 
 
-def save_scene(directory: Path, scene: TrainedScene, beside: Mapping[str, bytes] | None = None) -> None:
+def save_scene(
+    directory: Path, scene: TrainedScene, beside: Mapping[str, bytes] | None = None, *, halved: Collection[str] = ()
+) -> None:
     """Write the scene into a directory; create the directory if it is missing, and replace a scene that is there.
 
-    beside: the contents of further files, by name.
+    beside: the contents of further files, by name. halved: tensors of an exact scene that are stored as float16.
 
     Raises:
         SceneError: a number is not finite or out of its range, or the tensors do not belong together. Then nothing is
             written.
     """
     check(scene)
-    tensors = scene.file_tensors()
+    tensors = {name: each.half() if name in halved else each for name, each in scene.file_tensors().items()}
+    check_finite(tensors)
     directory.mkdir(parents=True, exist_ok=True)
-    content = scene.file_content
+    content = save(tensors) if halved else scene.file_content
     manifest = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
-        "coding": EXACT if scene.stored is None else COMPACT,
+        "coding": HALF if halved else EXACT if scene.stored is None else COMPACT,
         "deformation": scene.deformation.kind,
         "gaussians": len(scene.gaussians),
         "intrinsics": scene.intrinsics.numbers(),
@@ -183,7 +190,8 @@ def _model_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Gau
         return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
 
     deformation: Deformation
-    if _coding(manifest) == EXACT:
+    if _coding(manifest) != COMPACT:
+        tensors = {name: each.float() if each.dtype == torch.float16 else each for name, each in tensors.items()}
         deformation = restore(manifest["deformation"], under("deformation."))
         gaussians, seen = Gaussians(**under("gaussians.")), tensors["seen"]
     else:
@@ -196,8 +204,8 @@ def _model_of(manifest: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Gau
 
 def _coding(manifest: dict[str, Any]) -> str:
     coding = str(manifest["coding"])
-    if coding not in (EXACT, COMPACT):
-        raise ValueError(f"coding {coding!r} is neither {EXACT} nor {COMPACT}")
+    if coding not in (EXACT, HALF, COMPACT):
+        raise ValueError(f"coding {coding!r} is none of {EXACT}, {HALF} and {COMPACT}")
     return coding
 
 

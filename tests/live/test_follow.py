@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from intrasplat.live.eyes import EyesSettings
 from intrasplat.live.follow import Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past_segment import PastSegment
+from intrasplat.names import SCENE
 from intrasplat.scene.scene import TrainedScene, check
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.render import render_frame
@@ -85,6 +87,26 @@ def test_a_second_of_the_past_is_shown_as_it_was() -> None:
     scene, t = follower.scene_at(-5.0) or pytest.fail("there is a past")
     assert scene is follower.segments[0]
     assert t == 0.0
+
+
+def test_a_stored_segment_has_half_the_bytes_and_the_same_views(tmp_path: Path) -> None:
+    phantom, segments = _phantom("pull"), list[TrainedScene]()
+    follower = Follower(phantom.settings.calibration, SETTINGS, on_segment=segments.append)
+    for number in range(7):
+        follower.add(_pair(phantom, number))
+    stored = PastSegment.of(0, segments[0]).written(tmp_path, segments[0])
+    assert stored.path is not None
+    assert (stored.path / SCENE).stat().st_size < 0.6 * segments[0].byte_count
+    for number in range(3):
+        shown = (
+            psnr_tissue(
+                render_frame(each, (number + 0.5) / 4, detail="off").rgb,
+                _eyes(phantom, number)[0],
+                np.ones((HEIGHT, WIDTH), np.bool_),
+            )
+            for each in (segments[0], stored.load())
+        )
+        assert abs(next(shown) - next(shown)) < 0.05
 
 
 def test_a_segment_does_not_change_and_can_be_stored() -> None:
