@@ -18,6 +18,11 @@ const { left, top } = document.querySelector("#over").getBoundingClientRect();
 const at = (name, from) => from + Number(line.getAttribute(name));
 return [at("x1", left), at("y1", top), at("x2", left), at("y2", top)];
 """
+MESSAGE_LEFT = """
+const message = document.querySelector("#stage-message");
+Object.assign(message, { hidden: false, textContent: "Why." });
+return message.getBoundingClientRect().left;
+"""
 CLOSE_PX = 2.5
 
 
@@ -63,11 +68,7 @@ def test_the_picture_is_free_of_controls_and_all_over_it_follows(
         if min(width, height) > PHONE_PX:
             page.click("#tools [data-drawer=library]")
             page.until(lambda: is_free_of(page, "#library"))
-            page.script(
-                "const message = document.querySelector('#stage-message');"
-                "Object.assign(message, { hidden: false, textContent: 'Why.' })"
-            )
-            assert box_of(page, "#stage-message")[0] > box_of(page, "#library")[2]
+            assert page.script(MESSAGE_LEFT) > box_of(page, "#library")[2]
         page.until(lambda: is_free_of(page, "#measuring"))
         expected = [*on_screen(page, 0.25, 0.5), *on_screen(page, 0.5, 0.5)]
         page.until(lambda: page.script(ENDS) == pytest.approx(expected, abs=CLOSE_PX))

@@ -5,6 +5,8 @@ const STEP_BACK = ".tools, .controls, .five";
 const COVERS = `.drawer, ${STEP_BACK}`;
 /** After a press on the picture it stays so long where it is: a second tap means the same place. */
 const SETTLES_MS = 350;
+/** Of the theatre's width or height; where less would be left for the picture, it lies behind what covers it. */
+const MIN_SHARE = 0.25;
 
 /** @param {HTMLElement} theatre @returns {{left: number, right: number, top: number, bottom: number}} covered pixels */
 function coveredBy(theatre) {
@@ -18,6 +20,8 @@ function coveredBy(theatre) {
     const depth = { left: right - whole.left, right: whole.right - left, top: bottom - whole.top, bottom: whole.bottom - top };
     covered[edge] = Math.max(covered[edge], depth[edge]);
   }
+  if (whole.width - covered.left - covered.right < MIN_SHARE * whole.width) covered.left = covered.right = 0;
+  if (whole.height - covered.top - covered.bottom < MIN_SHARE * whole.height) covered.top = covered.bottom = 0;
   return covered;
 }
 
