@@ -315,7 +315,7 @@ export const DE = {
     "sending": "Die Szene wird gesendet."
   },
   "snapshot": {
-    "take": "Bild sichern",
+    "take": "Bild",
     "too_slow": "Das Bild dieser Ansicht dauert zu lange. Versuchen Sie es noch einmal."
   },
   "download": {

@@ -315,7 +315,7 @@ export const EN = {
     "sending": "The scene is being sent."
   },
   "snapshot": {
-    "take": "Save picture",
+    "take": "Picture",
     "too_slow": "The picture of this view takes too long. Try again."
   },
   "download": {
