@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import threading
 import time
 from collections.abc import Iterator
@@ -295,27 +294,6 @@ def test_all_of_a_feed_is_asked_of_its_own_worker_and_scenes_of_the_others(
     assert service.http.get("/render", params={"scene": scene, "t": "0.5"}).content == b"png"
     assert len(worker.asked) == 3
     assert len(service.painter.requests) == 1
-
-
-def test_a_picture_that_has_not_changed_is_not_sent_again_and_not_logged(
-    service: ServiceUnderTest, worker: FeedWorker, caplog: pytest.LogCaptureFixture
-) -> None:
-    feed_id = followed(service)
-    path, query = f"/scenes/{feed_id}/recorded", {"t": "live", "masks": "off"}
-    caplog.set_level(logging.INFO, "intrasplat.access")
-    caplog.clear()
-    first = service.http.get(path, params=query)
-    assert (first.status_code, first.content) == (200, b"picture")
-    worker.newest_s += 1
-    again = service.http.get(path, params=query, headers={"If-None-Match": first.headers["etag"]})
-    assert (again.status_code, again.content) == (304, b"")
-    assert float(again.headers["x-intrasplat-source-s"]) == 61
-    assert again.headers["cache-control"] == "no-store"
-    other = service.http.get(path, params=query, headers={"If-None-Match": '"another"'})
-    assert (other.status_code, other.headers["etag"]) == (200, first.headers["etag"])
-    assert not caplog.records
-    service.http.get(path, params=query | {"t": "soon"})
-    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(
