@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from tests.client.page import Page, Site
@@ -24,6 +26,7 @@ Object.assign(message, { hidden: false, textContent: "Why." });
 return message.getBoundingClientRect().left;
 """
 CLOSE_PX = 2.5
+SETTLED_S = 0.5
 
 
 def picture_box(page: Page) -> tuple[float, float, float, float]:
@@ -38,6 +41,17 @@ def is_free_of(page: Page, css: str) -> bool:
     other = box_of(page, css)
     over = min(right, other[2]) - max(left, other[0]), min(bottom, other[3]) - max(top, other[1])
     return min(over) < CLOSE_PX
+
+
+def until_still(page: Page) -> None:
+    """Wait until the picture stays where it is, longer than a press puts off its next place."""
+
+    def is_still() -> bool:
+        before = picture_box(page)
+        time.sleep(SETTLED_S)
+        return picture_box(page) == before
+
+    page.until(is_still)
 
 
 @pytest.mark.parametrize(("width", "height"), LAID_OUT)
@@ -62,6 +76,7 @@ def test_the_picture_is_free_of_controls_and_all_over_it_follows(
         page.click("#measure")
         for x in (0.25, 0.5):
             site.announce()
+            until_still(page)
             click_at(page, x, 0.5)
             page.until(lambda: page.script("return document.querySelectorAll('.measured path').length") >= 2)
         page.until(lambda: page.text("#measuring .figure"))
