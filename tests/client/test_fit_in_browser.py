@@ -17,8 +17,7 @@ PHONE_PX = 480
 ENDS = """
 const line = document.querySelector(".measured .line");
 const { left, top } = document.querySelector("#over").getBoundingClientRect();
-const at = (name, from) => from + Number(line.getAttribute(name));
-return [at("x1", left), at("y1", top), at("x2", left), at("y2", top)];
+return [...line.points].flatMap(({ x, y }) => [left + x, top + y]);
 """
 MESSAGE_LEFT = """
 const message = document.querySelector("#stage-message");
