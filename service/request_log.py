@@ -36,6 +36,7 @@ MAX_OPEN = 512
 """Maximum requests, event streams and WebSockets at a time. Each may occupy a connection for long."""
 
 NO_ROUTE = "-"
+"""Of the page's files, which are logged only when they fail."""
 OTHER_METHOD = "_OTHER"
 """OpenTelemetry's name for an unknown HTTP method, in spans."""
 OK = 200
@@ -102,7 +103,9 @@ class RequestLog:
             "status": status,
             "duration_ms": round(seconds * 1000.0, 1),
         }
-        level = logging.DEBUG if route in QUIET_ROUTES and not self._has_changed(route, status) else logging.INFO
+        is_polled = route in QUIET_ROUTES and not self._has_changed(route, status)
+        is_of_page = route == NO_ROUTE and status < 400
+        level = logging.DEBUG if is_polled or is_of_page else logging.INFO
         logger.log(level, "answered", extra=fields)
 
     def _has_changed(self, route: str, status: int) -> bool:

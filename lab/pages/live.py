@@ -1,13 +1,14 @@
-"""The part of docs/results/index.md on live feeds: the rows of bm_live.py."""
+"""The parts of docs/results/index.md on live feeds: the rows of bm_live.py and bm_feed_kills.py."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import median
 
 from lab.evaluate.rows import read_rows
 from lab.pages.markdown import number, origin, source, table
 
-LIVE = "live.csv"
+LIVE, KILLS = "live.csv", "feed_kills.csv"
 _INTRODUCTION = """
 ## Live feeds
 
@@ -15,6 +16,12 @@ A clip is played to and fro in real time over MPEG-TS on loopback, and followed;
 Age: from the arrival of the newest frame that the model knows to the rendered picture. Of several feeds at once the
 fewest used frames and the oldest ages; cores, memory and disk are of all of them
 ([definitions](../../lab/benchmarks/bm_live.py)).
+"""
+_KILLED = """
+### A process is killed
+
+kill -9 at random moments while a whole installation follows a feed. Back: seconds until a view of a later moment is
+shown over HTTP. Lost: seconds of what was known before. The cut before each kill must still be a whole clip.
 """
 _COLUMNS = {
     "received_fps": ("received a second", 1), "used_fps": ("used a second", 1), "steps": ("steps each", 0),
@@ -24,7 +31,27 @@ _COLUMNS = {
 
 
 def live_sections(folder: Path) -> list[str]:
-    """The section, if there are rows."""
+    """The sections whose rows exist."""
+    return [*_followed(folder), *_killed(folder)]
+
+
+def _killed(folder: Path) -> list[str]:
+    rows = read_rows(folder / KILLS)
+    if not rows:
+        return []
+    cells = []
+    for who in dict.fromkeys(row["who"] for row in rows):
+        here = [row for row in rows if row["who"] == who]
+        back_s, lost_s = ([float(row[name]) for row in here] for name in ("back_s", "lost_s"))
+        whole = sum(row["cut"] == "whole" for row in here)
+        seconds = (median(back_s), max(back_s), max(lost_s))
+        cells.append([who, str(len(here)), *(number(each, 1) for each in seconds), f"{whole} of {len(here)}"])
+    header = ["killed", "kills", "back, s", "at most", "lost at most, s", "cuts whole"]
+    command = source(f"python -m lab.benchmarks.bm_feed_kills --out lab/rows/{KILLS}", KILLS)
+    return [_KILLED, command, table(header, cells), origin(rows)]
+
+
+def _followed(folder: Path) -> list[str]:
     rows = read_rows(folder / LIVE)
     if not rows:
         return []

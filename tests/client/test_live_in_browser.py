@@ -328,6 +328,8 @@ def test_the_page_leads_to_open_feeds(site: Site, page: LivePage, painter: LiveP
 def test_a_feed_that_is_no_more_is_said_to_have_ended(site: Site, page: LivePage) -> None:
     page.watch("0" * 32)
     page.until_text("#word", say("live.word_ended"))
+    for name in ("keep", "live", "pause", "end"):
+        assert not page.find(f"#{name}").is_enabled(), name
 
 
 def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_path: Path) -> None:

@@ -189,7 +189,8 @@ export const DE = {
     "guesses": "Vermutungen gezeigt",
     "no_highlights": "ohne Glanzlichter",
     "recorded_light": "im Licht der Aufnahme",
-    "guessed": "Ein Teil dieser Ansicht wurde nie gesehen; er ist geraten."
+    "guessed": "Ein Teil dieser Ansicht wurde nie gesehen; er ist geraten.",
+    "not_compared": "Der schraffierte Teil wird nicht verglichen: Er ist maskiert oder wurde nie gesehen."
   },
   "screen": {
     "rendering": "Das Bild wird gezeichnet.",

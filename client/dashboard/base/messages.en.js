@@ -189,7 +189,8 @@ export const EN = {
     "guesses": "guesses shown",
     "no_highlights": "without highlights",
     "recorded_light": "in the light of the recording",
-    "guessed": "Part of this view was never seen; it is a guess."
+    "guessed": "Part of this view was never seen; it is a guess.",
+    "not_compared": "The hatched part is not compared: it is masked, or was never seen."
   },
   "screen": {
     "rendering": "The picture is being drawn.",

@@ -181,6 +181,7 @@ function refresh() {
   get("freeze").setAttribute("aria-pressed", String(look.mode === "frozen"));
   get("look").setAttribute("aria-pressed", String(look.rock.isOn));
   for (const name of ["freeze", "measure", "look"]) get(name).disabled = model.shown === null;
+  if (isGone) for (const name of ["keep", "live", "pause", "end"]) get(name).disabled = true;
 }
 
 function blankWords({ kind }) {

@@ -25,8 +25,9 @@ export class Legend {
     };
     for (const end of this.ends) {
       end.addEventListener("change", () => {
-        const isRange = this.ends.every((each) => each.validity.valid && each.value) && Number(near.value) < Number(far.value);
-        if (isRange) choose([Number(near.value), Number(far.value)]);
+        const range = [near, far].map((each) => Number(each.value)).sort((one, other) => one - other);
+        const isRange = this.ends.every((each) => each.validity.valid && each.value) && range[0] < range[1];
+        if (isRange) choose(range);
         else this.#fill(true);
       });
     }

@@ -57,8 +57,10 @@ function isGuess(code, view) {
 const withViewFirst = (codes) => [true, false].flatMap((isOfView) => codes.filter((code) => OF_VIEW.includes(code) === isOfView));
 
 /** What to know of a view, in the page's words. @param {string} code @param {View} view */
-const wordsOf = (code, view) =>
-  code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" });
+function wordsOf(code, view) {
+  if (code === "unseen" && view.layer === "error") return words("picture.not_compared");
+  return code === "unseen" && view.unseen === "guess" ? words("picture.guessed") : noticeWords({ code, text: "" });
+}
 
 /**
  * What to know of a picture: of this view first, then of its scene.
