@@ -180,10 +180,13 @@ def test_the_range_of_depths_is_set_in_the_legend_stays_in_the_link_and_goes_bac
     page.until(lambda: page.find("#legend .near").get_attribute("value") == f"{RANGE_MM[0]:.0f}")
     assert not page.find("#legend .auto").is_enabled()
     far = page.find("#legend .far")
-    far.send_keys(Keys.CONTROL + "a", Keys.NULL, "30", Keys.TAB)  # not beyond the near end
-    assert far.get_attribute("value") == f"{RANGE_MM[1]:.0f}"
+    far.send_keys(Keys.CONTROL + "a", Keys.NULL, "30", Keys.TAB)  # set the other way round, they are swapped
+    near = page.find("#legend .near")
+    page.until(lambda: (near.get_attribute("value"), far.get_attribute("value")) == ("30", f"{RANGE_MM[0]:.0f}"))
     far.send_keys(Keys.CONTROL + "a", Keys.NULL, "90", Keys.TAB)
     page.until_text("#legend .high", say("legend.mm", mm="90"))
+    near.send_keys(Keys.CONTROL + "a", Keys.NULL, f"{RANGE_MM[0]:.0f}", Keys.TAB)
+    page.until_text("#legend .low", say("legend.mm", mm=f"{RANGE_MM[0]:.0f}"))
     asked = site.painter.asked
     assert asked is not None
     assert (asked.near_mm, asked.far_mm) == (RANGE_MM[0], 90)
