@@ -115,7 +115,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
     from intrasplat.view.encode import encode_layer
-    from intrasplat.view.error import check_comparable, error_levels
+    from intrasplat.view.error import AS_RECORDED, check_comparable, error_levels
     from intrasplat.view.recorded import stored_picture
     from intrasplat.view.render import render_frame
     from intrasplat.view.renderer import renderer_of
@@ -124,13 +124,15 @@ def run_cli(options: argparse.Namespace) -> int:
     check_is_scene(options.scene, "SCENE")
     scene = load_scene(options.scene)
     layer = Layer(options.layer)
-    highlights = Highlights(options.highlights).shown_in(layer)
     wanted = _camera(options)
     camera = camera_of(scene.intrinsics, wanted, MAX_RENDER_PIXELS)
     asked_pose = None if options.pose is None else parse_pose(options.pose)
     pose, is_error = pose_of(scene, asked_pose), layer is Layer.ERROR
+    how = vars(options)
     if is_error:
         check_comparable(asked_pose, wanted)
+        how = {**how, **AS_RECORDED}
+    highlights = Highlights(how["highlights"]).shown_in(layer)
     shown = dict[NoticeCode, list[tuple[str, Notice]]]()
     for t, path in _targets(options, scene.frame_count):
         image_format = SUFFIX_FORMATS.get(path.suffix.lower())
@@ -139,10 +141,8 @@ def run_cli(options: argparse.Namespace) -> int:
         recorded = stored_picture(options.scene, scene.frame_count, t) if is_error else None
         frame = render_frame(
             scene, t if recorded is None else recorded.index / scene.frame_count, pose, camera, device,
-            highlights=highlights,
-            light="recorded" if is_error else options.light,
-            smoke="show" if is_error else options.smoke,
-            detail=options.detail if layer is Layer.RGB else "off",
+            highlights=highlights, light=how["light"], smoke=how["smoke"],
+            detail=how["detail"] if layer is Layer.RGB else "off",
         )  # fmt: skip
         range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -143,7 +143,8 @@ class Past:
         self._scenes[segment.number] = scene
         self._scenes.move_to_end(segment.number)
         if self._spec.folder is None:
-            for number in [*self._scenes][: -self._spec.cached][-1:]:
+            if len(self._scenes) > self._spec.cached:
+                number = [*self._scenes][-self._spec.cached - 1]
                 self._scenes[number] = replace(self._scenes[number])  # without what was made to render it
             return
         on_disk = {each.number for each in self._segments if each.path is not None}

@@ -3,25 +3,17 @@
 
 import { DE } from "./messages.de.js";
 import { EN } from "./messages.en.js";
+import { readChoice, writeChoice } from "./storage.js";
 
 const TABLES = { en: EN, de: DE };
-const KEPT_AS = "intrasplat-language";
+const STORED_AS = "intrasplat-language";
 /** A table's places: text, and attributes that are read aloud or shown. */
 const PLACES = { words: "textContent", wordsLabel: "ariaLabel", wordsTitle: "title", wordsPlaceholder: "placeholder" };
 
 /** Tells "changed" when another language is chosen. */
 export const languageEvents = new EventTarget();
 
-/** What the user chose, if the browser lets the page keep anything. */
-function keptLanguage() {
-  try {
-    return localStorage.getItem(KEPT_AS);
-  } catch {
-    return null;
-  }
-}
-
-const known = [keptLanguage(), ...navigator.languages].map((each) => each?.slice(0, 2).toLowerCase());
+const known = [readChoice(STORED_AS), ...navigator.languages].map((each) => each?.slice(0, 2).toLowerCase());
 let chosen = known.find((code) => code in TABLES) ?? "en";
 
 /** @returns {"en"|"de"} */
@@ -30,11 +22,7 @@ export const language = () => chosen;
 /** @param {"en"|"de"} code kept for the next visit */
 export function setLanguage(code) {
   chosen = code in TABLES ? code : "en";
-  try {
-    localStorage.setItem(KEPT_AS, chosen);
-  } catch {
-    // the choice holds until the page is closed
-  }
+  writeChoice(STORED_AS, chosen);
   showWords(document);
   languageEvents.dispatchEvent(new Event("changed"));
 }

@@ -3,7 +3,7 @@
 
 import { reconstruct } from "../base/api.js";
 import { insist } from "../base/pause.js";
-import { readTabStorage, writeTabStorage } from "../base/tabstorage.js";
+import { readTabStorage, writeTabStorage } from "../base/storage.js";
 import { Upload } from "./upload.js";
 
 const STORED_AS = "intrasplat-sending";

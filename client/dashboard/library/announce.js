@@ -4,7 +4,7 @@
 import { button, element, setText } from "../base/element.js";
 import { words } from "../base/messages.js";
 import { failureOf } from "../base/problem.js";
-import { readTabStorage, writeTabStorage } from "../base/tabstorage.js";
+import { readChoice, readTabStorage, writeChoice, writeTabStorage } from "../base/storage.js";
 import { nameOf } from "./card.js";
 import { progressOf, shareOf, shareOfSending } from "./progress.js";
 import { TimesLeft } from "./timeleft.js";
@@ -109,20 +109,13 @@ export class Announcer {
   }
 
   get #isWanted() {
-    try {
-      return localStorage.getItem(WANTED_AS) === "on" && window.Notification?.permission === "granted";
-    } catch {
-      return false; // the browser keeps nothing
-    }
+    return readChoice(WANTED_AS) === "on" && window.Notification?.permission === "granted";
   }
 
   async #wish() {
     const isWanted = !this.#isWanted && (await Notification.requestPermission()) === "granted";
-    try {
-      localStorage.setItem(WANTED_AS, isWanted ? "on" : "off");
-    } finally {
-      this.#showWish();
-    }
+    writeChoice(WANTED_AS, isWanted ? "on" : "off");
+    this.#showWish();
   }
 
   #showWish() {

@@ -5,7 +5,7 @@ import { getMeasurement } from "../base/api.js";
 import { languageEvents, words } from "../base/messages.js";
 import { drawOverTime, markTime } from "./distances.js";
 import { figureOf, MeasurementList } from "./list.js";
-import { freeName, KINDS, measurementOf, MOST, shapeAt, textOf } from "./measurements.js";
+import { freeName, KINDS, measurementOf, MOST, safeName, shapeAt, textOf } from "./measurements.js";
 import { Overlay } from "./overlay.js";
 import { isMeasurable, queryOf, sameView } from "./places.js";
 import { PointPicker } from "./pointpicker.js";
@@ -218,7 +218,7 @@ export class Measure {
   }
 
   #rename(each, name) {
-    each.name = name.replaceAll("~", " ").trim() || each.name;
+    each.name = safeName(name) || each.name;
     this.onChange();
     this.#draw();
   }

@@ -33,11 +33,14 @@ export function freeName(taken) {
   return letters.find((letter) => taken.every(({ name }) => name !== letter)) ?? letters[0];
 }
 
+/** @param {string} name @returns {string} one that an address can hold */
+export const safeName = (name) => name.replaceAll(BETWEEN, " ").trim();
+
 /** @param {Measurement} measurement @returns {string} as an address holds it */
 export function textOf({ name, kind, query }) {
   const lens = LENS.map((each) => short(query[each])).join(",");
   const points = query.points.split(";").map((each) => each.split(",").map(short).join(",")).join(";");
-  return [name.replaceAll(BETWEEN, " "), kind, short(query.t), lens, query.pose ?? "", points].join(BETWEEN);
+  return [safeName(name), kind, short(query.t), lens, query.pose ?? "", points].join(BETWEEN);
 }
 
 /** @param {string} text as textOf() writes it @returns {Measurement | null} null: it cannot be read */

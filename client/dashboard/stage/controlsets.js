@@ -3,18 +3,11 @@
 
 import { onKeys } from "../base/keys.js";
 import { languageEvents, words } from "../base/messages.js";
+import { readChoice, writeChoice } from "../base/storage.js";
 
 const STORED_AS = "intrasplat-controls";
 const SETS = ["desk", "theatre"];
 const root = document.documentElement;
-
-function stored() {
-  try {
-    return localStorage.getItem(STORED_AS);
-  } catch {
-    return null;
-  }
-}
 
 /** @param {Iterable<HTMLButtonElement>} buttons that change to the other set */
 export function prepareControlSets(buttons) {
@@ -26,14 +19,10 @@ export function prepareControlSets(buttons) {
   const change = () => {
     const next = SETS.find((each) => each !== root.dataset.controls);
     show(next);
-    try {
-      localStorage.setItem(STORED_AS, next);
-    } catch {
-      // the choice holds until the page is closed
-    }
+    writeChoice(STORED_AS, next);
   };
   for (const each of buttons) each.addEventListener("click", change);
   languageEvents.addEventListener("changed", () => show(root.dataset.controls));
   onKeys("controls", { t: [] }, change);
-  show(stored());
+  show(readChoice(STORED_AS));
 }

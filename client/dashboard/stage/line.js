@@ -10,7 +10,7 @@ const CAUTION = 0.6;
 const MAX_UNDER_WAY = 4;
 const MEMORY = 0.7; // weight of what came before
 const RECENT = 12;
-/** Pictures from the largest on. bytes: share of the full picture's, of JPEGs of tissue (tests/client/test_line_in_browser.py). */
+/** Pictures from the largest on. bytes: share of the full picture's, about, as JPEGs of tissue have. */
 const LEVELS = [
   { width: 1, quality: undefined, bytes: 1 },
   { width: 1, quality: 60, bytes: 0.4 },

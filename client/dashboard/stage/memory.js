@@ -5,6 +5,7 @@ import { bodyOf, getReport, request } from "../base/api.js";
 import { soon } from "../base/events.js";
 import { insist } from "../base/pause.js";
 import { Problem } from "../base/problem.js";
+import { readChoice, writeChoice } from "../base/storage.js";
 import { DamagedError } from "../player/decode.js";
 import { Detail } from "../player/detail.js";
 import { CannotDrawError } from "../player/gpu.js";
@@ -15,7 +16,7 @@ const SCENE = "scene.safetensors";
 const PARTIAL = 206;
 const EYES = ["left", "right"];
 const MAX_SIDE_PX = 4096;
-const KEPT_AS = "intrasplat-drawing";
+const STORED_AS = "intrasplat-drawing";
 /** Whether this browser draws: where it has a graphics processor, wherever it can, or never. */
 export const CHOICES = ["automatic", "always", "never"];
 
@@ -30,7 +31,7 @@ export class Memory extends EventTarget {
     this.mayDownload = mayDownload;
     /** @type {Player | null} */
     this.player = null;
-    this.choice = keptChoice();
+    this.choice = storedChoice();
     this.open(null);
   }
 
@@ -45,11 +46,7 @@ export class Memory extends EventTarget {
   /** @param {"automatic"|"always"|"never"} choice kept for the next visit */
   choose(choice) {
     this.choice = choice;
-    try {
-      localStorage.setItem(KEPT_AS, choice);
-    } catch {
-      // the choice holds until the page is closed
-    }
+    writeChoice(STORED_AS, choice);
     this.open(this.scene);
   }
 
@@ -146,13 +143,9 @@ export class Memory extends EventTarget {
   }
 }
 
-function keptChoice() {
-  try {
-    const kept = localStorage.getItem(KEPT_AS);
-    return CHOICES.includes(kept) ? kept : "automatic";
-  } catch {
-    return "automatic";
-  }
+function storedChoice() {
+  const stored = readChoice(STORED_AS);
+  return CHOICES.includes(stored) ? stored : "automatic";
 }
 
 /** @param {Error} error @returns {string} why this browser does not draw */
