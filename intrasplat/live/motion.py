@@ -18,6 +18,8 @@ from intrasplat.splat.constants import SH_C0
 Floats = NDArray[np.float32]
 NOISE_PX, DEPTH_NOISE_PX = 0.2, 0.3
 """Motion across the view, and change of disparity, in px of the coarse grid, that are as likely noise as motion."""
+MAX_OFF = 0.2
+"""Relative difference of depth from which on the model shows something else than the recorded frame."""
 
 
 class FlowStart:
@@ -45,8 +47,12 @@ class FlowStart:
         return np.asarray(camera @ start.axes.T, np.float32)
 
     def look_at(self, shown: DepthClip) -> None:
-        """Follow from the last frame as the model shows it, so that errors do not add up."""
-        self._last = CoarseFrame(shown, 0, self._grid)
+        """Follow from the last frame as the model shows it, so that errors do not add up.
+
+        Where its depth is not near that of the recorded frame, such as behind an instrument, the recorded one counts.
+        """
+        recorded_mm, self._last = self._last.depth_mm, CoarseFrame(shown, 0, self._grid)
+        self._last.correct_depth(recorded_mm, np.abs(self._last.depth_mm - recorded_mm) > MAX_OFF * recorded_mm)
 
     def to(self, clip: DepthClip) -> Carried:
         """The motion from the last frame to this clip's, which becomes the last one."""
@@ -77,4 +83,6 @@ class Carried:
         row = np.clip(np.rint(row), 0, height - 1).astype(np.intp)
         column = np.clip(np.rint(column), 0, width - 1).astype(np.intp)
         moved_mm, colour = (np.ascontiguousarray(each[row, column].T) for each in (self.displacement_mm, self.colour))
+        depth_mm = start.depth_mm[row, column]
+        moved_mm *= np.abs(z - depth_mm) <= MAX_OFF * depth_mm
         return moved_mm, np.asarray(colour / np.float32(SH_C0), np.float32)

@@ -80,11 +80,19 @@ class CoarseFrame:
         usable = grid.sample(clip.tissue[index]) & (depth_mm > 0)
         pose = clip.world_from_camera[index].astype(np.float32)
         self.grid, self.axes, self.place_mm = grid, pose[:3, :3], pose[:3, 3]
-        self.depth_mm = complete_depth(depth_mm, usable, np.ones_like(usable))
-        self.points_mm: Floats = (grid.rays * self.depth_mm[..., None]) @ self.axes.T + self.place_mm
+        self._put(complete_depth(depth_mm, usable, np.ones_like(usable)))
         confidence = grid.sample(clip.depth_confidence[index]) / np.float32(255)
         self.trust = np.where(usable, confidence, np.float32(0))
         clip.let_go(index)
+
+    def _put(self, depth_mm: Floats) -> None:
+        self.depth_mm = depth_mm
+        self.points_mm: Floats = (self.grid.rays * depth_mm[..., None]) @ self.axes.T + self.place_mm
+
+    def correct_depth(self, depth_mm: Floats, where: NDArray[np.bool_]) -> None:
+        """Take another depth [h, w], without any confidence, where [h, w] tells so."""
+        self._put(np.where(where, depth_mm, self.depth_mm))
+        self.trust[where] = 0
 
     def stands_at(self, other: CoarseFrame) -> bool:
         """Whether both frames have the same camera pose."""
