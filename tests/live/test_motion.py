@@ -51,7 +51,7 @@ def test_what_lies_far_from_the_surface_stays() -> None:
     start = FlowStart(first)
     start.look_at(_shown(first, 1.0))
     carried = start.to(second)
-    rays = (start._grid.rays * carried.start.depth_mm[..., None]).reshape(-1, 3)  # noqa: SLF001
+    rays = (start._grid.rays * carried.start.depth_mm[..., None]).reshape(-1, 3)
     on_it, _ = carried.of(rays)
     behind, _ = carried.of(1.5 * rays)
     assert np.abs(on_it).max() > 0.5
