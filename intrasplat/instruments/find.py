@@ -46,6 +46,11 @@ MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
 BORDER_PX = 2
 """Width of the coarse picture's border."""
 CLOSED_PX, GROWN_PX = 3, 3
+EDGE_SHARE, DARK_EDGE, COLOURED_EDGE = 0.02, 0.6, 0.15
+"""Signs of an instrument's own edge or shadow, of pixels up to EDGE_SHARE of the width from it: maximum brightness,
+relative to the surrounding tissue's; minimum difference of (green - blue) / (green + blue) from it."""
+ENTRY_SHARE = 0.05
+"""Share of the width: so near to the border, where the eyes do not overlap, depth does not limit an instrument."""
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
 """Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
 because highlights have no colour either; minimum share of its outline with a step in redness."""
@@ -261,26 +266,49 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
     The mask grows by a rim, because matching and blur extend over the outline.
     """
     size = picture.fine.shape[1::-1]
-    redness = cv2.GaussianBlur(_redness(picture.fine), (3, 3), 0) / np.float32(look.redness)
     enlarged = [_resized(each.pixels, size) for each in candidates]
     zone_px = 2 * round(ZONE_SHARE * size[0]) + 1
-    far = (cv2.dilate(np.maximum.reduce(enlarged), _box(zone_px)) == 0).astype(np.float32)
+    near = cv2.dilate(np.maximum.reduce(enlarged), _box(zone_px)) == 0
+    far = (near & (_resized(picture.field, size) > 0)).astype(np.float32)
+    colour = _colour(picture.fine, look)
     window = round(LOCAL_SHARE * size[0]) | 1
-    around = np.minimum(_mean(redness * far, window) / np.maximum(_mean(far, window), 1e-3), MAX_LOCAL_REDNESS)
+    tissue = _mean(colour * far[..., None], window) / np.maximum(_mean(far, window), 1e-3)[..., None]
+    redness, around = colour[..., 0], np.minimum(tissue[..., 0], MAX_LOCAL_REDNESS)
+    strip = cv2.dilate(picture.border.astype(np.uint8), _box(2 * round(ENTRY_SHARE * COARSE_WIDTH) + 1))
+    entry = _resized(strip & picture.field, size) if ENTRY_SHARE else np.zeros(size[::-1], np.uint8)
     found = np.zeros(size[::-1], np.uint8)
     for each, whole in zip(candidates, enlarged, strict=True):
         core = cv2.erode(whole, _box(3), borderValue=1)
         own = float(np.median(redness[core > 0])) if core.any() else 0.2
         zone = cv2.dilate(whole, _box(zone_px)) | _resized(_around_tip(each.pixels, picture.border) & in_front, size)
+        zone |= entry
         like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
-        count, label = cv2.connectedComponents(like, connectivity=8)
-        connected = np.zeros(count, np.bool_)
-        connected[label[core > 0]] = True
-        connected[0] = False
-        found |= _closed(connected[label].astype(np.uint8), CLOSED_PX)
+        found |= _closed(_connected(like, core), CLOSED_PX)
+    edge = (colour[..., 1] < DARK_EDGE * tissue[..., 1]) | (np.abs(colour[..., 2] - tissue[..., 2]) > COLOURED_EDGE)
+    beside = cv2.dilate(found, _box(2 * round(EDGE_SHARE * size[0]) + 1))
+    if EDGE_SHARE: found = _closed(_connected(found | (edge & beside), found), CLOSED_PX)
     found = cv2.dilate(found, _box(GROWN_PX))
     tool: Mask = cv2.resize(found * np.uint8(255), picture.size[::-1], interpolation=cv2.INTER_LINEAR) > 127
     return tool
+
+
+def _colour(rgb: Rgb, look: TissueLook) -> Image:
+    """[h, w, 3] of a picture: redness relative to the tissue's, brightness, (green - blue) / (green + blue)."""
+    smooth = cv2.GaussianBlur(rgb, (3, 3), 0).astype(np.float32)
+    red, green, blue = cv2.split(smooth)
+    yellow = (green - blue) / (green + blue + np.float32(DARK_LEVELS))
+    redness = cv2.GaussianBlur(_redness(rgb), (3, 3), 0) / np.float32(look.redness)
+    colour: Image = cv2.merge([redness, cv2.max(cv2.max(red, green), blue), yellow])
+    return colour
+
+
+def _connected(like: Bits, core: Bits) -> Bits:
+    """The areas of `like` that contain a pixel of `core`."""
+    count, label = cv2.connectedComponents(like, connectivity=8)
+    chosen = np.zeros(count, np.uint8)
+    chosen[label[core > 0]] = 1
+    chosen[0] = 0
+    return chosen[label]
 
 
 def _around_tip(pixels: Mask, border: Mask) -> Mask:
