@@ -118,8 +118,8 @@ SHAFT, EDGE = (slice(104, 132), slice(0, 120)), (slice(132, 136), slice(8, 120))
 
 
 def shaft(edge_rgb: tuple[float, float, float], without_depth: int = 0) -> FoundMask:
-    """What is found of a grey shaft from the left border whose lower side has the tissue's colour times edge_rgb. In its
-    lower rows, the first columns have the tissue's depth."""
+    """What is found of a grey shaft from the left border whose lower side has the tissue's colour times edge_rgb; its
+    first columns have the tissue's depth in the lower rows."""
     frame = make_phantom(PhantomSettings(width=320, height=256, frames=1, seed=5, tools=())).frame(0)
     rgb, depth_mm = frame.left.copy(), frame.depth_mm.copy()
     rgb[SHAFT] = 0.7 * rgb[SHAFT].mean(axis=2, keepdims=True)
