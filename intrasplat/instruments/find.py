@@ -51,7 +51,7 @@ DARK_EDGE, COLOURED_EDGE = 0.6, 0.15
 """Signs of an instrument's edge: maximum brightness relative to the surrounding tissue's; minimum difference of
 (green - blue) / (green + blue) from it."""
 ENTRY_SHARE = 0.05
-"""Share of the width: at the border, where the eyes hardly overlap, an instrument extends so far without depth."""
+"""Share of the width: this near to the border, where the eyes hardly overlap, masks extend so far without depth."""
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
 """Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
 because highlights have no colour either; minimum share of its outline with a step in redness."""
@@ -271,12 +271,15 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
     zone_px = 2 * round(ZONE_SHARE * size[0]) + 1
     colour, tissue = _colour(picture.fine, look), _around(picture, candidates, look)
     redness, around = colour[0], np.minimum(tissue[0], MAX_LOCAL_REDNESS)
-    strip = cv2.dilate(picture.border.view(np.uint8), _box(2 * round(ENTRY_SHARE * COARSE_WIDTH) + 1)) > 0
+    entry = _box(2 * round(ENTRY_SHARE * COARSE_WIDTH) + 1)
+    strip = (cv2.dilate(picture.border.view(np.uint8), entry) > 0) & picture.field
     found = np.zeros(size[::-1], np.uint8)
     for each, whole in zip(candidates, enlarged, strict=True):
         core = cv2.erode(whole, _box(3), borderValue=1)
         own = float(np.median(redness[core > 0])) if core.any() else 0.2
-        beyond = (_around_tip(each.pixels, picture.border) & in_front) | (strip & picture.field)
+        beyond = (_around_tip(each.pixels, picture.border) & in_front) | (
+            strip & (cv2.dilate(each.pixels.view(np.uint8), entry) > 0)
+        )
         zone = cv2.dilate(whole, _box(zone_px)) | _resized(beyond, size)
         like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
         found |= _closed(_connected(like, core), CLOSED_PX)
