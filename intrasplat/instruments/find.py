@@ -16,6 +16,7 @@ Rgb = NDArray[np.uint8]  # [H, W, 3]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
+Colour = tuple[Image, Image, Image]
 
 COARSE_WIDTH, FINE_WIDTH = 160, 320
 """Widths, px, of the reduced pictures in which instruments, then their outlines, are searched."""
@@ -46,6 +47,11 @@ MAX_LOCAL_REDNESS, TIP_FRONT = 1.2, 0.05
 BORDER_PX = 2
 """Width of the coarse picture's border."""
 CLOSED_PX, GROWN_PX = 3, 3
+DARK_EDGE, COLOURED_EDGE = 0.6, 0.15
+"""Signs of an instrument's edge: maximum brightness relative to the surrounding tissue's; minimum difference of
+(green - blue) / (green + blue) from it."""
+ENTRY_SHARE = 0.05
+"""Share of the width: this near to the border, where the eyes hardly overlap, masks extend so far without depth."""
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
 """Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
 because highlights have no colour either; minimum share of its outline with a step in redness."""
@@ -258,29 +264,66 @@ def _ramp(value: float, between: tuple[float, float]) -> float:
 def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask, look: TissueLook) -> Mask:
     """Mask [H, W] of the candidates, up to where redness is half-way between their own and the surrounding tissue's.
 
-    The mask grows by a rim, because matching and blur extend over the outline.
+    Edges of another kind follow (_edge). The mask grows by a rim, because matching and blur extend over the outline.
     """
     size = picture.fine.shape[1::-1]
-    redness = cv2.GaussianBlur(_redness(picture.fine), (3, 3), 0) / np.float32(look.redness)
     enlarged = [_resized(each.pixels, size) for each in candidates]
     zone_px = 2 * round(ZONE_SHARE * size[0]) + 1
-    far = (cv2.dilate(np.maximum.reduce(enlarged), _box(zone_px)) == 0).astype(np.float32)
-    window = round(LOCAL_SHARE * size[0]) | 1
-    around = np.minimum(_mean(redness * far, window) / np.maximum(_mean(far, window), 1e-3), MAX_LOCAL_REDNESS)
+    colour, tissue = _colour(picture.fine, look), _around(picture, candidates, look)
+    redness, around = colour[0], np.minimum(tissue[0], MAX_LOCAL_REDNESS)
+    entry = _box(2 * round(ENTRY_SHARE * COARSE_WIDTH) + 1)
+    strip = (cv2.dilate(picture.border.view(np.uint8), entry) > 0) & picture.field
     found = np.zeros(size[::-1], np.uint8)
     for each, whole in zip(candidates, enlarged, strict=True):
         core = cv2.erode(whole, _box(3), borderValue=1)
         own = float(np.median(redness[core > 0])) if core.any() else 0.2
-        zone = cv2.dilate(whole, _box(zone_px)) | _resized(_around_tip(each.pixels, picture.border) & in_front, size)
+        beyond = (_around_tip(each.pixels, picture.border) & in_front) | (
+            strip & (cv2.dilate(each.pixels.view(np.uint8), entry) > 0)
+        )
+        zone = cv2.dilate(whole, _box(zone_px)) | _resized(beyond, size)
         like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
-        count, label = cv2.connectedComponents(like, connectivity=8)
-        connected = np.zeros(count, np.bool_)
-        connected[label[core > 0]] = True
-        connected[0] = False
-        found |= _closed(connected[label].astype(np.uint8), CLOSED_PX)
-    found = cv2.dilate(found, _box(GROWN_PX))
+        found |= _closed(_connected(like, core), CLOSED_PX)
+    found = cv2.dilate(found | _edge(found, colour, tissue), _box(GROWN_PX))
     tool: Mask = cv2.resize(found * np.uint8(255), picture.size[::-1], interpolation=cv2.INTER_LINEAR) > 127
     return tool
+
+
+def _edge(found: Bits, colour: Colour, tissue: Colour) -> Bits:
+    """An instrument [h, w] with the pixels beside it that are darker than the surrounding tissue or of another hue: its
+    shaded side, its shadow, and coloured parts that reflect tissue."""
+    beside = cv2.dilate(found, _box(2 * round(ZONE_SHARE * found.shape[1]) + 1))
+    other = (colour[1] < np.float32(DARK_EDGE) * tissue[1]) | (cv2.absdiff(colour[2], tissue[2]) > COLOURED_EDGE)
+    return _closed(_connected(found | (other & beside), found), CLOSED_PX)
+
+
+def _colour(rgb: Rgb, look: TissueLook) -> Colour:
+    """Images [h, w] of a picture: redness relative to the tissue's, brightness, (green - blue) / (green + blue)."""
+    red, green, blue = (each.astype(np.float32) for each in cv2.split(cv2.GaussianBlur(rgb, (3, 3), 0)))
+    redness = (red - green) / (red + green + np.float32(DARK_LEVELS)) / np.float32(look.redness)
+    hue = (green - blue) / (green + blue + np.float32(DARK_LEVELS))
+    return redness, cv2.max(cv2.max(red, green), blue), hue
+
+
+def _around(picture: Looked, candidates: Sequence[_Candidate], look: TissueLook) -> Colour:
+    """The mean colour (_colour) of the tissue around each pixel of the fine picture."""
+    size, (width, height) = picture.coarse.shape[1::-1], picture.fine.shape[1::-1]
+    taken = np.logical_or.reduce([each.pixels for each in candidates]).view(np.uint8)
+    far = cv2.dilate(taken, _box(2 * round(ZONE_SHARE * size[0]) + 1)) < picture.field
+    weight, window = far.astype(np.float32), round(LOCAL_SHARE * size[0]) | 1
+    count = np.maximum(_mean(weight, window), np.float32(1e-3))
+    means = [_mean(each * weight, window) / count for each in _colour(picture.coarse, look)]
+    redness, light, hue = (cv2.resize(each, (width, height), interpolation=cv2.INTER_LINEAR) for each in means)
+    return redness, light, hue
+
+
+def _connected(like: Bits, core: Bits) -> Bits:
+    """The areas [h, w] of `like` that contain a pixel of `core`."""
+    count, label = cv2.connectedComponents(like, connectivity=8)
+    chosen = np.zeros(count, np.uint8)
+    chosen[label[core > 0]] = 1
+    chosen[0] = 0
+    connected: Bits = chosen[label]
+    return connected
 
 
 def _around_tip(pixels: Mask, border: Mask) -> Mask:

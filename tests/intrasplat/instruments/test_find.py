@@ -113,6 +113,33 @@ def looked_at_with(column: slice, colour: float, nearer: float) -> FoundMask:
     return find_instruments(picture, nearness_of(picture.coarse, depth_mm), TissueLook.of([frame.left]))
 
 
+SHAFT, EDGE = (slice(104, 132), slice(0, 120)), (slice(132, 136), slice(8, 120))
+"""Rows and columns of an instrument, and of its lower side."""
+
+
+def shaft(edge_rgb: tuple[float, float, float], without_depth: int = 0) -> FoundMask:
+    """What is found of a grey shaft from the left border whose lower side has the tissue's colour times edge_rgb; its
+    first columns have the tissue's depth in the lower rows."""
+    frame = make_phantom(PhantomSettings(width=320, height=256, frames=1, seed=5, tools=())).frame(0)
+    rgb, depth_mm = frame.left.copy(), frame.depth_mm.copy()
+    rgb[SHAFT] = 0.7 * rgb[SHAFT].mean(axis=2, keepdims=True)
+    rgb[EDGE] = np.median(rgb[EDGE], axis=(0, 1)) * edge_rgb
+    depth_mm[104:114, :120] /= 1.25
+    depth_mm[114:136, without_depth:120] /= 1.25
+    picture = Looked.at(rgb)
+    return find_instruments(picture, nearness_of(picture.coarse, depth_mm), TissueLook.of([frame.left]))
+
+
+@pytest.mark.parametrize("edge_rgb", [(0.4, 0.4, 0.4), (1.0, 1.0, 0.3)], ids=["in shade", "golden"])
+def test_an_edge_as_red_as_tissue_is_masked(edge_rgb: tuple[float, float, float]) -> None:
+    assert shaft(edge_rgb).tool[EDGE].mean() > 0.95
+    assert not shaft((1.0, 1.0, 1.0)).tool[EDGE][2:].any()
+
+
+def test_an_instrument_is_masked_up_to_the_border_where_stereo_sees_no_depth() -> None:
+    assert shaft((1.0, 1.0, 1.0), without_depth=16).tool[118:132, :16].mean() > 0.95
+
+
 INSIDE, FROM_BORDER = slice(120, 220), slice(0, 120)
 
 
