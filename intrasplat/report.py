@@ -184,6 +184,25 @@ class CameraPoses(BaseModel):
     unsure_frames: tuple[int, ...] = Field(default=(), description="frames whose pose is not to be relied on")
 
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class RecordedPixels(BaseModel):
+    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a kept frame shows.
+
+    x, y count in pixels of the full size, from the middle of the first one. With (X, Y, Z) = rays (x, y, 1), the
+    recorded pixel is camera (D(X / Z, Y / Z), 1), where D is OpenCV's distortion. The defaults move nothing.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    width: int = Field(gt=0, description="width of the recorded eye in pixels")
+    height: int = Field(gt=0, description="height of the recorded eye in pixels")
+    rays: tuple[float, ...] = Field(default=IDENTITY, min_length=9, max_length=9, description="3x3, row-major")
+    distortion: tuple[float, ...] = Field(default=(), description="OpenCV's coefficients k1 k2 p1 p2 k3 and on")
+    camera: tuple[float, ...] = Field(default=IDENTITY, min_length=9, max_length=9, description="3x3, row-major")
+
+
 class Recorded(BaseModel):
     """Which recorded frames a scene keeps, as its cameras see them: rectified, with corrected colours."""
 
@@ -195,6 +214,9 @@ class Recorded(BaseModel):
     height: int = Field(gt=0, description="height of a picture in pixels")
     masks: bool = Field(description="whether masks are kept with them; False: every pixel counts as tissue")
     size_bytes: int = Field(ge=0, description="what they take on the disk")
+    pixels: RecordedPixels | None = Field(
+        default=None, description="which pixels of the recording they show; None: a report of before it was said"
+    )
 
 
 class Imported(BaseModel):

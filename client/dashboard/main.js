@@ -11,7 +11,7 @@ import { currentKey, keyEvents, showKeyForm } from "./base/key.js";
 import { listenToKeys, onKeys } from "./base/keys.js";
 import { figure, languageEvents, showWords, words } from "./base/messages.js";
 import { pause } from "./base/pause.js";
-import { failureOf } from "./base/problem.js";
+import { connectionLost, failureOf } from "./base/problem.js";
 import { fileName, save } from "./base/save.js";
 import { Scopes } from "./base/scopes.js";
 import { ClipForm } from "./form/form.js";
@@ -153,7 +153,7 @@ async function report(id) {
     compare.know(id, found);
     offerError(found);
     verdict.know(found);
-    showReport(get("report"), id, found, sendAgain);
+    showReport(get("report"), id, found, { onMasks: sendAgain, onPaint: paintMasks });
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
@@ -194,12 +194,27 @@ function showProgress() {
   waiting.tell(isUnderWay ? shareOf(job) : null, isUnderWay ? progressOf(job, times) : "");
 }
 
-/** A job's clip is sent again. @param {string} id @param {"masks"|"calibration"} [part] the file that is asked for */
-function sendAgain(id, part = "masks") {
+/** @param {string} id @param {"masks"|"calibration"} [part] the file that goes with a job's clip @param {File} [painted] */
+function sendAgain(id, part = "masks", painted) {
   const job = jobs.byId.get(id);
   if (!job) return;
   drawers.open("drawer", false);
-  form.sendAgain(job, part);
+  form.sendAgain(job, part, painted);
+}
+
+/** @type {typeof import("./masks/brush.js") | null} loaded when it is wanted first */
+let brush = null;
+
+/** @param {string} id @param {import("./base/wire.js").Report} found its report */
+async function paintMasks(id, found) {
+  viewer.timeline.play(false);
+  try {
+    brush ??= await import("./masks/brush.js");
+    await brush.styled();
+  } catch {
+    return tell(connectionLost().message);
+  }
+  brush.openBrush(id, found, (masks) => sendAgain(id, "masks", masks));
 }
 
 function offerMasks() {
@@ -322,7 +337,10 @@ const form = new ClipForm(
     refusal: get("upload-refusal"),
   },
   {
-    onJob: expect,
+    onJob(id) {
+      brush?.forgetStrokes();
+      expect(id);
+    },
     onSend: send,
     onShare(share) {
       announcer.send(share);

@@ -728,6 +728,28 @@ class Recorded(Model):
     """whether masks are kept with them; False: every pixel counts as tissue"""
     size_bytes: int
     """what they take on the disk"""
+    pixels: RecordedPixels | None = None
+    """which pixels of the recording they show; None: a report of before it was said"""
+
+
+class RecordedPixels(Model):
+    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a kept frame shows.
+
+    x, y count in pixels of the full size, from the middle of the first one. With (X, Y, Z) = rays (x, y, 1),
+    the recorded pixel is camera (D(X / Z, Y / Z), 1), where D is OpenCV's distortion. The defaults move
+    nothing.
+    """
+
+    width: int
+    """width of the recorded eye in pixels"""
+    height: int
+    """height of the recorded eye in pixels"""
+    rays: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    """3x3, row-major"""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients k1 k2 p1 p2 k3 and on"""
+    camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    """3x3, row-major"""
 
 
 class Refusal(Model):

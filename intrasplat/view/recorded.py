@@ -7,6 +7,7 @@ Symbols: h w pixels of a picture.
 from __future__ import annotations
 
 import io
+import itertools
 import zipfile
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from intrasplat.machine.mapped import let_go
 from intrasplat.names import DETAIL, RECORDED
 from intrasplat.names import Eye as EyeName
 from intrasplat.picture import RecordedMasks
-from intrasplat.report import Recorded
+from intrasplat.report import Recorded, RecordedPixels
 from intrasplat.scene.recorded_file import EYES, MASK, PICTURE, name_of, nearest, read_frame
 from intrasplat.scene.recorded_video import RecordedEye, encoded
 from intrasplat.scene.scene import TrainedScene
@@ -104,8 +105,22 @@ def recorded_files(
         height=lens.height,
         masks=is_masked,
         size_bytes=len(zipped) + len(video or b""),
+        pixels=_recorded_pixels(clip),
     )
     return {RECORDED: zipped, DETAIL: video}, summary
+
+
+def _recorded_pixels(clip: DepthClip) -> RecordedPixels:
+    """Where the left eye's pixels are in the recording."""
+    height, width = clip.tissue.shape[1:]
+    done = clip.rectification
+    if done is None:
+        return RecordedPixels(width=width, height=height)
+    rays = np.linalg.inv(np.array(done.projection)[:, :3] @ np.array(done.rotation))
+    camera = tuple(itertools.chain(*done.camera))
+    return RecordedPixels(
+        width=width, height=height, rays=tuple(rays.ravel().tolist()), distortion=done.distortion, camera=camera
+    )
 
 
 def _zipped(

@@ -91,6 +91,11 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
             page.show(drawer)
             page.until(lambda drawer=drawer: page.find(f"#{drawer}").is_displayed())  # type: ignore[misc]
             found[drawer] = violations(page, axe)
+        page.click(f'#report button[aria-label="{say("brush.title", language)}"]')
+        page.until(lambda: page.script("return document.querySelector('.brush')?.dataset.shown") == "0")
+        found["brush"] = violations(page, axe)
+        assert page.script(LAYOUT_OF_BRUSH, MIN_TOUCH_PX) == {"off": [], "small": [], "isLarge": True}
+        page.click(".brush header button")
         page.click("#report-drawer [data-close]")
         page.click("#show-help")
         page.until(lambda: page.find("#help").is_displayed())
@@ -111,6 +116,17 @@ def test_axe_finds_nothing_in_any_state_of_the_page(
     assert {state: each for state, each in found.items() if each} == {}
 
 
+LAYOUT_OF_BRUSH = """
+const used = [...document.querySelectorAll(".brush button, .brush input")];
+const box = (each) => each.getBoundingClientRect();
+const isOff = ({ left, right, bottom }) => left < 0 || right > innerWidth + 1 || bottom > innerHeight + 1;
+const named = (some, is) => some.filter((each) => is(box(each))).map((each) => each.ariaLabel);
+return {
+  off: named(used.filter((each) => !each.closest(".strip")), isOff), // the strip scrolls
+  small: named(used, ({ width, height }) => Math.min(width, height) < arguments[0]),
+  isLarge: box(document.querySelector(".brush .paper")).height > 0.4 * innerHeight,
+};
+"""
 LAYOUT = """
 const all = "button, select, input, summary, #time-value, #readout, #badge, .notice, #connection";
 const seen = { opacityProperty: true, visibilityProperty: true };

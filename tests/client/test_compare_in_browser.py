@@ -15,6 +15,7 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.clip import Eye as ClipEye
 from intrasplat.names import RECORDED, Eye
+from intrasplat.report import Masks
 from intrasplat.scene.recorded_file import EYES
 from intrasplat.view.recorded import recorded_files
 from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
@@ -54,7 +55,8 @@ def recorded_scene(site: Site, eyes: tuple[Eye, ...] = ("left",), *, masks: bool
     clip = DepthClip(**left, frame_times_s=np.arange(FRAMES) / 25, right=ClipEye(**right))
     files, kept = recorded_files(clip, eyes, ())
     (site.store.scene_folder(scene, 1) / RECORDED).write_bytes(files[RECORDED] or b"")
-    site.store.add_scores(WORKER, scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"recorded": kept}))
+    given = Masks(source="given", share=0.5) if masks else None
+    site.store.add_scores(WORKER, scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"recorded": kept, "masks": given}))
     return scene
 
 

@@ -298,7 +298,17 @@
  *   height: number,
  *   masks: boolean,
  *   size_bytes: number,
+ *   pixels?: RecordedPixels | null,
  * }} Recorded
+ */
+/**
+ * @typedef {{
+ *   width: number,
+ *   height: number,
+ *   rays?: number[],
+ *   distortion?: number[],
+ *   camera?: number[],
+ * }} RecordedPixels
  */
 /**
  * @typedef {{

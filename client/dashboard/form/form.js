@@ -83,8 +83,9 @@ export class ClipForm {
    * Use a job's clip again with another file: its options are chosen, and the file is asked for.
    * @param {import("../base/api.js").Job} job
    * @param {"masks"|"calibration"} part
+   * @param {File} [painted] the masks, white on instruments
    */
-  sendAgain(job, part) {
+  sendAgain(job, part, painted) {
     this.#startAnew();
     this.earlier = job;
     this.asked = part;
@@ -95,6 +96,9 @@ export class ClipForm {
     this.#showSource();
     this.form.scrollIntoView();
     this.form.elements[part].focus({ preventScroll: true });
+    if (!painted) return;
+    this.form.elements.mask_polarity.value = "tool";
+    this.take([painted]);
   }
 
   /** Send the clip that comes with the page. @param {string} label its name */

@@ -13,6 +13,8 @@ import { lightMark, reasonsOf, trustOf } from "./trustlight.js";
 /** @param {Report["masks"]} masks */
 const areFound = (masks) => masks?.source === "found" || masks?.source === "segmenter";
 
+/** Coefficients of a lens that the brush knows; further ones tilt the sensor. */
+const MAX_DISTORTION = 12;
 /** More reasons for care than these are under "details". */
 const MAX_REASONS = 3;
 
@@ -63,22 +65,38 @@ function careful(report, trust) {
 
 const listOf = (sentences, name) => element("ul", { class: name }, ...sentences.map((text) => element("li", { text })));
 
+/**
+ * Whether the masks can be painted in the page: there are frames to paint on, and masks in the pixels of the recording. Given
+ * masks are known only as the frames have them, so these must be all frames, as they were recorded.
+ * @param {Report} report
+ */
+function canPaint({ masks, recorded, frame_count: count }) {
+  const pixels = recorded?.pixels;
+  if (!masks || !pixels || pixels.distortion.slice(MAX_DISTORTION).some(Boolean)) return false;
+  if (areFound(masks) || !masks.share) return true;
+  const isAsRecorded = pixels.distortion.length === 0 && pixels.rays.every((each, i) => each === (i % 4 === 0 ? 1 : 0));
+  return recorded.frames.length === count && recorded.width === pixels.width && isAsRecorded;
+}
+
 /** How to send better masks. */
-function correction(id, { masks }, message, onMasks) {
+function correction(id, report, message, { onMasks, onPaint }) {
+  const { masks } = report;
   if (!masks) return [];
+  const paint = canPaint(report) ? [button(words("brush.title"), () => onPaint(id, report))] : [];
   const send = button(words(masks.source === "none" ? "report.send_masks" : "report.send_better_masks"), () => onMasks(id));
-  if (!areFound(masks) || !masks.share) return [send];
+  if (!areFound(masks) || !masks.share) return [...paint, send];
   const save = button(words("report.save_masks"), () => download(() => getMasks(id), message));
-  return [save, send, element("p", { class: "quiet", text: words("report.how_to_correct") })];
+  return [...paint, save, send, element("p", { class: "quiet", text: words("report.how_to_correct") })];
 }
 
 /**
  * @param {HTMLElement} target
  * @param {string} id
  * @param {Report} report
- * @param {(id: string) => void} onMasks better masks are to be sent for this scene's clip
+ * @param {{onMasks: (id: string) => void, onPaint: (id: string, report: Report) => void}} told better masks are to be sent
+ *   for this scene's clip, or to be painted
  */
-export function showReport(target, id, report, onMasks) {
+export function showReport(target, id, report, told) {
   const trust = trustOf(report);
   const message = element("div", { class: "message bad" });
   const isOpen = target.querySelector("details.figures")?.open ?? false;
@@ -91,7 +109,7 @@ export function showReport(target, id, report, onMasks) {
     ...careful(report, trust),
     ...lightList(report.light),
     figures,
-    ...correction(id, report, message, onMasks),
+    ...correction(id, report, message, told),
     message,
   );
 }

@@ -12,10 +12,11 @@ import pytest
 
 from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip, Eye
+from intrasplat.clip.recorded_masks import Rectification
 from intrasplat.errors import InputError, SceneError
 from intrasplat.names import RECORDED
 from intrasplat.picture import RecordedMasks
-from intrasplat.report import Masks
+from intrasplat.report import Masks, RecordedPixels
 from intrasplat.scene.recorded_file import EYES, MAX_FRAME_BYTES
 from intrasplat.view.recorded import MARK, MAX_MOMENTS, MAX_WIDTH, live_frame, recorded_files, stored_frame
 
@@ -201,3 +202,26 @@ def test_a_file_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> No
             archive.writestr("left/000000.jpg", bytes(size))
         with pytest.raises(SceneError, match="cannot be read"):
             stored_frame(tmp_path, FRAMES, 0.0)
+
+
+def test_the_report_says_which_recorded_pixel_a_frame_shows() -> None:
+    """Here without distortion, which the page's own test has (tests/client/test_brush_in_browser.py)."""
+    turned = cv2.Rodrigues(np.array([0.02, -0.05, 0.03]))[0]
+    done = Rectification(
+        camera=((60.0, 0.0, 31.0), (0.0, 61.0, 22.0), (0.0, 0.0, 1.0)),
+        distortion=(),
+        rotation=tuple(map(tuple, turned.tolist())),
+        projection=((58.0, 0.0, 30.0, 0.0), (0.0, 58.0, 25.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+    )
+    pixels = recorded_files(dataclasses.replace(clip(), rectification=done), EYES[:1], ())[1].pixels
+    assert pixels is not None
+    x, y = np.meshgrid(np.arange(pixels.width), np.arange(pixels.height))
+    rays = np.reshape(pixels.rays, (3, 3)) @ np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
+    found = (np.reshape(pixels.camera, (3, 3)) @ (rays / rays[2]))[:2].reshape(2, *x.shape)
+    moved = [np.array(each) for each in (done.camera, np.zeros(5), done.rotation, done.projection)]
+    maps = cv2.initUndistortRectifyMap(*moved, (pixels.width, pixels.height), cv2.CV_32FC1)
+    np.testing.assert_allclose(found, maps, atol=1e-3)
+    assert np.abs(maps[0] - x).max() > 2
+    plain = recorded_files(clip(2 * MAX_WIDTH, frames=1), EYES[:1], ())[1]
+    assert plain.width == MAX_WIDTH
+    assert plain.pixels == RecordedPixels(width=2 * MAX_WIDTH, height=48)
