@@ -370,6 +370,7 @@ onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("snapshot", { p: [] }, () => snapshot.take());
+onKeys("close_drawer", { Escape: [] }, () => drawers.close());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
 if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

@@ -511,6 +511,8 @@ export const DE = {
     "unit_deg": "Grad",
     "pieces": "{pieces}, als gewählt wurde",
     "name": "Name der Messung",
+    "unnamed": "Eine Messung braucht einen Namen. Diese heißt weiter {name}.",
+    "list": "Liste der Messungen",
     "delete": "Messung {name} löschen",
     "csv": "Als CSV speichern",
     "away": "In diesem Moment nicht bekannt: Ein Punkt ist außerhalb des Blickfelds des Endoskops.",
@@ -525,7 +527,8 @@ export const DE = {
   "legend": {
     "depth": "Tiefe",
     "confidence": "Verlässlichkeit von Tiefe und Farbe",
-    "mm": "{mm} mm",
+    "nearest": "{mm} mm und näher",
+    "farthest": "{mm} mm und ferner",
     "sure": "sicher",
     "error": "Modell gegen Aufnahme",
     "levels": "{levels}",
@@ -813,6 +816,8 @@ export const DE = {
   },
   "time": {
     "play": "Abspielen",
+    "loop_from": "Ab hier",
+    "loop_to": "Bis hier",
     "pause": "Anhalten",
     "slider": "Zeit",
     "speed": "Geschwindigkeit",
@@ -846,6 +851,7 @@ export const DE = {
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",
     "snapshot": "Ein Bild dieser Ansicht sichern",
+    "close_drawer": "Szenen, neuen Clip oder Bericht schließen",
     "help": "Diese Hilfe zeigen oder schließen"
   },
   "key": {
