@@ -17,9 +17,11 @@ export function spread(boxes, picture) {
     const x = within(box.x, picture.left, picture.right - box.width);
     const line = box.height + BETWEEN_PX;
     const lines = Array.from({ length: 2 * taken.length + 1 }, (_, i) => Math.ceil(i / 2) * (i % 2 ? -1 : 1));
-    const places = lines.map((each) => within(box.y + each * line, picture.top, picture.bottom - box.height));
-    const found = places.map((y) => ({ ...box, x, y })).find((place) => !taken.some((other) => isOver(place, other)));
-    const place = found ?? { ...box, x, y: places[0] };
+    const places = lines.map((each) => {
+      const y = within(box.y + each * line, picture.top, picture.bottom - box.height);
+      return { x, y, width: box.width, height: box.height };
+    });
+    const place = places.find((each) => !taken.some((other) => isOver(each, other))) ?? places[0];
     taken.push(place);
     return [place.x - box.x, place.y - box.y];
   });

@@ -142,6 +142,7 @@ export class Measure {
   #say() {
     const { panel } = this.parts;
     const { place, values } = this.told ?? { place: "measure.first", values: {} };
+    panel.toggleAttribute("data-first", place === "measure.first");
     panel.querySelector(".told").textContent = words(place, values);
     panel.querySelector(".csv").hidden = !this.measurements.some(({ shape }) => shape);
     this.#sayNow();
