@@ -44,7 +44,8 @@ return [...document.querySelectorAll("#measuring .list input")]
 """
 CUT_RINGS = """
 const cut = [];
-for (const each of document.querySelectorAll(".status button, #stage, .tools button, .controls :is(button, select, input)")) {
+const all = ".status button, #stage, .tools button, .controls :is(button, select, input)";
+for (const each of document.querySelectorAll(all)) {
   if (!each.checkVisibility()) continue;
   each.focus({ focusVisible: true });
   const style = getComputedStyle(each);
@@ -52,7 +53,7 @@ for (const each of document.querySelectorAll(".status button, #stage, .tools but
   const out = parseFloat(style.outlineOffset) + parseFloat(style.outlineWidth);
   const { left, top, right, bottom } = each.getBoundingClientRect();
   const isWithin = (box) =>
-    left - out >= box.left - 1 && top - out >= box.top - 1 && right + out <= box.right + 1 && bottom + out <= box.bottom + 1;
+    Math.min(left - box.left, top - box.top, box.right - right, box.bottom - bottom) >= out - 1;
   let isCut = !isWithin({ left: 0, top: 0, right: innerWidth, bottom: innerHeight });
   for (let over = each.parentElement; over !== document.body; over = over.parentElement) {
     isCut ||= getComputedStyle(over).overflow !== "visible" && !isWithin(over.getBoundingClientRect());

@@ -18,9 +18,9 @@ from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
 from tests.client.page import CALIBRATION, Page, Site, site_at
+from tests.client.test_sheet_in_browser import drop
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of
 from tests.client.test_waiting_in_browser import BAR
-from tests.client.test_sheet_in_browser import drop
 from tests.client.words import say
 from tests.service.test_check import RECTIFIED
 
