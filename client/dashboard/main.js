@@ -108,7 +108,9 @@ const facts = () => ({
   warning: get("picture-warning").textContent,
   seam: compare.seam,
 });
-const snapshot = new Snapshot(viewer, { stage: get("stage"), recorded: get("recorded"), button: get("snapshot") }, facts, tell);
+const sides = { recorded: get("recorded"), ofRecorded: get("of-recorded"), ofModel: get("of-model") };
+const pictured = { ...sides, stage: get("stage"), measured: get("over").querySelector("svg"), button: get("snapshot") };
+const snapshot = new Snapshot(viewer, pictured, facts, tell);
 const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
@@ -388,6 +390,7 @@ onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());
 onKeys("measure", { m: [] }, () => viewer.scene && measure.toggle());
 onKeys("snapshot", { p: [] }, () => snapshot.take());
+onKeys("close_drawer", { Escape: [] }, () => drawers.close());
 onKeys("help", { "?": [] }, showHelp);
 listenToKeys();
 if (!address.follow() && location.hash) drawers.open("library", false); // it names no scene, and says so

@@ -184,9 +184,9 @@ def test_the_range_of_depths_is_set_in_the_legend_stays_in_the_link_and_goes_bac
     near = page.find("#legend .near")
     page.until(lambda: (near.get_attribute("value"), far.get_attribute("value")) == ("30", f"{RANGE_MM[0]:.0f}"))
     far.send_keys(Keys.CONTROL + "a", Keys.NULL, "90", Keys.TAB)
-    page.until_text("#legend .high", say("legend.mm", mm="90"))
+    page.until_text("#legend .high", say("legend.farthest", mm="90"))
     near.send_keys(Keys.CONTROL + "a", Keys.NULL, f"{RANGE_MM[0]:.0f}", Keys.TAB)
-    page.until_text("#legend .low", say("legend.mm", mm=f"{RANGE_MM[0]:.0f}"))
+    page.until_text("#legend .low", say("legend.nearest", mm=f"{RANGE_MM[0]:.0f}"))
     asked = site.painter.asked
     assert asked is not None
     assert (asked.near_mm, asked.far_mm) == (RANGE_MM[0], 90)
@@ -194,9 +194,9 @@ def test_the_range_of_depths_is_set_in_the_legend_stays_in_the_link_and_goes_bac
     link = page.script("return location.href")
     page.driver.get("about:blank")
     page.driver.get(link)
-    page.until_text("#legend .high", say("legend.mm", mm="90"))
+    page.until_text("#legend .high", say("legend.farthest", mm="90"))
     page.click("#legend .auto")
-    page.until_text("#legend .high", say("legend.mm", mm=f"{RANGE_MM[1]:.0f}"))
+    page.until_text("#legend .high", say("legend.farthest", mm=f"{RANGE_MM[1]:.0f}"))
     assert site.painter.asked is not None
     assert site.painter.asked.near_mm is None
 
@@ -326,7 +326,7 @@ def test_depth_and_confidence_have_legends_and_colours_have_none(site: Site, pag
     Select(page.find("#layer")).select_by_value("depth")
     page.until_text("#legend", say("legend.depth"))
     assert [page.text(f"#legend {part}") for part in (".low", ".high")] == [
-        say("legend.mm", mm=f"{each:.0f}") for each in RANGE_MM
+        say(f"legend.{end}", mm=f"{each:.0f}") for end, each in zip(("nearest", "farthest"), RANGE_MM, strict=True)
     ]
     colours = page.script("return document.querySelector('#legend .colours').style.backgroundImage")
     assert f"rgb({', '.join(map(str, COLOUR_TABLE[:3]))})" in colours

@@ -8,13 +8,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from selenium.webdriver.common.keys import Keys
 
 from contract.wire.labels import LabelChange
 from tests.client.page import Page, Site, grey_of
+from tests.client.test_compare_in_browser import MODEL_MARK, choose, shade_of, until_frame
+from tests.client.test_sheet_in_browser import follow_measured, viewed
 from tests.client.words import say
 
 SIGNATURE_BYTES = 8
+LINE_BGR = (75, 179, 232)
+"""Of measurements: --warn of style/page.css."""
 
 
 def texts_of(png: bytes) -> dict[str, str]:
@@ -61,3 +66,47 @@ def test_a_picture_of_the_view_says_what_it_shows(site: Site, page: Page, tmp_pa
     caption = picture[528:]
     assert (caption == 0).mean() > 0.6  # on black
     assert (caption > 200).mean() > 0.02  # written
+
+
+def saved(page: Page, folder: Path) -> NDArray[np.uint8]:
+    """[H, W, 3] BGR of the picture that the key saves."""
+    page.find("#stage").send_keys("p")
+    page.until(lambda: list(folder.glob("*.png")))
+    (file,) = folder.glob("*.png")
+    content = np.frombuffer(file.read_bytes(), np.uint8)
+    file.unlink()
+    return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), np.uint8)
+
+
+def test_a_picture_of_a_comparison_names_both_sides_and_has_the_measurements_that_are_shown(
+    site: Site, page: Page, tmp_path: Path
+) -> None:
+    page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    scene = viewed(site, page)
+    follow_measured(site, page, scene)
+
+    def lines(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        return np.asarray(np.all(abs(picture.astype(int) - LINE_BGR) <= 3, axis=2))
+
+    side_px, factor = 660, 660 / 60
+    for mode, left in (("off", 0), ("wipe", 0), ("side", side_px)):
+        choose(page, mode)
+        if mode != "off":
+            until_frame(page, 0)
+        site.announce()
+        picture = saved(page, tmp_path)
+        lower, right = (round(factor * each) for each in (28, 36))  # of the area, in pixels of its picture
+        found = lines(picture)[lower - 3 : lower + 4, left : left + side_px]
+        assert found[:, round(factor * 26) : right].any(axis=0).mean() > 0.8
+        assert not found[:, right + 30 :].any()
+        values = picture[round(factor * 6) : round(factor * 26), left : left + side_px]
+        assert (values.min(axis=2) > 220).sum() > 300  # letters, brighter than the model
+        if mode == "off":
+            continue
+        middle = side_px if mode == "side" else side_px // 2
+        of_recorded, of_model = picture[6:60, :middle], picture[6:60, middle:]
+        assert min((of_recorded > 200).mean(), (of_model < 60).mean()) > 0.005
+        assert shade_of(0) < 60 < grey_of(MODEL_MARK) < 220
+    choose(page, "off")
+    page.click("#measuring .end")
+    assert not lines(saved(page, tmp_path)).any()

@@ -18,6 +18,7 @@ from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
 from tests.client.page import CALIBRATION, Page, Site, site_at
+from tests.client.test_sheet_in_browser import drop
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of
 from tests.client.test_waiting_in_browser import BAR
 from tests.client.words import say
@@ -338,6 +339,9 @@ def test_a_key_that_may_not_send_is_told_so_and_asks_for_nothing_that_is_refused
         page.until(lambda: page.text("#no-jobs") == say("label.none"))
         page.show("drawer")
         page.until(lambda: page.text("#upload") == say("upload.not_allowed"))  # nothing else is offered
+        assert page.text("#upload-message") == ""
+        drop(page, CLIP.name)
+        assert page.text("#upload-message") == say("upload.not_allowed")
         page.show("library")
         page.click("#forget-key")
         page.until(lambda: page.find("#key-text").is_displayed())

@@ -2,8 +2,8 @@
 
 const MORE_PX = 8;
 
-/** Mark a drawer while there is more below what is in view (data-more). @param {HTMLElement} drawer */
-function markMore(drawer) {
+/** Mark what scrolls while there is more below what is in view (data-more). @param {HTMLElement} drawer */
+export function markMore(drawer) {
   const mark = () => {
     const below = drawer.scrollHeight - drawer.scrollTop - drawer.clientHeight;
     drawer.toggleAttribute("data-more", below > MORE_PX);
@@ -18,6 +18,7 @@ export class Drawers {
   constructor(tools) {
     /** @type {string | null} the id of the open one */
     this.isOpen = null;
+    markMore(tools);
     this.buttons = new Map([...tools.querySelectorAll("[data-drawer]")].map((each) => [each.dataset.drawer, each]));
     for (const [id, button] of this.buttons) {
       button.addEventListener("click", () => this.toggle(id));
@@ -34,7 +35,7 @@ export class Drawers {
 
   /** @param {string} id @param {boolean} [takesFocus] false where nobody asked for it */
   open(id, takesFocus = true) {
-    if (!document.activeElement?.closest(".drawer")) this.opener = document.activeElement;
+    if (!document.activeElement?.closest(".drawers")) this.opener = document.activeElement;
     this.#show(id);
     if (takesFocus) document.getElementById(id).querySelector("[data-close]").focus();
   }

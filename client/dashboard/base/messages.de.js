@@ -538,10 +538,12 @@ export const DE = {
     "unit_deg": "Grad",
     "pieces": "{pieces}, als gewählt wurde",
     "name": "Name der Messung",
+    "unnamed": "Eine Messung braucht einen Namen. Diese heißt weiter {name}.",
+    "list": "Liste der Messungen",
     "delete": "Messung {name} löschen",
     "csv": "Als CSV speichern",
     "away": "In diesem Moment nicht bekannt: Ein Punkt ist außerhalb des Blickfelds des Endoskops.",
-    "scale": "{length} mm in der Tiefe der Bildmitte ({depth} mm)",
+    "scale": "{length} mm in {depth} mm Tiefe",
     "axes_mm": "mm, über Sekunden",
     "axes_mm2": "mm², über Sekunden",
     "axes_deg": "Grad, über Sekunden",
@@ -552,7 +554,8 @@ export const DE = {
   "legend": {
     "depth": "Tiefe",
     "confidence": "Verlässlichkeit von Tiefe und Farbe",
-    "mm": "{mm} mm",
+    "nearest": "{mm} mm und näher",
+    "farthest": "{mm} mm und ferner",
     "sure": "sicher",
     "error": "Modell gegen Aufnahme",
     "levels": "{levels}",
@@ -840,6 +843,8 @@ export const DE = {
   },
   "time": {
     "play": "Abspielen",
+    "loop_from": "Ab",
+    "loop_to": "Bis",
     "pause": "Anhalten",
     "slider": "Zeit",
     "speed": "Geschwindigkeit",
@@ -873,6 +878,7 @@ export const DE = {
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",
     "snapshot": "Ein Bild dieser Ansicht sichern",
+    "close_drawer": "Szenen, neuen Clip oder Bericht schließen",
     "help": "Diese Hilfe zeigen oder schließen"
   },
   "key": {

@@ -538,10 +538,12 @@ export const EN = {
     "unit_deg": "degrees",
     "pieces": "{pieces}, when chosen",
     "name": "Name of the measurement",
+    "unnamed": "A measurement needs a name. This one is still {name}.",
+    "list": "List of measurements",
     "delete": "Delete measurement {name}",
     "csv": "Save as CSV",
     "away": "Not known at this moment: a point is out of the endoscope's view.",
-    "scale": "{length} mm at the depth of the middle ({depth} mm)",
+    "scale": "{length} mm at a depth of {depth} mm",
     "axes_mm": "mm, over seconds",
     "axes_mm2": "mm², over seconds",
     "axes_deg": "degrees, over seconds",
@@ -552,7 +554,8 @@ export const EN = {
   "legend": {
     "depth": "Depth",
     "confidence": "Confidence in depth and colour",
-    "mm": "{mm} mm",
+    "nearest": "{mm} mm and nearer",
+    "farthest": "{mm} mm and farther",
     "sure": "sure",
     "error": "Model against the recording",
     "levels": "{levels}",
@@ -840,6 +843,8 @@ export const EN = {
   },
   "time": {
     "play": "Play",
+    "loop_from": "From",
+    "loop_to": "To",
     "pause": "Pause",
     "slider": "Time",
     "speed": "Speed",
@@ -873,6 +878,7 @@ export const EN = {
     "full_screen": "Full screen",
     "copy_link": "Copy the link to this view",
     "snapshot": "Save a picture of this view",
+    "close_drawer": "Close scenes, new clip or report",
     "help": "Show or close this help"
   },
   "key": {

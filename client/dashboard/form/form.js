@@ -166,7 +166,8 @@ export class ClipForm {
     document.addEventListener("dragleave", (event) => hold(event, false));
     document.addEventListener("drop", (event) => {
       hold(event, false);
-      if (!this.isAllowed || event.dataTransfer.files.length === 0) return;
+      if (event.dataTransfer.files.length === 0) return;
+      if (!this.isAllowed) return this.#say(words("upload.not_allowed"), "bad");
       const files = [...event.dataTransfer.files];
       if (files.length === 1 && SAVED_SCENE.test(files[0].name)) return this.onScene(files[0]);
       this.onAsked();

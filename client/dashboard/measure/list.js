@@ -66,10 +66,10 @@ export class MeasurementList {
       name.value = each.name;
     });
     name.addEventListener("focus", () => this.told.onSelect(each));
-    const told = element("div", {}, element("p", { class: "figure" }), element("p", { class: "pieces quiet" }));
+    const told = element("div", { class: "found" }, element("p", { class: "figure" }), element("p", { class: "pieces quiet" }));
     told.addEventListener("click", () => this.told.onSelect(each));
     const remove = button("×", () => this.told.onDelete(each), words("measure.delete", { name: each.name }));
-    const row = element("li", {}, name, told, remove);
+    const row = element("li", {}, element("div", { class: "what" }, name, told), remove);
     this.rows.set(each, row);
     return row;
   }

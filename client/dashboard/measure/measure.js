@@ -4,6 +4,7 @@
 import { getMeasurement } from "../base/api.js";
 import { languageEvents, words } from "../base/messages.js";
 import { drawOverTime, markTime } from "./distances.js";
+import { prepareFold } from "./fold.js";
 import { figureOf, MeasurementList } from "./list.js";
 import { freeName, KINDS, measurementOf, MOST, safeName, shapeAt, textOf } from "./measurements.js";
 import { Overlay } from "./overlay.js";
@@ -20,7 +21,7 @@ export class Measure {
   /**
    * @param {import("../stage/viewer.js").Viewer} viewer
    * @param {{stage: HTMLElement, canvas: HTMLElement, over: HTMLElement, button: HTMLButtonElement,
-   *   panel: HTMLElement}} parts panel: with .kind, .told, .list, .again, .csv, .end and svg
+   *   panel: HTMLElement}} parts panel: with .kind, .fold, .told, .list, .again, .csv, .end and svg
    * @param {{onChange: () => void, onSave: (measurements: Measurement[]) => void}} told onChange: others are there now
    */
   constructor(viewer, parts, told) {
@@ -46,6 +47,7 @@ export class Measure {
       onCross: () => this.#draw(),
       onEnd: () => this.end(),
     });
+    prepareFold(parts.panel);
     this.#begin();
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.#forget());
@@ -140,6 +142,7 @@ export class Measure {
   #say() {
     const { panel } = this.parts;
     const { place, values } = this.told ?? { place: "measure.first", values: {} };
+    panel.toggleAttribute("data-first", place === "measure.first");
     panel.querySelector(".told").textContent = words(place, values);
     panel.querySelector(".csv").hidden = !this.measurements.some(({ shape }) => shape);
     this.#sayNow();
@@ -218,7 +221,9 @@ export class Measure {
   }
 
   #rename(each, name) {
-    each.name = safeName(name) || each.name;
+    const safe = safeName(name);
+    if (!safe) return this.#tell("measure.unnamed", { name: each.name });
+    each.name = safe;
     this.onChange();
     this.#draw();
   }
@@ -253,6 +258,7 @@ export class Measure {
       const text = now && `${name}  ${figureOf(shape, now.value, now.sigma)}`;
       if (now) this.overlay.line(shown.camera, now.places, text, { isClosed: kind === "area" });
     }
+    this.overlay.spread(shown.camera);
     if (!this.current && sameView(shown, this.view)) this.overlay.points(shown.camera, this.chosen);
     const cross = this.picker.crossIn(shown.camera);
     if (cross) this.overlay.cross(shown.camera, cross);

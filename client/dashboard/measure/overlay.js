@@ -1,6 +1,7 @@
 // Points, lines, areas and cross over the picture, at places of the tissue or points of the picture.
 
 import { draw } from "../base/element.js";
+import { spread } from "./labels.js";
 import { project, toScreen } from "./places.js";
 
 const ARM_PX = 9;
@@ -38,6 +39,18 @@ export class Overlay {
     draw(this.svg, "text", { x, y: y - ARM_PX }, text);
   }
 
+  /** Once all lines are there: their texts above them, within the picture and not over each other. @param {import("../stage/stream.js").Camera} camera */
+  spread(camera) {
+    const texts = [...this.svg.querySelectorAll("text")];
+    this.svg.append(...texts);
+    const [left, top] = this.#at(camera, [0, 0]);
+    const [right, bottom] = this.#at(camera, [camera.width, camera.height]);
+    const moves = spread(texts.map((text) => text.getBBox()), { left, top, right, bottom });
+    texts.forEach((text, i) => {
+      for (const [j, name] of ["x", "y"].entries()) text.setAttribute(name, Number(text.getAttribute(name)) + moves[i][j]);
+    });
+  }
+
   /** @param {import("../stage/stream.js").Camera} camera @param {number[]} point of the picture, besides what is there */
   cross(camera, point) {
     this.#mark("cross", this.#at(camera, point));
@@ -51,7 +64,7 @@ export class Overlay {
 
   #mark(name, [x, y]) {
     const arms = `M${x - ARM_PX} ${y}H${x + ARM_PX}M${x} ${y - ARM_PX}V${y + ARM_PX}`;
-    for (const each of ["under", name]) draw(this.svg, "path", { class: each, d: arms });
+    for (const each of ["under", name]) draw(this.svg, "path", { class: each, "data-mark": name, d: arms });
   }
 }
 

@@ -63,6 +63,7 @@ export class PointPicker {
   #key(event) {
     const { isOn, camera, onPoint, onCross, onEnd } = this.picking;
     if (!isOn() || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    if (event.key === "Escape" && document.querySelector(".drawers > .drawer:not([hidden])")) return; // it closes first
     if (event.key === "Escape") onEnd();
     else if (event.target !== this.stage || !camera()) return;
     else if (event.key === "Enter") onPoint(this.#placeIn(camera()));

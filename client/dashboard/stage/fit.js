@@ -2,7 +2,7 @@
 // What covers the stage names in its style the edge at which it does: --covers.
 
 const STEP_BACK = ".tools, .controls, .five";
-const COVERS = `.drawer, ${STEP_BACK}`;
+const COVERS = `.drawer, .legend, ${STEP_BACK}`;
 /** After a press on the picture it stays so long where it is: a second tap means the same place. */
 const SETTLES_MS = 350;
 /** Of the theatre's width or height; where less would be left for the picture, it lies behind what covers it. */

@@ -52,8 +52,8 @@ export class Legend {
     if (layer === "confidence") return { low: words("legend.unsure"), high: words("legend.sure") };
     if (layer === "error") return { low: words("legend.levels", { levels: 0 }), high: words("legend.levels_most", { levels: BRIGHTEST_ERROR }) };
     if (layer !== "depth" || !depthRangeMm) return null;
-    const [low, high] = depthRangeMm.map((each) => words("legend.mm", { mm: figure(each) }));
-    return { low, high };
+    const [near, far] = depthRangeMm.map((each) => ({ mm: figure(each) }));
+    return { low: words("legend.nearest", near), high: words("legend.farthest", far) }; // what lies beyond has the colours of the ends
   }
 
   /** Show the range in its fields, but for one that somebody writes in. */

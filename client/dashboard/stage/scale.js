@@ -69,9 +69,11 @@ export class Scale {
     const point = this.known?.point;
     this.box.hidden = !point || point.refusal !== null;
     if (this.box.hidden) return;
-    const pxPerMm = screenScale(this.canvas, this.known.shown.camera) / point.mm_per_px;
-    const room = MAX_SHARE * this.canvas.getBoundingClientRect().width;
-    const length = LENGTHS_MM.findLast((each) => each * pxPerMm <= room) ?? LENGTHS_MM[0];
+    const { camera } = this.known.shown;
+    const scale = screenScale(this.canvas, camera);
+    const pxPerMm = scale / point.mm_per_px;
+    const longest = MAX_SHARE * scale * camera.width;
+    const length = LENGTHS_MM.findLast((each) => each * pxPerMm <= longest) ?? LENGTHS_MM[0];
     this.bar.style.width = `${(length * pxPerMm).toFixed(1)}px`;
     this.about.textContent = words("measure.scale", {
       length: figure(length, length < 1 ? 1 : 0),

@@ -61,6 +61,7 @@ export class Screen {
     if (canvas.width !== image.width) canvas.width = image.width; // setting it clears and allocates anew
     if (canvas.height !== image.height) canvas.height = image.height;
     canvas.getContext("2d").drawImage(image, 0, 0);
+    this.stage.style.setProperty("--aspect", String(canvas.width / canvas.height)); // where it is within the stage: style/page.css
     image.close?.();
     const label = [name, moment].filter(Boolean).join(", ");
     canvas.setAttribute("aria-label", label);

@@ -6,6 +6,7 @@ import { figure, words } from "../base/messages.js";
 import { pause } from "../base/pause.js";
 import { withTexts } from "../base/pngtext.js";
 import { fileName, save } from "../base/save.js";
+import { burnMeasurements } from "../measure/burn.js";
 
 /** Narrower pictures are enlarged, so that the lines can be read. */
 const MIN_WIDTH_PX = 640;
@@ -16,7 +17,8 @@ const PATIENCE_MS = 10_000;
 export class Snapshot {
   /**
    * @param {import("./viewer.js").Viewer} viewer
-   * @param {{stage: HTMLElement, recorded: HTMLCanvasElement, button: HTMLButtonElement}} parts
+   * @param {{stage: HTMLElement, recorded: HTMLCanvasElement, ofRecorded: HTMLElement, ofModel: HTMLElement, measured: SVGSVGElement,
+   *   button: HTMLButtonElement}} parts measured: as measure/overlay.js draws it
    * @param {() => {name: string, badge: string, verdict: string, warning: string, seam: number}} facts of what is in view
    * @param {(text: string) => void} tell what went wrong
    */
@@ -76,32 +78,58 @@ export class Snapshot {
     };
   }
 
-  /** What the stage shows: the model's picture, or the recorded frame over or beside it. */
+  /** What the stage shows: the model's picture, the recorded frame over or beside it, with their names, and measurements. */
   #picture(seam) {
     const { canvas } = this.viewer.parts;
-    const { stage, recorded } = this.parts;
+    const { stage, recorded, ofRecorded, ofModel, measured } = this.parts;
     const factor = Math.max(1, Math.ceil(MIN_WIDTH_PX / canvas.width));
     const [width, height] = [canvas.width * factor, canvas.height * factor];
     const isBeside = stage.dataset.compare === "side";
     const made = Object.assign(document.createElement("canvas"), { width: isBeside ? 2 * width : width, height });
     const context = made.getContext("2d");
     context.drawImage(canvas, isBeside ? width : 0, 0, width, height);
-    if (stage.dataset.compare === undefined || recorded.hidden) return made;
+    const isCompared = stage.dataset.compare !== undefined && !recorded.hidden;
     const shownTo = isBeside ? width : (seam / 100) * width;
-    context.save();
-    context.beginPath();
-    context.rect(0, 0, shownTo, height);
-    context.clip();
-    context.drawImage(recorded, 0, 0, width, height);
-    context.restore();
+    if (isCompared) {
+      context.save();
+      context.beginPath();
+      context.rect(0, 0, shownTo, height);
+      context.clip();
+      context.drawImage(recorded, 0, 0, width, height);
+      context.restore();
+    }
+    const { camera } = this.viewer.shown;
+    const place = { left: isBeside ? width : 0, width };
+    if (camera) burnMeasurements(context, { svg: measured, canvas, camera }, place);
+    if (isCompared) {
+      nameSide(context, ofRecorded.textContent, 0, shownTo);
+      nameSide(context, ofModel.textContent, shownTo, made.width);
+    }
     return made;
   }
 }
 
+/**
+ * Say at the top of a part of the picture what it is.
+ * @param {CanvasRenderingContext2D} context @param {string} text @param {number} left px @param {number} right px
+ */
+function nameSide(context, text, left, right) {
+  const px = letterPx(context.canvas);
+  const most = right - left - 2 * px;
+  if (most <= 0) return; // nothing of it is in the picture
+  Object.assign(context, { font: fontOf(px), textAlign: "start", textBaseline: "top", fillStyle: "#000c" });
+  context.fillRect(left + px / 2, px / 2, Math.min(most, context.measureText(text).width) + px, 1.6 * px);
+  context.fillStyle = "white";
+  context.fillText(text, left + px, 0.8 * px, most);
+}
+
+const letterPx = ({ width }) => Math.max(13, Math.round(width * LINE_SHARE));
+const fontOf = (px) => `${px}px system-ui, sans-serif`;
+
 /** A picture with lines of text below it. @param {HTMLCanvasElement} picture @param {string[]} lines */
 function captioned(picture, lines) {
-  const px = Math.max(13, Math.round(picture.width * LINE_SHARE));
-  const font = `${px}px system-ui, sans-serif`;
+  const px = letterPx(picture);
+  const font = fontOf(px);
   const measure = picture.getContext("2d");
   measure.font = font;
   const wrapped = lines.flatMap((line) => wrap(line, (text) => measure.measureText(text).width < picture.width - 2 * px));
