@@ -25,6 +25,13 @@ const sizeOf = (id) => parseFloat(getComputedStyle(document.getElementById(id)).
 return Object.fromEntries(arguments[0].map((id) => [id, sizeOf(id)]));
 """
 """Sizes of the letters that say age, trust and reason, px."""
+CUT_NOTES = """
+const notes = document.querySelector(".notes");
+const { bottom } = notes.getBoundingClientRect();
+return [...notes.children].filter((each) => each.checkVisibility() && each.textContent)
+  .filter((each) => each.getBoundingClientRect().bottom > bottom + 1).map(({ id }) => id);
+"""
+"""Notes beside the word that are not to be seen whole."""
 
 
 @pytest.mark.parametrize(
@@ -70,9 +77,13 @@ def test_it_is_accessible_and_fits_in_every_state(
         page.until(lambda: page.state == "back")
         judge("back")
         page.click("#live")
+        page.click("#keep")
+        page.until_text("#kept", say("live.kept_open", language))
         painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
         page.until(lambda: page.state == "lost")
+        page.until_text("#why", say("live.reason_silent", language)[:10])
         judge("lost")
+        assert page.script(CUT_NOTES) == []
         painter.state, painter.reason = FeedState.NO_TISSUE, None
         page.until(lambda: page.state == "empty")
         judge("empty")
