@@ -9,7 +9,6 @@ import { canCapture, openCapture } from "./push.js";
 import { faultOf, isOfSource } from "./sources.js";
 
 const LOOK_MS = 2000;
-const EXAMPLES = { url: "rtsp://encoder.example.org/stereo", file: "/data/stereo.mp4" };
 
 export class Opening {
   /**
@@ -60,7 +59,6 @@ export class Opening {
     if (isTyped) {
       setText(form.querySelector("#source-name"), words(`live.source_${from}`));
       setText(form.querySelector("#source-note"), words(`live.source_note_${from}`));
-      source.placeholder = EXAMPLES[from];
     }
     this.#judge();
     device.closest("label").hidden = isTyped || device.options.length < 2;
