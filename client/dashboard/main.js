@@ -6,7 +6,7 @@ import { closeBanner, prepareBanners } from "./base/banners.js";
 import { Drawers } from "./base/drawers.js";
 import { setText } from "./base/element.js";
 import { prepareFullScreen, ScreenLight } from "./base/fullscreen.js";
-import { prepareHelp, toggleHelp } from "./base/help.js";
+import { prepareHelp, prepareLanguages, toggleHelp } from "./base/help.js";
 import { currentKey, keyEvents, showKeyForm } from "./base/key.js";
 import { listenToKeys, onKeys } from "./base/keys.js";
 import { figure, languageEvents, showWords, words } from "./base/messages.js";
@@ -23,7 +23,7 @@ import { baselinesOf } from "./library/figures.js";
 import { SceneImport } from "./library/importing.js";
 import { JobList } from "./library/joblist.js";
 import { Jobs } from "./library/jobs.js";
-import { progressOf, shareOf, shareOfSending } from "./library/progress.js";
+import { progressOf, shareOf, shareOfSending, workOn } from "./library/progress.js";
 import { showReport } from "./library/report.js";
 import { Shelf } from "./library/shelf.js";
 import { TimesLeft } from "./library/timeleft.js";
@@ -180,9 +180,13 @@ function expect(id) {
   jobs.poll();
 }
 
-/** A clip is being sent: its own first frame is the picture, until there is one of it. @param {File | undefined} clip */
-function send(clip) {
-  waiting.begin(clip);
+/**
+ * A clip is being sent: its own first frame is the picture, until there is one of it.
+ * @param {File | undefined} clip
+ * @param {boolean} isExample the page's own
+ */
+function send(clip, isExample) {
+  waiting.begin(clip, isExample);
   get("empty").hidden = true;
   if (drawers.isOpen === "drawer") drawers.close();
 }
@@ -273,6 +277,7 @@ function showJobs() {
   showProgress();
   openFirst();
   const viewed = jobs.byId.get(viewer.scene);
+  viewer.screen.tellWork(workOn(viewed));
   light.keep(viewer.isRunning || viewed?.state === "running");
   get("scene-id").textContent = viewed ? nameOf(viewed) : "";
   if (viewed?.state === "done" && reported !== viewed.id) {
@@ -381,6 +386,7 @@ stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen 
 const showHelp = () => toggleHelp(get("help"));
 const toggleFullScreen = prepareFullScreen(get("full-screen"));
 prepareHelp(get("help"));
+prepareLanguages(document.querySelectorAll("[data-language]"));
 prepareFive(get("five"));
 prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 get("show-help").addEventListener("click", showHelp);

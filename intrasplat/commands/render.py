@@ -10,16 +10,20 @@ from typing import TYPE_CHECKING, get_args
 
 from pydantic import ValidationError
 
-from intrasplat.commands.arguments import finite
+from intrasplat.commands.arguments import finite, positive
 from intrasplat.commands.device import add_device
-from intrasplat.commands.exits import ExitCode
+from intrasplat.commands.exits import ExitCode, flag_of
 from intrasplat.errors import InputError
 from intrasplat.names import Detail, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode, Severity
 from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
 
 if TYPE_CHECKING:  # imported when needed, as it imports torch
+    import numpy as np
+    from numpy.typing import NDArray
+
     from intrasplat.scene.scene import TrainedScene
+    from intrasplat.view.depth_range import DepthRange
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -53,6 +57,13 @@ def add_cli_arguments(parser: argparse.ArgumentParser) -> None:
         help="depth: 16-bit PNG in 0.01 mm, or NPY in mm, 0 where there is none; confidence: 0 to 1; error: levels "
         "of 255 by which the model differs from the recorded frame nearest to the time (default: rgb)",
     )
+    for end, colour in (("near", "brightest"), ("far", "darkest")):
+        parser.add_argument(
+            f"--{end}-mm",
+            type=positive,
+            metavar="MM",
+            help=f"of --layer depth as JPEG or WebP: the depth of the {colour} colour (default: the clip's)",
+        )
     parser.add_argument(
         "--unseen",
         choices=[each.value for each in Unseen],
@@ -144,7 +155,7 @@ def run_cli(options: argparse.Namespace) -> int:
             highlights=highlights, light=how["light"], smoke=how["smoke"],
             detail=how["detail"] if layer is Layer.RGB else "off",
         )  # fmt: skip
-        range_mm = renderer_of(scene, device).depth_range.before(pose) if layer is Layer.DEPTH else None
+        range_mm = _depth_range(renderer_of(scene, device).depth_range, pose, options) if layer is Layer.DEPTH else None
         path.parent.mkdir(parents=True, exist_ok=True)
         error = None if recorded is None else error_levels(frame.rgb, recorded, frame.unseen)
         unseen = Unseen(options.unseen)
@@ -161,8 +172,20 @@ def run_cli(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
+def _depth_range(
+    found: DepthRange, pose: NDArray[np.float64] | None, options: argparse.Namespace
+) -> tuple[float, float]:
+    """Nearest and farthest depth of the false colours, mm. Raises InputError, which names the option."""
+    try:
+        return found.chosen(pose, options.near_mm, options.far_mm)
+    except InputError as error:
+        raise InputError(flag_of(error.field), error.problem, error.remedy) from error
+
+
 def _without_effect(options: argparse.Namespace, scene: TrainedScene) -> Iterator[str]:
     """Why an option changes nothing."""
+    if (options.near_mm, options.far_mm) != (None, None) and options.layer != Layer.DEPTH:
+        yield f"Layer {options.layer} has no range of depths: --near-mm and --far-mm change nothing."
     if options.smoke == "show" and scene.veil is None:
         yield "No smoke was found in the clip of this scene: --smoke show changes nothing."
     if options.light == "recorded" and scene.log_gains is None and scene.vignetting is None:

@@ -150,10 +150,15 @@ class Feed:
     def moment(self, when: FeedTime = LIVE) -> FeedMoment | None:
         """The moment of a time, to be rendered; None: nothing is known yet.
 
+        While the feed goes on, a time that the model has not come to yet gives its newest moment.
+
         Raises:
             InputError: the time lies before the past that is stored; its field is "t".
         """
-        return find_moment(when, self._model.scene(), self._past, self.settings.max_age_s)
+        is_out = self._watch is not None and self._watch.is_out
+        is_fed = self._source.state in (FeedState.LIVE, FeedState.BEHIND)
+        goes_on = is_fed and not is_out and self._model.trouble is None
+        return find_moment(when, self._model.scene(), self._past, self.settings.max_age_s, goes_on=goes_on)
 
     def picture(self) -> FeedPair | None:
         """The newest pair that came in, whether or not the model learns it. None: there is none since this feed was

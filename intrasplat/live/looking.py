@@ -57,8 +57,13 @@ def range_of(window: PastSegment | None, past: Past) -> PastRange | None:
     return PastRange(first.source_s[0], last.source_s[1], first.arrived_at[0], last.arrived_at[1])
 
 
-def find_moment(asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float) -> FeedMoment | None:
+def find_moment(
+    asked: FeedTime, window: TrainedScene | None, past: Past, max_age_s: float, *, goes_on: bool = False
+) -> FeedMoment | None:
     """The moment of a time; None: nothing is known yet.
+
+    goes_on: whether the model is to learn what comes in: of a time that it has not come to yet, the newest moment is
+    shown, without a notice.
 
     Raises:
         InputError: the time lies before the past that is stored.
@@ -76,7 +81,7 @@ def find_moment(asked: FeedTime, window: TrainedScene | None, past: Past, max_ag
         chosen = _chosen(spans, axis, wanted)
         scene = window if chosen is newest else past.load(chosen)
         if scene is not None:
-            return _moment(asked, scene, axis, wanted, newest_s, max_age_s)
+            return _moment(asked, scene, axis, wanted, newest_s, max_age_s, goes_on)
     return None
 
 
@@ -97,7 +102,7 @@ def _chosen(spans: list[PastSegment], axis: Axis, wanted: float) -> PastSegment:
 
 
 def _moment(
-    asked: FeedTime, scene: TrainedScene, axis: Axis, wanted: float, newest_s: float, max_age_s: float
+    asked: FeedTime, scene: TrainedScene, axis: Axis, wanted: float, newest_s: float, max_age_s: float, goes_on: bool
 ) -> FeedMoment:
     times = {"source_s": np.asarray(scene.frame_times_s), "arrived_at": arrivals(scene)}
     frames, along = np.arange(scene.frame_count), times[axis]
@@ -107,11 +112,12 @@ def _moment(
     if times["source_s"][after] - times["source_s"][before] > MAX_STEP_S:
         place = float(before if wanted - along[before] < along[after] - wanted else after)
     shown, source_s, captured_at = (float(np.interp(place, frames, each)) for each in (along, *times.values()))
+    age_s, is_live = time.time() - captured_at, source_s >= newest_s
     off_s, notices = abs(shown - wanted), tuple[Notice, ...]()
-    if off_s > TOLERANCE_S and asked != LIVE:
+    is_to_come = goes_on and is_live and wanted > shown and off_s <= age_s + TOLERANCE_S
+    if off_s > TOLERANCE_S and asked != LIVE and not is_to_come:
         text = f"Nothing is known of this moment: the nearest one is shown, {off_s:.1f} s {_side(shown, wanted)} it."
         notices = (Notice.warning(NoticeCode.TIME_IN_GAP, text),)
-    age_s, is_live = time.time() - captured_at, source_s >= newest_s
     t = place / scene.frame_count
     return FeedMoment(scene, t, source_s, captured_at, age_s, is_live, is_live and age_s > max_age_s, notices)
 

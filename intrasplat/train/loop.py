@@ -102,6 +102,8 @@ def train(
             reported = now
             made_s = now - began
             left_s = made_s / (iteration - first) * (run.iterations - iteration) if made_s > REMAINING_AFTER_S else None
+            if left_s is not None and has_budget and run.schedule.fitted_at is not None:
+                left_s = min(left_s, max(run.setup.budget_s - now, 0.0))  # the last cycle will be fitted into it
             hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
     check_sums(run.model.wait(), run.iteration)
     _check_finite(run)

@@ -104,7 +104,7 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
 
 def first_report_of_the_page() -> Report:
     """Before the scores are known."""
-    figures = [name for name in Report.model_fields if name.startswith(("psnr", "baseline"))]
+    figures = [name for name in Report.model_fields if name.startswith(("psnr", "baseline", "depth_agreement"))]
     return REPORT_OF_THE_PAGE.model_copy(update={**dict.fromkeys(figures), "scored": False})
 
 

@@ -32,7 +32,7 @@ def texture() -> np.ndarray:
     """As hard to code as tissue: about 90 kB as a JPEG of usual quality."""
     noise = np.random.default_rng(0).normal(128, 40, (HEIGHT, WIDTH, 3)).astype(np.float32)
     fine, coarse = cv2.GaussianBlur(noise, (0, 0), 0.9), cv2.GaussianBlur(noise, (0, 0), 12) * 6 - 640
-    return np.clip(0.5 * fine + 0.5 * coarse, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(0.5 * fine + 0.5 * coarse, 0, 255), np.uint8)
 
 
 class TissuePainter(Painter):

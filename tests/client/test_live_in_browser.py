@@ -36,6 +36,11 @@ const tape = document.getElementById("tape");
 tape.value = String(arguments[0]);
 for (const kind of ["input", "change"]) tape.dispatchEvent(new Event(kind, { bubbles: true }));
 """
+TYPE = """
+const { source } = document.querySelector("#open-feed").elements;
+source.value = arguments[0];
+source.dispatchEvent(new Event("change", { bubbles: true }));
+"""
 PRESS = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: arguments[0], bubbles: true }))"
 
 
@@ -166,9 +171,16 @@ def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePa
     frame = "return getComputedStyle(document.body, '::after')"
     assert page.script(f"{frame}.borderTopStyle") == "double"
     assert page.script("return getComputedStyle(document.querySelector('.strike')).visibility") == "visible"
+    address = page.driver.current_url
     page.script(PRESS, "l")
     page.until(lambda: page.state == "live")
     assert page.script(f"{frame}.borderTopWidth") == "0px"
+    assert "at=" not in page.driver.current_url
+    page.driver.get("about:blank")
+    page.driver.get(address.replace("/live.html#/", "/#/live/"))
+    page.until(lambda: page.state == "frozen")
+    page.until(lambda: (age_of(page, "model") or {"ms": None})["ms"] == held["ms"])
+    page.until(lambda: page.script("return document.querySelectorAll('#tape-drawing .frozen').length") == 1)
 
 
 def test_the_tape_goes_back_and_plays_on_from_there(site: Site, page: LivePage, painter: LivePainter) -> None:
@@ -342,7 +354,31 @@ def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_p
     page.find("#open-feed [name=calibration]").send_keys(str(calibration))
     page.find("#open-feed [name=source]").send_keys("rtsp://nowhere.example.org/1")
     page.click("#open-feed [type=submit]")
-    page.until(lambda: page.text("#open-message") != "")
+    page.until_text("#open-message", say("live.source_refused_url"))
+
+    def fault(kind: str, text: str) -> str:
+        page.click(f"#open-feed [name=from][value={kind}]")
+        page.script(TYPE, text)
+        return page.text("#source-fault")
+
+    for kind, text, place in (
+        ("url", "/data/stereo.mp4", "source_is_path"),
+        ("url", "camera", "source_no_url"),
+        ("url", "https://me:secret@camera/1", "source_user"),
+        ("url", "tcp://camera", "source_port"),
+        ("file", "rtsp://camera/1", "source_is_url"),
+        ("file", "stereo.mp4", "source_no_path"),
+    ):
+        assert fault(kind, text) == say(f"live.{place}"), text
+    for kind, text in (
+        ("url", "rtsp://me:secret@[::1]:8554/1?a=b"),
+        ("url", "udp://camera:5000"),
+        ("file", "v4l2:///dev/video0"),
+    ):
+        assert fault(kind, text) == "", text
+    assert page.text("#source-note") == say("live.source_note_file")
+    page.click("#open-feed [type=submit]")
+    page.until_text("#open-message", say("live.source_refused_file"))
 
 
 def test_every_state_and_reason_has_words() -> None:

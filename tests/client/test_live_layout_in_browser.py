@@ -18,6 +18,20 @@ from tests.client.words import LANGUAGES, say
 LIVE_SIZES = (*SIZES, (844, 390))
 ACTIONS = ("freeze", "look", "measure", "keep", "live")
 MIN_ACTION_PX = 64
+FAR_HEIGHT, MIN_FAR_PX = 1080, 32
+NOTES = ("why", "kept", "message", "live-age", "model-age", "trust", "trust-why")
+LETTERS = """
+const sizeOf = (id) => parseFloat(getComputedStyle(document.getElementById(id)).fontSize);
+return Object.fromEntries(arguments[0].map((id) => [id, sizeOf(id)]));
+"""
+"""Sizes of the letters that say age, trust and reason, px."""
+CUT_NOTES = """
+const notes = document.querySelector(".notes");
+const { bottom } = notes.getBoundingClientRect();
+return [...notes.children].filter((each) => each.checkVisibility() && each.textContent)
+  .filter((each) => each.getBoundingClientRect().bottom > bottom + 1).map(({ id }) => id);
+"""
+"""Notes beside the word that are not to be seen whole."""
 
 
 @pytest.mark.parametrize(
@@ -47,6 +61,12 @@ def test_it_is_accessible_and_fits_in_every_state(
         assert min(sizes) >= MIN_ACTION_PX
         page.click("#screen [data-switch-controls]")
         judge("theatre")
+        if height == FAR_HEIGHT:
+            for controls in ("theatre", "desk"):
+                page.script("document.documentElement.dataset.controls = arguments[0]", controls)
+                letters = page.script(LETTERS, NOTES)
+                assert min(letters.values()) >= MIN_FAR_PX, (controls, letters)
+            page.script("document.documentElement.dataset.controls = 'theatre'")
         assert not page.find("#end").is_displayed()
         page.click("#screen [data-switch-controls]")
         page.click("#measure")
@@ -57,9 +77,13 @@ def test_it_is_accessible_and_fits_in_every_state(
         page.until(lambda: page.state == "back")
         judge("back")
         page.click("#live")
+        page.click("#keep")
+        page.until_text("#kept", say("live.kept_open", language))
         painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
         page.until(lambda: page.state == "lost")
+        page.until_text("#why", say("live.reason_silent", language)[:10])
         judge("lost")
+        assert page.script(CUT_NOTES) == []
         painter.state, painter.reason = FeedState.NO_TISSUE, None
         page.until(lambda: page.state == "empty")
         judge("empty")

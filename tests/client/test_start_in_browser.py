@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from client.page import DASHBOARD
-from tests.client.page import Page, Site, grey_of
+from tests.client.page import WORKER, Page, Site, grey_of
 from tests.client.test_theatre_in_browser import SIZES, is_on_screen, screen_of
 from tests.client.words import say
 
@@ -18,6 +18,14 @@ const { clip, calibration } = document.querySelector("#upload").elements;
 return [clip.files[0].name, calibration.files[0].name];
 """
 
+CHOOSE_GERMAN = """
+const choice = document.querySelector("#empty-language");
+choice.value = "de";
+choice.dispatchEvent(new Event("change", { bubbles: true }));
+"""
+PILL = "return [document.querySelector('#connection').className, document.querySelector('#connection').textContent]"
+LATER = "const now = performance.now.bind(performance); performance.now = () => now() + 61_000"
+
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_an_empty_page_says_what_it_is_and_how_to_begin(site: Site, page: Page, width: int, height: int) -> None:
@@ -28,6 +36,11 @@ def test_an_empty_page_says_what_it_is_and_how_to_begin(site: Site, page: Page, 
         assert is_on_screen(page, "#tools [data-drawer=drawer]")
         for css in ("#controls", "#measure", "#copy-link", "#tools [data-drawer=report-drawer]"):
             assert not page.find(css).is_displayed(), css
+        assert is_on_screen(page, "#empty-language")
+        page.script(CHOOSE_GERMAN)
+        page.until_text("#empty", say("empty.what", "de"))
+        assert page.script("return document.querySelector('#language').value") == "de"
+        page.script("localStorage.clear()")
         page.click("#empty-clip")
         assert page.find("#drawer").is_displayed()
 
@@ -41,9 +54,26 @@ def test_one_click_sends_the_example_with_calibration_and_masks(site: Site, page
         assert (folder / sent).read_bytes() == (DASHBOARD / "example" / name).read_bytes()
     assert record.files.masks is not None
     assert record.labels.label == say("empty.name")
-    page.until(lambda: page.text("#badge") == say("screen.own_clip"))
+    page.until(lambda: page.text("#badge") == say("screen.example_clip"))
     assert not page.find("#empty").is_displayed()
     assert sum(each.stat().st_size for each in (DASHBOARD / "example").iterdir()) < 1_000_000
+
+
+def test_a_worker_that_was_never_there_is_starting_for_a_minute_and_one_that_left_is_missed_at_once(
+    site: Site, page: Page
+) -> None:
+    missing = ["pill bad", say("problem.http_503:worker")]
+    site.queue.withdraw(WORKER)
+    page.open()
+    page.until(lambda: page.script(PILL) == ["pill starting", say("page.starting")])
+    page.script(LATER)
+    page.until(lambda: page.script(PILL) == missing)
+    site.announce()
+    page.until(lambda: page.script(PILL) == ["pill good", say("page.ready")])
+    page.open()
+    page.until(lambda: page.script(PILL) == ["pill good", say("page.ready")])
+    site.queue.withdraw(WORKER)
+    page.until(lambda: page.script(PILL) == missing)
 
 
 def test_files_may_be_dropped_anywhere(page: Page) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contract.wire.job import JobError, JobProgress
 from intrasplat.errors import ErrorCode
 from tests.client.local_service import CLIP
-from tests.client.page import Page, Site
+from tests.client.page import REPORT_OF_THE_PAGE, Page, Site
 from tests.client.test_theatre_in_browser import box_of
 from tests.client.words import say
 
@@ -17,6 +17,8 @@ const { data } = preview.getContext("2d").getImageData(preview.width / 4, previe
 return [preview.width, preview.height, data[0] + data[1] + data[2] > 0];
 """
 """Width, height, and whether it is not black."""
+SPACE = "document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))"
+PRESSED = "return document.querySelector('#play').getAttribute('aria-pressed')"
 
 
 def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_picture(site: Site, page: Page) -> None:
@@ -26,13 +28,29 @@ def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_p
     assert page.text("#badge") == say("screen.own_clip")
     assert not page.find("#drawer").is_displayed()
     claim = site.claim()
+    assert not page.find("#play").is_enabled()
+    page.script(SPACE)
+    assert page.script(PRESSED) == "false"
     site.train(claim, 20, 24.0)
     page.until_state("training")
+    page.until(lambda: page.find("#play").is_enabled())
     assert page.script(HIDDEN, "#preview")
     page.until_text("#waiting p", "about 20 s left")
-    site.finish(claim)
+    assert page.text("#badge") == say("screen.training")
+    for stage in ("finish", "publish"):
+        site.queue.beat(claim, JobProgress(stage=stage, fraction=1.0))
+        page.until_text("#waiting p", say(f"stage.{stage}"))
+        page.until(lambda: page.text("#badge") == say("screen.storing"))
+    page.click("#tools [data-drawer=report-drawer]")
+    scene = site.finish(claim, scored=False)
     page.until_state("live")
     page.until(lambda: page.script(HIDDEN, "#waiting"))
+    page.until_text("#report", say("report.depth_pending"))
+    assert say("report.no_depth") not in page.text("#report")
+    page.click("#report .figures summary")
+    page.until_text("#report .figures", say("figure.pending"))
+    site.store.add_scores("worker-1", scene, 1, REPORT_OF_THE_PAGE)
+    page.until_text("#report", say("report.depth", mm="0.8"))
 
 
 def test_one_bar_and_the_title_of_the_tab_grow_with_every_stage(site: Site, page: Page) -> None:

@@ -114,6 +114,29 @@ def test_render_writes_any_layer_from_any_pose(scene: Path, tmp_path: Path) -> N
     assert np.load(out).shape == (HEIGHT // 2, WIDTH // 2)
 
 
+def test_render_colours_depth_between_the_ends_that_are_given(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = ["--t", "0", "--layer", "depth", "--out"]
+
+    def brightness(*ends: str) -> float:
+        assert main(["render", str(scene), *ends, *depth, str(tmp_path / "depth.webp")]) == ExitCode.OK
+        return float(cv2.imread(str(tmp_path / "depth.webp")).mean())
+
+    assert (
+        brightness("--near-mm", "1000", "--far-mm", "2000")
+        > brightness()
+        > brightness("--near-mm", "1", "--far-mm", "2")
+    )
+    capsys.readouterr()
+    ends = ["--near-mm", "90", "--far-mm", "50"]
+    assert main(["render", str(scene), *ends, *depth, str(tmp_path / "no.webp")]) == ExitCode.BAD_INPUT
+    assert "--far-mm" in capsys.readouterr().err
+    assert not (tmp_path / "no.webp").exists()
+    assert main(["render", str(scene), "--t", "0", *ends, "--out", str(tmp_path / "colour.png")]) == ExitCode.OK
+    assert "--far-mm change nothing" in capsys.readouterr().err
+
+
 def test_render_leaves_out_highlights_that_two_eyes_told_apart(
     scene: Path, scene_of_two_eyes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

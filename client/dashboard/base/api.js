@@ -136,13 +136,13 @@ export const stillThere = async (id) => {
   await request(`/render?scene=${id}`, { headers: { "If-None-Match": "*" }, signal });
 };
 
-/** @returns {Promise<string>} why nothing would be trained now, in words; empty if it would */
+/** @returns {Promise<Problem | null>} why nothing would be trained now; null if it would */
 export async function trouble() {
   try {
     await request("/readyz");
-    return "";
+    return null;
   } catch (error) {
-    if (error instanceof Problem && error.status === 503) return error.message;
+    if (error instanceof Problem && error.status === 503) return error;
     throw error;
   }
 }

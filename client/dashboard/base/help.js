@@ -36,11 +36,18 @@ export function toggleHelp(dialog) {
   dialog.showModal();
 }
 
-/** Wire the help's dialog. @param {HTMLDialogElement} dialog with a [data-close], a choice of language and a place for .help-tables */
+/** Let choices of a language choose it, and follow one another. @param {Iterable<HTMLSelectElement>} choices */
+export function prepareLanguages(choices) {
+  const show = () => {
+    for (const choice of choices) choice.value = language();
+  };
+  for (const choice of choices) choice.addEventListener("change", () => setLanguage(choice.value));
+  languageEvents.addEventListener("changed", show);
+  show();
+}
+
+/** Wire the help's dialog. @param {HTMLDialogElement} dialog with a [data-close] and a place for .help-tables */
 export function prepareHelp(dialog) {
-  const choice = dialog.querySelector("#language");
-  choice.value = language();
-  choice.addEventListener("change", () => setLanguage(choice.value));
   languageEvents.addEventListener("changed", () => fill(dialog));
   dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close());
   dialog.addEventListener("keydown", (event) => event.key === "?" && dialog.close());

@@ -39,7 +39,7 @@ export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
-   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined) => void, onShare: (share: number | null) => void,
+   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined, isExample: boolean) => void, onShare: (share: number | null) => void,
    *   onAsked: () => void, onScene: (file: File) => void}} told of the job that was made; that a clip is being sent; of the
    *   share that is sent, null at the end; that something is asked of the user; of a scene that was saved and is dropped
    */
@@ -107,7 +107,7 @@ export class ClipForm {
     const files = EXAMPLE.map(async (name) => new File([await (await fetch(`example/${name}`)).blob()], name));
     this.take(await Promise.all(files));
     this.form.elements.label.value = label;
-    await this.#send();
+    await this.#send(true);
   }
 
   #startAnew() {
@@ -213,7 +213,7 @@ export class ClipForm {
     return look === this.looks ? showFindings(this.form, findings) : null;
   }
 
-  async #send() {
+  async #send(isExample = false) {
     if (this.isSending) return;
     this.isSending = true;
     this.#showSubmit();
@@ -227,7 +227,7 @@ export class ClipForm {
     }
     const files = this.#files();
     const sending = this.#begin(planOf(files, this.#submission()));
-    await this.#run(sending, files);
+    await this.#run(sending, files, isExample);
   }
 
   /** @param {import("./sending.js").Plan} plan */
@@ -239,10 +239,10 @@ export class ClipForm {
     });
   }
 
-  /** @param {Sending} sending @param {Map<string, File>} files */
-  async #run(sending, files) {
+  /** @param {Sending} sending @param {Map<string, File>} files @param {boolean} isExample the page's own */
+  async #run(sending, files, isExample = false) {
     this.#show(true);
-    this.onSend(files.get("clip") ?? files.get("left"));
+    this.onSend(files.get("clip") ?? files.get("left"), isExample);
     try {
       this.onJob(await sending.run(files));
       this.#startAnew();

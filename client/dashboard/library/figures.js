@@ -2,6 +2,7 @@
 
 import { element } from "../base/element.js";
 import { figure, words } from "../base/messages.js";
+import { isPending } from "./trustlight.js";
 
 /** @typedef {import("../base/wire.js").Report} Report */
 
@@ -28,7 +29,7 @@ export function baselinesOf(report) {
 /** @param {Report} report */
 function likeness(report) {
   const db = number(report.psnr_tissue_db, 2, "dB");
-  if (db === null) return words("figure.not_measured");
+  if (db === null) return words(isPending(report) ? "figure.pending" : "figure.not_measured");
   const best = Math.max(...baselinesOf(report).map((each) => each.db));
   if (!Number.isFinite(best)) return words("figure.likeness", { db });
   return words("figure.likeness_beside_copies", { db, best: number(best, 2, "dB") });

@@ -15,6 +15,8 @@ const IDLE_POLLS = 4;
 export const PAGE_SIZE = 30;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
 const MAX_FOLLOWED = 3;
+/** A worker that was not seen yet may be starting for so long. */
+const STARTING_MS = 60_000;
 const isActive = (job) => job.state === "queued" || job.state === "running";
 
 /** A job's scores while it trains, by iteration. */
@@ -41,7 +43,7 @@ class Scores {
 export class Jobs {
   /**
    * @param {() => void} onChange after any change of the jobs
-   * @param {(text: string, kind: "good"|"bad") => void} onConnection how the service is
+   * @param {(text: string, kind: "good"|"starting"|"bad") => void} onConnection how the service is
    * @param {() => boolean} isWatched whether somebody looks at the list, or waits for the service
    */
   constructor(onChange, onConnection, isWatched) {
@@ -73,6 +75,9 @@ export class Jobs {
     /** Whether the service has listed its jobs. */
     this.isKnown = false;
     this.isWell = true;
+    this.hasTrained = false; // whether a worker was there
+    /** @type {number | null} when it was first missed */
+    this.missedMs = null;
     setInterval(() => this.#tick(), POLL_MS);
     this.poll();
   }
@@ -123,14 +128,24 @@ export class Jobs {
       const wrong = await trouble();
       if (round === this.round) this.#tellConnection(wrong);
     } catch (error) {
-      if (round === this.round) this.#tellConnection(error.status ? error.message : words("page.no_connection"));
+      if (round === this.round) this.#tellConnection(error);
     }
   }
 
-  /** @param {string} wrong what is, in words; empty: nothing */
+  /** @param {Error | null} wrong what is */
   #tellConnection(wrong) {
-    this.isWell = wrong === "";
-    this.onConnection(wrong || words("page.ready"), wrong ? "bad" : "good");
+    this.isWell = wrong === null;
+    this.hasTrained ||= this.isWell;
+    if (this.isWell) this.onConnection(words("page.ready"), "good");
+    else if (this.#isStarting(wrong)) this.onConnection(words("page.starting"), "starting");
+    else this.onConnection(wrong.status ? wrong.message : words("page.no_connection"), "bad");
+  }
+
+  /** Whether the worker that is missing was never there, and may come yet. */
+  #isStarting({ status, document }) {
+    if (status !== 503 || document.field !== "worker" || this.hasTrained) return false;
+    this.missedMs ??= performance.now();
+    return performance.now() - this.missedMs < STARTING_MS;
   }
 
   #startAnew() {

@@ -41,3 +41,9 @@ export function progressOf(job, times) {
   const db = job.psnr_db != null && `${figure(job.psnr_db, 1)} dB`;
   return [stage, db, left].filter(Boolean).join(" · ");
 }
+
+/** @param {import("../base/api.js").Job} [job] @returns {""|"storing"|"scoring"} what is done to its scene after training */
+export function workOn(job) {
+  if (job?.state === "done") return "scoring";
+  return job?.state === "running" && ["finish", "publish"].includes(job.stage) ? "storing" : "";
+}

@@ -6,7 +6,7 @@ import { figure, noticeWords, words } from "../base/messages.js";
 import { lightList } from "../stage/lightstrip.js";
 import { download } from "./downloads.js";
 import { figuresOf, percent } from "./figures.js";
-import { lightMark, reasonsOf, trustOf } from "./trustlight.js";
+import { isPending, lightMark, reasonsOf, trustOf } from "./trustlight.js";
 
 /** @typedef {import("../base/wire.js").Report} Report */
 
@@ -33,7 +33,8 @@ function trusted(report) {
   const seconds = figure((times.at(-1) ?? 0) - (times[0] ?? 0), 1);
   const sentences = [words(`report.clip${eyes ? `_${eyes}` : ""}`, { frames: figure(frames), seconds })];
   const isMeasured = Number.isFinite(depth_mm);
-  sentences.push(words(isMeasured ? "report.depth" : "report.no_depth", { mm: figure(depth_mm ?? 0, 1) }));
+  const unmeasured = isPending(report) ? "report.depth_pending" : "report.no_depth";
+  sentences.push(words(isMeasured ? "report.depth" : unmeasured, { mm: figure(depth_mm ?? 0, 1) }));
   if (Number.isFinite(coverage)) sentences.push(words(coverage < 0.995 ? "report.covered" : "report.covered_all", { share: percent(coverage) }));
   const fieldWords = field?.source === "given" ? "report.field_of_view_given" : "report.field_of_view";
   if (field && field.share < 1) sentences.push(words(fieldWords, { share: percent(field.share) }));

@@ -35,6 +35,9 @@ const SHAPES = { good: "●", care: "▲", bad: "■", pending: "◌" };
  * @typedef {{light: Light, reasons: import("../base/wire.js").Notice[]}} Trust reasons for care, the worst first
  */
 
+/** Whether scores are still to come. @param {{scored: boolean}} report */
+export const isPending = ({ scored }) => scored === false;
+
 /** @param {import("../base/wire.js").Notice} notice @returns {"bad"|"care"|"fine"} */
 const weightOf = ({ code, severity }) => (severity === "warning" ? (WEIGHT_OF.get(code) ?? "care") : "fine");
 

@@ -59,9 +59,14 @@ export class Look extends EventTarget {
     const { shown } = this.model;
     if (this.mode === "frozen") return true;
     if (shown === null) return false;
-    [this.mode, this.atS] = ["frozen", shown.capturedAtS];
-    this.#changed();
+    this.freezeAt(shown.capturedAtS);
     return true;
+  }
+
+  /** Stay at a moment. @param {number} atS UNIX time */
+  freezeAt(atS) {
+    [this.mode, this.atS] = ["frozen", atS];
+    this.#changed();
   }
 
   /** @param {number} backS seconds behind the newest moment */

@@ -21,6 +21,7 @@ import { LiveMeasure } from "./measuring.js";
 import { ModelPicture } from "./model.js";
 import { Opening } from "./opening.js";
 import { LivePicture } from "./picture.js";
+import { hashOf, placeOf } from "./place.js";
 import { Push } from "./push.js";
 import { Tape } from "./tape.js";
 
@@ -29,7 +30,6 @@ const TAPE_MS = 250;
 const STEP_S = 1;
 const TURN = 20;
 const NEARER = 1.1;
-const ID = /^#\/([0-9a-f]{32})$/;
 /** What every picture of the endoscope may show; else the screen is blank. */
 const HIDDEN_STATES = ["no_tissue"];
 const ICONS = {
@@ -257,6 +257,7 @@ picture.addEventListener("shown", refresh);
 model.addEventListener("refused", ({ detail }) => (refused = detail));
 look.addEventListener("changed", () => {
   refused = null;
+  if (feedId !== null) history.replaceState(null, "", hashOf(feedId, look.mode === "frozen" ? look.atS : null));
   refresh();
 });
 setInterval(refresh, TICK_MS);
@@ -323,7 +324,11 @@ showWords(document);
 
 /** Show what the address names. */
 function follow() {
-  view(ID.exec(location.hash)?.[1] ?? null);
+  const { id, atS } = placeOf(location.hash);
+  view(id);
+  if (id === null || atS === null) return;
+  tape.mark({ atS, kind: "frozen" });
+  look.freezeAt(atS);
 }
 addEventListener("hashchange", follow);
 addEventListener("pagehide", () => push?.end());

@@ -1,4 +1,4 @@
-// The list of open feeds, and the form that opens another: from an address, or from a capture device of this browser.
+// The list of open feeds, and the form that opens another: from an address, a file, or a capture device of this browser.
 
 import { setText } from "../base/element.js";
 import { languageEvents, words } from "../base/messages.js";
@@ -6,6 +6,7 @@ import { showProblem } from "../base/problem.js";
 import { listFeeds, openFeed } from "./feeds.js";
 import { showFeeds } from "./links.js";
 import { canCapture, openCapture } from "./push.js";
+import { faultOf, isOfSource } from "./sources.js";
 
 const LOOK_MS = 2000;
 
@@ -22,7 +23,12 @@ export class Opening {
       this.#open();
     });
     form.addEventListener("change", (event) => event.target.name === "from" && this.#offer());
-    languageEvents.addEventListener("changed", () => !parts.section.hidden && this.#list());
+    form.elements.source.addEventListener("change", () => this.#judge());
+    form.elements.source.addEventListener("input", () => this.#say("")); // not while it is being typed
+    languageEvents.addEventListener("changed", () => {
+      this.#offer();
+      if (!parts.section.hidden) this.#list();
+    });
     form.elements.from.value = "url";
     for (const each of form.querySelectorAll("[value=capture]")) each.disabled = !canCapture();
     parts.form.querySelector(".no-capture").hidden = canCapture();
@@ -44,12 +50,34 @@ export class Opening {
   }
 
   #offer() {
-    const isUrl = this.parts.form.elements.from.value === "url";
-    const { source, device } = this.parts.form.elements;
-    source.closest("label").hidden = !isUrl;
-    source.required = isUrl;
-    device.closest("label").hidden = isUrl || device.options.length < 2;
-    if (!isUrl) this.#listDevices();
+    const { form } = this.parts;
+    const from = form.elements.from.value;
+    const { source, device } = form.elements;
+    const isTyped = from !== "capture";
+    source.closest("label").hidden = !isTyped;
+    source.required = isTyped;
+    if (isTyped) {
+      setText(form.querySelector("#source-name"), words(`live.source_${from}`));
+      setText(form.querySelector("#source-note"), words(`live.source_note_${from}`));
+    }
+    this.#judge();
+    device.closest("label").hidden = isTyped || device.options.length < 2;
+    if (!isTyped) this.#listDevices();
+  }
+
+  /** Say what is to be changed in the source. @returns {boolean} whether it can be sent */
+  #judge() {
+    const { source, from } = this.parts.form.elements;
+    const text = source.value.trim();
+    const fault = from.value === "capture" || text === "" ? "" : faultOf(from.value, text);
+    this.#say(fault && words(fault));
+    return fault === "";
+  }
+
+  #say(fault) {
+    const { source } = this.parts.form.elements;
+    setText(this.parts.form.querySelector("#source-fault"), fault);
+    source.toggleAttribute("aria-invalid", fault !== "");
   }
 
   /** Names are known once the user has allowed a device. */
@@ -61,7 +89,7 @@ export class Opening {
     if (cameras.map(({ deviceId }) => deviceId).join() !== known) {
       device.replaceChildren(...cameras.map(({ deviceId, label }) => new Option(label, deviceId)));
     }
-    device.closest("label").hidden = from.value === "url" || device.options.length < 2;
+    device.closest("label").hidden = from.value !== "capture" || device.options.length < 2;
   }
 
   async #list() {
@@ -82,20 +110,22 @@ export class Opening {
     let media = null;
     message.replaceChildren();
     message.classList.remove("bad");
+    if (!this.#judge()) return source.focus();
     submit.disabled = true;
     try {
       if (from.value === "capture") media = await openCapture(device.value).catch(() => null);
       if (from.value === "capture" && media === null) throw new Error(words("live.capture_refused"));
       const options = { layout: layout.value };
       if (label.value.trim()) options.label = label.value.trim();
-      if (from.value === "url") options.source = source.value.trim();
+      if (from.value !== "capture") options.source = source.value.trim();
       const feed = await openFeed(options, calibration.files[0]);
       form.reset();
       this.#offer();
       this.onOpen(feed.id, media);
     } catch (error) {
       for (const track of media?.getTracks() ?? []) track.stop();
-      showProblem(message, error);
+      const isListed = from.value === "capture" || !isOfSource(error);
+      showProblem(message, isListed ? error : { message: words(`live.source_refused_${from.value}`), details: error.details });
     }
     submit.disabled = false;
   }

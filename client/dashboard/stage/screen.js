@@ -44,6 +44,7 @@ export class Screen {
     this.confirmedAt = this.aliveAt = 0;
     this.awaitedUntil = 0;
     this.trouble = "";
+    this.work = "";
     this.words = words;
     this.canvas.width = this.canvas.height = 0; // its pixels are gone, not only hidden
     this.sceneId.dataset.scene = scene ?? "";
@@ -72,9 +73,16 @@ export class Screen {
     else this.confirm();
   }
 
-  /** @param {boolean} isCovered the user's own clip lies over whatever picture there is */
-  cover(isCovered) {
-    this.isCovered = isCovered;
+  /** @param {boolean} isCovered a clip that is sent lies over whatever picture there is @param {boolean} isExample the page's own */
+  cover(isCovered, isExample = false) {
+    Object.assign(this, { isCovered, isExample });
+    this.#look();
+  }
+
+  /** @param {""|"storing"|"scoring"} work on the scene after its training, while its last snapshot is in view */
+  tellWork(work) {
+    if (this.work === work) return;
+    this.work = work;
     this.#look();
   }
 
@@ -131,7 +139,7 @@ export class Screen {
 
   /** @returns {[string, string, string]} state, badge, message over the picture */
   #state() {
-    if (this.isCovered) return ["waiting", words("screen.own_clip"), ""];
+    if (this.isCovered) return ["waiting", words(this.isExample ? "screen.example_clip" : "screen.own_clip"), ""];
     if (this.scene === null) return ["none", "", this.words];
     if (this.shown === null) return ["waiting", words("screen.nothing"), this.words];
     const isOfMemory = this.shown.way === "memory";
@@ -143,7 +151,7 @@ export class Screen {
     }
     if (this.shown.isRecorded) return ["live", words("screen.recorded"), ""];
     if (this.shown.codes?.includes(FIRST_PICTURE)) return ["training", words("screen.first_picture"), ""];
-    if (this.shown.state === "running") return ["training", words("screen.training"), ""];
+    if (this.shown.state === "running") return ["training", words(`screen.${this.work || "training"}`), ""];
     return this.shown.isExtrapolated ? ["extrapolated", words("screen.extrapolated"), ""] : ["live", words("screen.current"), ""];
   }
 

@@ -66,7 +66,7 @@ export function steer(viewer, { stage, canvas, home, eye, rock, stepBack, stepOn
   stepBack.addEventListener("click", () => timeline.step(-1));
   stepOn.addEventListener("click", () => timeline.step(1));
 
-  onKeys("play", { " ": [], PageDown: [] }, () => viewer.scene && timeline.play(!timeline.isPlaying));
+  onKeys("play", { " ": [], PageDown: [] }, () => viewer.shown && timeline.play(!timeline.isPlaying));
   onKeys("step", { ",": [-1], ".": [1] }, (frames) => timeline.step(frames));
   onKeys("speed", { "<": [-1], ">": [1] }, (steps) => timeline.changeSpeed(steps));
   onKeys("loop_start", { a: [] }, () => timeline.startLoop());

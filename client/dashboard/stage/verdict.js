@@ -7,6 +7,8 @@ import { reasonsIn } from "../library/report.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { warningOf } from "./pictures.js";
 
+const TRAINING_GOES_ON = "training_goes_on";
+
 export class Verdict {
   /**
    * @param {import("./viewer.js").Viewer} viewer
@@ -37,7 +39,8 @@ export class Verdict {
   #warn() {
     const { shown, screen } = this.viewer;
     const isOfModel = shown !== null && !screen.shown?.isRecorded;
-    setText(this.warning, isOfModel ? warningOf(screen.shown?.codes ?? [], shown, this.reasons) : "");
+    const codes = (screen.shown?.codes ?? []).filter((code) => code !== TRAINING_GOES_ON || screen.work === "");
+    setText(this.warning, isOfModel ? warningOf(codes, shown, this.reasons) : "");
     this.warning.toggleAttribute("data-of-scene", screen.shown?.codes.length === 0);
     this.warning.title = this.warning.textContent;
   }

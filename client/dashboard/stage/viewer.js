@@ -110,9 +110,14 @@ export class Viewer extends EventTarget {
     this.dispatchEvent(new Event("gone")); // what was measured or compared in it goes, too
     this.parts.readout.textContent = "";
     this.clip.open(scene);
-    if (scene === null) this.timeline.play(false);
-    this.parts.play.disabled = scene === null;
+    this.#allowPlay();
     this.refresh();
+  }
+
+  /** Nothing plays without a picture. */
+  #allowPlay() {
+    if (this.shown === null) this.timeline.play(false);
+    this.parts.play.disabled = this.shown === null;
   }
 
   /**
@@ -292,6 +297,7 @@ export class Viewer extends EventTarget {
   #present(picture, image, view, name, began) {
     this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
     this.shown = shownOf(view, picture);
+    this.#allowPlay();
     this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
     this.#tell(name, picture, performance.now() - began);
   }
@@ -363,6 +369,7 @@ export class Viewer extends EventTarget {
     const isNotYet = error.status === 503 && error.document.field === "scene" && !this.screen.hasPicture;
     if (NOTHING_TO_SHOW.includes(error.status)) {
       this.shown = null;
+      this.#allowPlay();
       this.memory.open(this.scene);
       this.screen.clear(this.scene, this.whyNothing(this.scene) || error.message);
       this.dispatchEvent(new Event("gone"));

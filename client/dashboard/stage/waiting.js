@@ -21,13 +21,13 @@ export class Waiting {
     this.visit = 0; // counts clips: the frame of an earlier one is not shown
   }
 
-  /** A clip is being sent. @param {File | undefined} clip */
-  async begin(clip) {
+  /** A clip is being sent. @param {File | undefined} clip @param {boolean} isExample the page's own */
+  async begin(clip, isExample = false) {
     const visit = (this.visit += 1);
     this.job = null;
     this.tell(0, words("waiting.sending"));
     const hasFrame = clip !== undefined && (await drawFirstFrame(clip, this.preview));
-    if (visit === this.visit && hasFrame) this.#cover(true);
+    if (visit === this.visit && hasFrame) this.#cover(true, isExample);
   }
 
   /** @param {number | null} share of all that is to be done; null: nothing is under way @param {string} text what is done */
@@ -51,9 +51,9 @@ export class Waiting {
     this.tell(null);
   }
 
-  #cover(isCovered) {
+  #cover(isCovered, isExample = false) {
     this.preview.hidden = !isCovered;
-    this.screen.cover(isCovered);
+    this.screen.cover(isCovered, isExample);
   }
 }
 

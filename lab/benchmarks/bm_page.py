@@ -1,0 +1,109 @@
+"""How soon is the page there, what does it ask for, and what does it show over a slow line?
+
+    python -m lab.benchmarks.bm_page [--visits 3] [--rest-s 30] [--moving-s 15]
+
+Headless Chromium opens a page with one finished scene: visits without and with a cache, with milliseconds to the
+first paint and to the first picture, requests and bytes; then requests and bytes at rest; then pictures a second
+while the clip plays over a line of 400 kbit/s and 400 ms. A stand-in for a worker sends pictures that are as hard to
+code as tissue, so that no figure depends on a renderer. Bytes are of answers with their heads, without what comes
+over the WebSocket.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+from tests.client.page import Page, Site, browser, site_at
+from tests.client.slow_line import slow_line
+from tests.client.test_line_in_browser import BIT_PER_S, LATENCY_S, WATCH, TissuePainter
+
+COUNT = """
+const paint = performance.getEntriesByName("first-contentful-paint")[0]?.startTime ?? NaN;
+const sent = [...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
+  .filter((each) => each.transferSize > 0);
+return [paint, performance.now(), sent.length, sent.reduce((sum, each) => sum + each.transferSize, 0)];
+"""
+"""Milliseconds to the first paint and until now, requests to the service, bytes of their answers."""
+
+
+def main() -> None:
+    """Print a line for each kind of visit, for rest, and for the slow line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--visits", type=int, default=3, help="of each kind (default: %(default)s)")
+    parser.add_argument("--rest-s", type=float, default=30.0, help="seconds at rest (default: %(default)s)")
+    parser.add_argument("--moving-s", type=float, default=15.0, help="over the slow line (default: %(default)s)")
+    options = parser.parse_args()
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    with (
+        tempfile.TemporaryDirectory(prefix="intrasplat-page-") as name,
+        site_at(Path(name) / "data", TissuePainter().answer) as site,
+        browser() as driver,
+    ):
+        site.scene()
+        page = Page(driver, site.url)
+        _visit(site, page)  # the browser starts
+        for kind in ("cold", "warm"):
+            visits = [_visit(site, page, is_cold=kind == "cold") for _ in range(options.visits)]
+            paint_ms, picture_ms, requests, sent_bytes = (median(each) for each in zip(*visits, strict=True))
+            print(
+                f"{kind}: first paint {paint_ms:.0f} ms (at most {max(each[0] for each in visits):.0f}), picture "
+                f"{picture_ms:.0f} ms, {requests:.0f} requests, {sent_bytes / 1e3:.1f} kB",
+                flush=True,
+            )
+        _rest(site, page, options.rest_s)
+        _slow(site, page, options.moving_s)
+        driver.get("about:blank")  # or its connections keep the service from ending
+
+
+def _visit(site: Site, page: Page, *, is_cold: bool = False) -> tuple[float, float, float, float]:
+    """What COUNT finds when the first picture is there."""
+    site.announce()  # else the worker counts as gone after a while
+    page.driver.get("about:blank")
+    if is_cold:
+        page.driver.execute_cdp_cmd("Network.clearBrowserCache", {})
+    page.open()
+    page.until_state("live")
+    paint_ms, now_ms, requests, sent_bytes = page.script(COUNT)
+    return paint_ms, now_ms, requests, sent_bytes
+
+
+def _rest(site: Site, page: Page, rest_s: float) -> None:
+    page.script("performance.setResourceTimingBufferSize(10000); performance.clearResourceTimings()")
+    _wait(site, rest_s)
+    requests, sent_bytes = page.script(COUNT.replace('...performance.getEntriesByType("navigation"), ', ""))[2:]
+    print(f"at rest, {rest_s:g} s: {requests} requests, {sent_bytes / 1e3:.1f} kB", flush=True)
+
+
+def _slow(site: Site, page: Page, moving_s: float) -> None:
+    with slow_line(int(site.url.rpartition(":")[2]), BIT_PER_S, LATENCY_S) as port:
+        slow = Page(page.driver, f"http://127.0.0.1:{port}")
+        slow.open()
+        slow.until(lambda: not slow.script("return document.querySelector('#play').disabled"))
+        slow.script(WATCH)
+        slow.click("#play")
+        _wait(site, moving_s)
+        pictures = slow.script("return pictures")
+        seconds = pictures[-1][0] - pictures[0][0] if len(pictures) > 1 else 0.0
+        rate_hz = (len(pictures) - 1) / seconds if seconds else 0.0
+        line = f"{BIT_PER_S / 1e3:g} kbit/s, {1000 * LATENCY_S:g} ms"
+        print(
+            f"{line}: {rate_hz:.1f} pictures a second in {seconds:.1f} s, {pictures[-1][1] if pictures else 0} px wide"
+        )
+        slow.driver.get("about:blank")
+
+
+def _wait(site: Site, seconds: float) -> None:
+    """Wait, while the worker lives."""
+    until_s = time.monotonic() + seconds
+    while (left_s := until_s - time.monotonic()) > 0:
+        site.announce()
+        time.sleep(min(1.0, left_s))
+
+
+if __name__ == "__main__":
+    main()
