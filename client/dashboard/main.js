@@ -87,9 +87,10 @@ const compare = new Compare(viewer, {
   ofRecorded: get("of-recorded"),
   ofModel: get("of-model"),
   mode: get("compare"),
+  beside: get("beside"),
   tools: get("compare-tools"),
   message: get("compare-message"),
-});
+}, () => address.note());
 const over = { stage: get("stage"), canvas: get("picture"), over: get("over") };
 new Probe(viewer, over);
 new Scale(viewer, { canvas: get("picture"), box: get("scale") });
@@ -102,7 +103,7 @@ const measure = new Measure(viewer, { ...over, button: get("measure"), panel: ge
   },
 });
 const facts = () => ({
-  name: get("scene-id").textContent,
+  name: compare.names,
   badge: get("badge").textContent,
   verdict: get("verdict").querySelector(".shape + span")?.textContent ?? "",
   warning: get("picture-warning").textContent,
@@ -250,6 +251,7 @@ function showJobs() {
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
+  compare.offer([...jobs.byId.values()]);
   setText(get("no-jobs"), shelf.nothing);
   const expected = jobs.byId.get(awaited);
   if (expected && expected.state !== "queued") view(expected.id);
@@ -304,12 +306,21 @@ viewer.timeline.playEvents.addEventListener("changed", () => {
   light.keep(viewer.isRunning || jobs.byId.get(viewer.scene)?.state === "running");
   address.note();
 });
+/** Let the scene play and rock, as its address says; not for whoever wants less motion. */
+function move({ plays, rocks }) {
+  if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+  if (plays) viewer.timeline.play(true);
+  if (rocks && !viewer.rock.isOn) viewer.swing();
+}
+
 const goTo = (place) => {
   if (place.scene !== viewer.scene) view(place.scene);
   viewer.look(place);
+  compare.restore(place.compare);
   measure.restore(place.measures);
+  move(place);
 };
-const address = new Address(viewer, get("layer"), goTo, tell, () => measure.texts);
+const address = new Address(viewer, get("layer"), goTo, tell, () => ({ compare: compare.text, measures: measure.texts }));
 
 const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
 const form = new ClipForm(

@@ -1,0 +1,61 @@
+"""Two scenes of the library beside one another, in a real browser."""
+
+from __future__ import annotations
+
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
+
+from contract.wire.labels import LabelChange
+from tests.client.page import Page, Site, grey_of
+from tests.client.test_compare_in_browser import choose, shade_at, view
+from tests.client.words import say
+
+
+def until_halves(page: Page, left: int, right: int) -> None:
+    """The shades of both scenes' pictures."""
+    page.until(lambda: abs(shade_at(page, 0.5) - left) <= 2 and abs(page.shade - right) <= 2)
+
+
+def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page) -> None:
+    other, scene = site.scene("10"), site.scene("e0")
+    for job_id, label in ((other, "fast"), (scene, "quality")):
+        site.queue.relabel(job_id, LabelChange(label=label))
+    view(page, scene)
+    page.until(
+        lambda: other in page.script("return [...document.querySelector('#beside').options].map((o) => o.value)")
+    )
+    page.script("document.querySelector('#more').open = true")
+    Select(page.find("#beside")).select_by_value(other)  # begins with a seam
+    until_halves(page, grey_of(other), grey_of(scene))
+    assert page.find("#seam").is_displayed()
+    for css, name in (("#of-recorded", "fast"), ("#of-model", "quality")):
+        page.until_text(css, f"{name} · ")
+        page.until_text(css, say("light.care"))
+
+    page.find("#stage").send_keys(Keys.ARROW_LEFT)  # both turn, and the comparison goes on
+    page.until(lambda: "turned" in page.view)
+    page.until(lambda: site.painter.asked is not None and site.painter.asked.scene_id == other)
+    assert site.painter.asked is not None
+    assert site.painter.asked.pose is not None
+    for _ in range(10):
+        page.find("#step-on").click()
+    page.until(lambda: site.painter.asked is not None and abs(site.painter.asked.t - 0.25) < 1e-3)
+    moment = page.text("#of-model").split(" · ")[1]
+    page.until_text("#of-recorded", moment)  # the same second
+
+    choose(page, "side")
+    page.until(lambda: f"compare=side,{other}" in page.driver.current_url)
+    address = page.driver.current_url
+    page.driver.get("about:blank")
+    page.driver.get(address)
+    until_halves(page, grey_of(other), grey_of(scene))
+    assert page.find("#compare").get_attribute("value") == "side"
+    assert page.find("#beside").get_attribute("value") == other
+
+    site.store.purge(other)
+    site.queue.forget(other)
+    page.until_text("#compare-message", "fast")
+    assert page.find("#compare").get_attribute("value") == "off"
+    assert shade_at(page, 0.5) == -1
+    assert page.state == "live"
+    page.until(lambda: "compare=" not in page.driver.current_url)
