@@ -29,7 +29,8 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     until_halves(page, grey_of(other), grey_of(scene))
     assert page.find("#seam").is_displayed()
     for css, name in (("#of-recorded", "fast"), ("#of-model", "quality")):
-        page.until_text(css, f"{name} · ")
+        page.until_text(css, name)
+        page.until_text(css, "0.00 s")
         page.until_text(css, say("light.care"))
 
     page.find("#stage").send_keys(Keys.ARROW_LEFT)  # both turn, and the comparison goes on
@@ -40,8 +41,7 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     for _ in range(10):
         page.find("#step-on").click()
     page.until(lambda: site.painter.asked is not None and abs(site.painter.asked.t - 0.25) < 1e-3)
-    moment = page.text("#of-model").split(" · ")[1]
-    page.until_text("#of-recorded", moment)  # the same second
+    page.until_text("#of-recorded", page.text("#of-model").split(" · ")[1])  # the same second
 
     choose(page, "side")
     page.until(lambda: f"compare=side,{other}" in page.driver.current_url)

@@ -354,8 +354,8 @@ export class Compare {
 
 /** @param {HTMLElement} label @param {string[]} texts the name first @param {Report | null} report */
 function fillLabel(label, [name, ...texts], report) {
-  const mark = report ? [lightMark(trustOf(report).light), " "] : [];
-  label.replaceChildren(...mark, element("b", { text: name }), ` · ${texts.filter(Boolean).join(" · ")}`);
+  const mark = report ? [" ", lightMark(trustOf(report).light)] : [];
+  label.replaceChildren(element("b", { text: name }), ...mark, ` · ${texts.filter(Boolean).join(" · ")}`);
 }
 
 /** Diagonal stripes, px wide along a row. @param {CanvasRenderingContext2D} context @param {number} px */
