@@ -25,6 +25,7 @@ import { JobList } from "./library/joblist.js";
 import { Jobs } from "./library/jobs.js";
 import { progressOf, shareOf, shareOfSending } from "./library/progress.js";
 import { showReport } from "./library/report.js";
+import { Share } from "./library/share.js";
 import { Shelf } from "./library/shelf.js";
 import { TimesLeft } from "./library/timeleft.js";
 import { listOpenFeeds } from "./live/links.js";
@@ -47,6 +48,8 @@ import { Waiting } from "./stage/waiting.js";
 
 const get = (id) => document.getElementById(id);
 
+/** As long as a picture counts without a sign of the service. */
+const FIRST_MS = 5000;
 const scopes = new Scopes(() => showJobs());
 export const viewer = new Viewer({
   stage: get("stage"),
@@ -114,6 +117,10 @@ const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
 viewer.addEventListener("shown", () => viewer.scene === waiting.job && waiting.end());
+/** That of first.js, which says nothing of itself. */
+const dropFirst = () => get("first")?.remove();
+viewer.addEventListener("shown", dropFirst, { once: true });
+setTimeout(dropFirst, FIRST_MS);
 const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
@@ -375,7 +382,11 @@ prepareHelp(get("help"));
 prepareFive(get("five"));
 prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 get("show-help").addEventListener("click", showHelp);
-get("copy-link").addEventListener("click", () => address.copy());
+const share = new Share(get("sharing"), scopes, {
+  link: (isMoving) => address.link({ plays: isMoving, rocks: isMoving && compare.mayTurn }),
+  scene: () => viewer.scene,
+});
+get("share").addEventListener("click", () => share.open());
 onKeys("full_screen", { f: [] }, toggleFullScreen);
 onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());

@@ -41,7 +41,9 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     for _ in range(10):
         page.find("#step-on").click()
     page.until(lambda: site.painter.asked is not None and abs(site.painter.asked.t - 0.25) < 1e-3)
-    page.until_text("#of-recorded", page.text("#of-model").split(" · ")[1])  # the same second
+    moments = ("#of-recorded", "#of-model")
+    page.until(lambda: len({page.text(css).partition(" · ")[2] for css in moments}) == 1)  # the same second
+    assert "0.00 s" not in page.text("#of-recorded")
 
     choose(page, "side")
     page.until(lambda: f"compare=side,{other}" in page.driver.current_url)

@@ -122,6 +122,11 @@ export class Address {
     return scene ? hashOf(place, this.#layers[0]) : "";
   }
 
+  /** @param {{plays?: boolean, rocks?: boolean}} moving as it opens @returns {string} the address of the view */
+  link(moving) {
+    return location.href.replace(/#.*$/, "") + this.hash(moving);
+  }
+
   /** Say it now. */
   write() {
     const hash = this.hash();

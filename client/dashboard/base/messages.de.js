@@ -785,6 +785,15 @@ export const DE = {
     "copy_by_hand": "Kopieren Sie diesen Link: {link}",
     "compare": "Der Vergleich in dieser Adresse ist nicht lesbar."
   },
+  "share": {
+    "title": "Teilen",
+    "link": "Link zu dieser Ansicht",
+    "moves": "Spielt und pendelt beim Öffnen",
+    "file": "Als eine Datei speichern (.html)",
+    "copied": "Der Link ist kopiert.",
+    "by_hand": "Der Link ist markiert: Kopieren Sie ihn mit Strg+C.",
+    "key": "Wer den Link öffnet, braucht einen eigenen Schlüssel, wenn dieser Dienst einen verlangt. Die Datei enthält die Szene selbst: Sie spielt und dreht sich in jedem Browser, ohne den Dienst."
+  },
   "tool": {
     "tools": "Werkzeuge",
     "controls": "Zeit und Ansicht",

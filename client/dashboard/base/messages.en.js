@@ -785,6 +785,15 @@ export const EN = {
     "copy_by_hand": "Copy this link: {link}",
     "compare": "The comparison in this address cannot be read."
   },
+  "share": {
+    "title": "Share",
+    "link": "Link to this view",
+    "moves": "It opens playing and rocking",
+    "file": "Save as one file (.html)",
+    "copied": "The link is copied.",
+    "by_hand": "The link is selected: copy it with Ctrl+C.",
+    "key": "Whoever opens the link needs a key of their own, if this service asks for one. The file holds the scene itself: it plays and turns in any browser, without the service."
+  },
   "tool": {
     "tools": "Tools",
     "controls": "Time and view",

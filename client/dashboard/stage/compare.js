@@ -113,6 +113,11 @@ export class Compare {
     return this.other ? `${this.mode},${this.other.scene}` : this.mode;
   }
 
+  /** Whether it goes on when the view turns. */
+  get mayTurn() {
+    return this.mode === "off" || this.other !== null;
+  }
+
   /** @returns {string} the names of what is compared, or that of the scene in view */
   get names() {
     const { name } = this;
