@@ -48,8 +48,6 @@ import { Waiting } from "./stage/waiting.js";
 
 const get = (id) => document.getElementById(id);
 
-/** As long as a picture counts without a sign of the service. */
-const FIRST_MS = 5000;
 const scopes = new Scopes(() => showJobs());
 export const viewer = new Viewer({
   stage: get("stage"),
@@ -117,10 +115,7 @@ const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
 viewer.addEventListener("shown", () => viewer.scene === waiting.job && waiting.end());
-/** That of first.js, which says nothing of itself. */
-const dropFirst = () => get("first")?.remove();
-viewer.addEventListener("shown", dropFirst, { once: true });
-setTimeout(dropFirst, FIRST_MS);
+viewer.addEventListener("shown", () => get("first")?.remove(), { once: true });
 const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */

@@ -792,7 +792,7 @@ export const DE = {
     "file": "Als eine Datei speichern (.html)",
     "copied": "Der Link ist kopiert.",
     "by_hand": "Der Link ist markiert: Kopieren Sie ihn mit Strg+C.",
-    "key": "Wer den Link öffnet, braucht einen eigenen Schlüssel, wenn dieser Dienst einen verlangt. Die Datei enthält die Szene selbst: Sie spielt und dreht sich in jedem Browser, ohne den Dienst."
+    "key": "Wer den Link öffnet, braucht einen eigenen Schlüssel, wenn dieser Dienst einen verlangt. Die Datei enthält die Szene selbst: Sie spielt und dreht sich in einem Browser, ohne den Dienst."
   },
   "tool": {
     "tools": "Werkzeuge",

@@ -792,7 +792,7 @@ export const EN = {
     "file": "Save as one file (.html)",
     "copied": "The link is copied.",
     "by_hand": "The link is selected: copy it with Ctrl+C.",
-    "key": "Whoever opens the link needs a key of their own, if this service asks for one. The file holds the scene itself: it plays and turns in any browser, without the service."
+    "key": "Whoever opens the link needs a key of their own, if this service asks for one. The file holds the scene itself: it plays and turns in a browser, without the service."
   },
   "tool": {
     "tools": "Tools",

@@ -7,6 +7,7 @@ import { figure, languageEvents, words } from "../base/messages.js";
 import { nameOf } from "../library/card.js";
 import { reasonsIn } from "../library/report.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
+import { Hatch } from "./hatch.js";
 import { OtherScene } from "./otherscene.js";
 import { Pictures, warningOf } from "./pictures.js";
 import { RecordedFrames } from "./recordedframes.js";
@@ -24,9 +25,6 @@ const COMPARISON = /^(wipe|side)(?:,([0-9a-f]{32}))?$/;
 /** @param {string} text of an address */
 export const isComparison = (text) => COMPARISON.test(text);
 
-/** The hatch of what nobody saw (intrasplat/view/unseen.py). */
-const GREYS = ["rgb(40 40 40)", "rgb(74 74 74)"];
-const STRIPES_A_PICTURE = 96;
 
 export class Compare {
   /**
@@ -44,7 +42,7 @@ export class Compare {
     /** @type {Job[]} */
     this.offered = [];
     viewer.awaits = () => this.other?.isExpected === true;
-    this.hatch = document.createElement("canvas");
+    this.hatch = new Hatch();
     /** @type {Mode} */
     this.mode = "off";
     this.seam = MIDDLE;
@@ -253,7 +251,7 @@ export class Compare {
       if (canvas.height !== height) canvas.height = height;
       const context = canvas.getContext("2d");
       context.drawImage(found.picture, 0, 0);
-      if (found.mask && !tools.checked) context.drawImage(this.#hatched(found.mask), 0, 0);
+      if (found.mask && !tools.checked) context.drawImage(this.hatch.over(found.mask), 0, 0);
       this.drawn = found.frame;
     }
     this.#label();
@@ -268,23 +266,6 @@ export class Compare {
       this.drawn = image;
     }
     this.#label();
-  }
-
-  /** @param {ImageBitmap} mask opaque where the hatch is to be */
-  #hatched(mask) {
-    const { hatch } = this;
-    if (hatch.width !== mask.width || hatch.height !== mask.height) {
-      Object.assign(hatch, { width: mask.width, height: mask.height });
-      this.stripes = null;
-    }
-    const context = hatch.getContext("2d");
-    this.stripes ??= stripesOn(context, Math.max(2, Math.round(mask.width / STRIPES_A_PICTURE)));
-    context.globalCompositeOperation = "copy";
-    context.drawImage(mask, 0, 0);
-    context.globalCompositeOperation = "source-in";
-    context.fillStyle = this.stripes;
-    context.fillRect(0, 0, mask.width, mask.height);
-    return hatch;
   }
 
   #label() {
@@ -361,18 +342,4 @@ export class Compare {
 function fillLabel(label, [name, ...texts], report) {
   const mark = report ? [" ", lightMark(trustOf(report).light)] : [];
   label.replaceChildren(element("b", { text: name }), ...mark, ` · ${texts.filter(Boolean).join(" · ")}`);
-}
-
-/** Diagonal stripes, px wide along a row. @param {CanvasRenderingContext2D} context @param {number} px */
-function stripesOn(context, px) {
-  const tile = document.createElement("canvas");
-  tile.width = tile.height = 2 * px;
-  const drawing = tile.getContext("2d");
-  for (let y = 0; y < 2 * px; y++) {
-    for (let x = 0; x < 2 * px; x++) {
-      drawing.fillStyle = GREYS[Math.floor((x + y) / px) % 2];
-      drawing.fillRect(x, y, 1, 1);
-    }
-  }
-  return context.createPattern(tile, "repeat");
 }

@@ -7,6 +7,8 @@
   const asked = new URLSearchParams(query);
   const layer = asked.get("layer") ?? "rgb";
   if (layer === "recorded") return; // no picture of the stream's
+  /** A picture of which nothing is said does not stay longer than one without a sign of the service (screen.js). */
+  const COUNTS_MS = 5000;
   const view = { id: 1, scene, t: Number(asked.get("t")) || 0, layer, format: "jpeg" };
   const pose = asked.get("pose");
   if (pose === "right") view.eye = "right";
@@ -27,6 +29,7 @@
     Object.assign(canvas, { width: image.width, height: image.height, hidden: false });
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close();
+    setTimeout(() => canvas.remove(), COUNTS_MS);
   };
   socket.addEventListener("message", show);
   socket.addEventListener("open", () => {
