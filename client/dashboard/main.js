@@ -25,6 +25,7 @@ import { JobList } from "./library/joblist.js";
 import { Jobs } from "./library/jobs.js";
 import { progressOf, shareOf, shareOfSending, workOn } from "./library/progress.js";
 import { showReport } from "./library/report.js";
+import { Share } from "./library/share.js";
 import { Shelf } from "./library/shelf.js";
 import { TimesLeft } from "./library/timeleft.js";
 import { listOpenFeeds } from "./live/links.js";
@@ -87,9 +88,10 @@ const compare = new Compare(viewer, {
   ofRecorded: get("of-recorded"),
   ofModel: get("of-model"),
   mode: get("compare"),
+  beside: get("beside"),
   tools: get("compare-tools"),
   message: get("compare-message"),
-});
+}, () => address.note());
 const over = { stage: get("stage"), canvas: get("picture"), over: get("over") };
 new Probe(viewer, over);
 new Scale(viewer, { canvas: get("picture"), box: get("scale") });
@@ -102,7 +104,7 @@ const measure = new Measure(viewer, { ...over, button: get("measure"), panel: ge
   },
 });
 const facts = () => ({
-  name: get("scene-id").textContent,
+  name: compare.names,
   badge: get("badge").textContent,
   verdict: get("verdict").querySelector(".shape + span")?.textContent ?? "",
   warning: get("picture-warning").textContent,
@@ -115,6 +117,7 @@ const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
 viewer.addEventListener("shown", () => viewer.scene === waiting.job && waiting.end());
+viewer.addEventListener("shown", () => get("first")?.remove(), { once: true });
 const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */
@@ -271,6 +274,7 @@ function showJobs() {
   offerMasks();
   shelf.refresh();
   list.show(shelf.shown, viewer.scene);
+  compare.offer([...jobs.byId.values()]);
   setText(get("no-jobs"), shelf.nothing);
   const expected = jobs.byId.get(awaited);
   if (expected && expected.state !== "queued") view(expected.id);
@@ -326,12 +330,21 @@ viewer.timeline.playEvents.addEventListener("changed", () => {
   light.keep(viewer.isRunning || jobs.byId.get(viewer.scene)?.state === "running");
   address.note();
 });
+/** Let the scene play and rock, as its address says; not for whoever wants less motion. */
+function move({ plays, rocks }) {
+  if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+  if (plays) viewer.timeline.play(true);
+  if (rocks && !viewer.rock.isOn) viewer.swing();
+}
+
 const goTo = (place) => {
   if (place.scene !== viewer.scene) view(place.scene);
   viewer.look(place);
+  compare.restore(place.compare);
   measure.restore(place.measures);
+  move(place);
 };
-const address = new Address(viewer, get("layer"), goTo, tell, () => measure.texts);
+const address = new Address(viewer, get("layer"), goTo, tell, () => ({ compare: compare.text, measures: measure.texts }));
 
 const announcer = new Announcer({ line: get("sent"), ask: get("notify") }, view);
 const form = new ClipForm(
@@ -390,7 +403,11 @@ prepareLanguages(document.querySelectorAll("[data-language]"));
 prepareFive(get("five"));
 prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 get("show-help").addEventListener("click", showHelp);
-get("copy-link").addEventListener("click", () => address.copy());
+const share = new Share(get("sharing"), scopes, {
+  link: (isMoving) => address.link({ plays: isMoving, rocks: isMoving && compare.mayTurn }),
+  scene: () => viewer.scene,
+});
+get("share").addEventListener("click", () => share.open());
 onKeys("full_screen", { f: [] }, toggleFullScreen);
 onKeys("copy_link", { l: [] }, () => address.copy());
 onKeys("compare", { c: [] }, () => viewer.scene && compare.cycle());

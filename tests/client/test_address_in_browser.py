@@ -93,7 +93,7 @@ def test_the_link_is_copied(page: Page, scene: str) -> None:
     page.driver.execute_cdp_cmd(
         "Browser.grantPermissions", {"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
     )
-    page.click("#copy-link")
+    page.find("#stage").send_keys("l")
     page.until_text("#address-message", say("address.copied"))
     read = "navigator.clipboard.readText().then(arguments[0], (error) => arguments[0](String(error)))"
     assert page.driver.execute_async_script(read) == page.driver.current_url  # type: ignore[no-untyped-call]

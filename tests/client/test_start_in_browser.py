@@ -34,7 +34,7 @@ def test_an_empty_page_says_what_it_is_and_how_to_begin(site: Site, page: Page, 
         assert "intrasplat" in page.text("#empty")
         assert is_on_screen(page, "#empty-example")
         assert is_on_screen(page, "#tools [data-drawer=drawer]")
-        for css in ("#controls", "#measure", "#copy-link", "#tools [data-drawer=report-drawer]"):
+        for css in ("#controls", "#measure", "#share", "#tools [data-drawer=report-drawer]"):
             assert not page.find(css).is_displayed(), css
         assert is_on_screen(page, "#empty-language")
         page.script(CHOOSE_GERMAN)

@@ -1,15 +1,17 @@
-// The page's address: #/scene/ID?t=&pose=&layer=&range=&m= names a view and its measurements, so that it survives a reload and can be sent to others.
+// The page's address: #/scene/ID?t=&pose=&layer=&range=&compare=&m= names a view, what it is compared with and its measurements,
+// so that it survives a reload and can be sent to others. play=1 and rock=1 let it play and rock as it opens.
 // #/live/ID leads to the live screen of a feed.
 
 import { addressOf } from "../live/links.js";
 import { measurementOf } from "../measure/measurements.js";
+import { isComparison } from "../stage/compare.js";
 import { words } from "./messages.js";
 
 /**
- * pose: as GET /render spells it, or RIGHT_EYE. range: of depth's false colours in mm; null: the clip's. measures: as
- * textOf() of measure/measurements.js writes them.
+ * pose: as GET /render spells it, or RIGHT_EYE. range: of depth's false colours in mm; null: the clip's. compare: as text of
+ * stage/compare.js; null: with nothing. measures: as textOf() of measure/measurements.js writes them. plays, rocks: as it opens.
  * @typedef {{scene: string, t: number, pose: string | null, layer: string, range: [number, number] | null,
- *   measures: string[]}} Place
+ *   compare: string | null, measures: string[], plays?: boolean, rocks?: boolean}} Place
  */
 
 /** Not a pose of the service's: the endoscope's right eye, wherever it is at t. */
@@ -44,10 +46,12 @@ export function placeOf(hash, layers) {
   const pose = read("pose", (text) => POSE.test(text), null);
   const layer = read("layer", (text) => layers.includes(text), layers[0]);
   const range = read("range", isRange, null)?.split(",").map(Number) ?? null;
+  const compare = read("compare", isComparison, null);
   const asked = query.getAll("m");
   const measures = asked.filter((text) => measurementOf(text) !== null);
   if (measures.length < asked.length) wrong.push(words("address.measures"));
-  return { place: { scene: found[1], t, pose, layer, range, measures }, wrong: wrong.join(" ") };
+  const [plays, rocks] = ["play", "rock"].map((name) => query.get(name) === "1");
+  return { place: { scene: found[1], t, pose, layer, range, compare, measures, plays, rocks }, wrong: wrong.join(" ") };
 }
 
 /** @param {string} text */
@@ -57,12 +61,15 @@ function isRange(text) {
 }
 
 /** @param {Place} place @param {string} usual the layer that needs no name @returns {string} the hash */
-export function hashOf({ scene, t, pose, layer, range, measures }, usual) {
+export function hashOf({ scene, t, pose, layer, range, compare, measures, plays, rocks }, usual) {
   const parts = [];
   if (t > 0) parts.push(`t=${Number(t.toFixed(4))}`);
   if (pose !== null) parts.push(`pose=${pose.trim().replace(/[,\s]+/g, ",")}`);
   if (layer !== usual) parts.push(`layer=${layer}`);
   if (range) parts.push(`range=${range.join(",")}`);
+  if (compare) parts.push(`compare=${compare}`);
+  if (plays) parts.push("play=1");
+  if (rocks) parts.push("rock=1");
   parts.push(...measures.map((each) => `m=${encodeURIComponent(each).replaceAll("%2C", ",").replaceAll("%3B", ";").replaceAll("%3A", ":")}`));
   return `#/scene/${scene}${parts.length ? `?${parts.join("&")}` : ""}`;
 }
@@ -74,10 +81,10 @@ export class Address {
    * @param {HTMLSelectElement} layer
    * @param {(place: Place) => void} go there: somebody followed or typed an address
    * @param {(text: string, isBad?: boolean) => void} tell
-   * @param {() => string[]} measures that are there
+   * @param {() => {compare: string | null, measures: string[]}} shown beside the view
    */
-  constructor(viewer, layer, go, tell, measures) {
-    Object.assign(this, { viewer, layer, go, tell, measures });
+  constructor(viewer, layer, go, tell, shown) {
+    Object.assign(this, { viewer, layer, go, tell, shown });
     this.timer = 0;
     addEventListener("hashchange", () => this.follow());
     viewer.addEventListener("shown", () => this.note());
@@ -108,11 +115,21 @@ export class Address {
     }, WRITE_AFTER_MS);
   }
 
+  /** @param {{plays?: boolean, rocks?: boolean}} [moving] as it opens @returns {string} the hash of the view; empty without one */
+  hash(moving = {}) {
+    const { scene, timeline, orbit, range } = this.viewer;
+    const place = { scene, t: timeline.t, pose: orbit.place, layer: this.layer.value, range, ...this.shown(), ...moving };
+    return scene ? hashOf(place, this.#layers[0]) : "";
+  }
+
+  /** @param {{plays?: boolean, rocks?: boolean}} moving as it opens @returns {string} the address of the view */
+  link(moving) {
+    return location.href.replace(/#.*$/, "") + this.hash(moving);
+  }
+
   /** Say it now. */
   write() {
-    const { scene, timeline, orbit, range } = this.viewer;
-    const place = { scene, t: timeline.t, pose: orbit.place, layer: this.layer.value, range, measures: this.measures() };
-    const hash = scene ? hashOf(place, this.#layers[0]) : "";
+    const hash = this.hash();
     if (hash !== location.hash) history.replaceState(null, "", hash || location.pathname);
   }
 

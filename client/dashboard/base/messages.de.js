@@ -495,22 +495,30 @@ export const DE = {
     "report_of": "Zur gezeigten Szene: wie gut sie ist, und was zu beachten ist."
   },
   "compare": {
-    "title": "Mit der Aufnahme vergleichen",
+    "title": "Vergleichen",
     "off": "kein Vergleich",
-    "wipe": "Aufnahme und Modell, mit Trennlinie",
-    "side": "Aufnahme neben dem Modell",
+    "wipe": "mit Trennlinie",
+    "side": "nebeneinander",
     "instruments": "Instrumente in der Aufnahme",
     "instruments_why": "Ohne sie ist schraffiert, was maskiert ist.",
     "recorded": "Aufnahme, Bild {frame}",
     "loading": "Bild der Aufnahme wird geladen",
     "model": "Modell",
-    "seam": "Trennlinie zwischen Aufnahme und Modell",
-    "seam_at": "Aufnahme auf {percent} % der Breite",
+    "seam": "Trennlinie zwischen den verglichenen Bildern",
+    "seam_at": "linkes Bild auf {percent} % der Breite",
     "turned": "Der Vergleich ist beendet: Nur vom Ort des Endoskops aus zeigen Aufnahme und Modell dasselbe.",
     "not_yet": "Die Aufnahme kann verglichen werden, wenn die Szene fertig ist.",
     "none": "Zu dieser Szene gibt es keine Bilder der Aufnahme: Sie ist älter, oder die Bilder sollten nicht aufbewahrt werden.",
     "no_eye": "Von diesem Auge sind keine Bilder der Aufnahme aufbewahrt.",
-    "failed": "Die Bilder der Aufnahme können nicht gezeigt werden. {why}"
+    "failed": "Die Bilder der Aufnahme können nicht gezeigt werden. {why}",
+    "with": "Womit die Szene verglichen wird",
+    "with_recording": "mit der Aufnahme",
+    "names": "{other} neben {name}",
+    "other": "andere Szene",
+    "loading_scene": "wird geladen",
+    "silent": "der Dienst antwortet nicht",
+    "over": "ihr Clip ist zu Ende",
+    "other_failed": "Der Vergleich ist beendet: {name} kann nicht mehr gezeigt werden. {why}"
   },
   "measure": {
     "title": "Messen",
@@ -821,7 +829,17 @@ export const DE = {
     "measures": "Eine Messung in dieser Adresse ist nicht lesbar.",
     "copy": "Link kopieren",
     "copied": "Der Link zu dieser Ansicht ist kopiert. Wer ihn öffnet, braucht einen eigenen Schlüssel.",
-    "copy_by_hand": "Kopieren Sie diesen Link: {link}"
+    "copy_by_hand": "Kopieren Sie diesen Link: {link}",
+    "compare": "Der Vergleich in dieser Adresse ist nicht lesbar."
+  },
+  "share": {
+    "title": "Teilen",
+    "link": "Link zu dieser Ansicht",
+    "moves": "Spielt und pendelt beim Öffnen",
+    "file": "Als eine Datei speichern (.html)",
+    "copied": "Der Link ist kopiert.",
+    "by_hand": "Der Link ist markiert: Kopieren Sie ihn mit Strg+C.",
+    "key": "Wer den Link öffnet, braucht einen eigenen Schlüssel, wenn dieser Dienst einen verlangt. Die Datei enthält die Szene selbst: Sie spielt und dreht sich in einem Browser, ohne den Dienst."
   },
   "tool": {
     "tools": "Werkzeuge",
@@ -890,7 +908,7 @@ export const DE = {
     "rock": "Die Ansicht pendeln lassen, oder das beenden",
     "controls": "OP-Bedienung oder alle Bedienelemente",
     "eye": "Linkes Auge, rechtes Auge",
-    "compare": "Mit der Aufnahme vergleichen: mit Trennlinie, daneben, aus",
+    "compare": "Mit der Aufnahme oder einer anderen Szene vergleichen: mit Trennlinie, daneben, aus",
     "measure": "Messen, oder das Messen beenden",
     "full_screen": "Ganzer Bildschirm",
     "copy_link": "Link zu dieser Ansicht kopieren",

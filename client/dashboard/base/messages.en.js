@@ -495,22 +495,30 @@ export const EN = {
     "report_of": "Of the scene in view: how good it is, and what to be careful about."
   },
   "compare": {
-    "title": "Compare with the recording",
+    "title": "Compare",
     "off": "no comparison",
-    "wipe": "recording and model, with a seam",
-    "side": "recording beside the model",
+    "wipe": "with a seam",
+    "side": "beside one another",
     "instruments": "Instruments in the recording",
     "instruments_why": "Without them, what is masked is hatched.",
     "recorded": "recorded, frame {frame}",
     "loading": "recorded frame is loading",
     "model": "model",
-    "seam": "Seam between recording and model",
-    "seam_at": "recording on {percent} % of the width",
+    "seam": "Seam between the pictures that are compared",
+    "seam_at": "left picture on {percent} % of the width",
     "turned": "The comparison has ended: only from the endoscope's own place do recording and model show the same.",
     "not_yet": "The recording can be compared when the scene is finished.",
     "none": "This scene keeps no recorded frames: it was made before they were kept, or they were not to be kept.",
     "no_eye": "Of this eye no recorded frames are kept.",
-    "failed": "The recorded frames cannot be shown. {why}"
+    "failed": "The recorded frames cannot be shown. {why}",
+    "with": "What the scene is compared with",
+    "with_recording": "with the recording",
+    "names": "{other} beside {name}",
+    "other": "other scene",
+    "loading_scene": "is loading",
+    "silent": "the service does not answer",
+    "over": "its clip is over",
+    "other_failed": "The comparison has ended: {name} cannot be shown any more. {why}"
   },
   "measure": {
     "title": "Measure",
@@ -821,7 +829,17 @@ export const EN = {
     "measures": "A measurement in this address cannot be read.",
     "copy": "Copy link",
     "copied": "The link to this view is copied. Whoever opens it needs a key of their own.",
-    "copy_by_hand": "Copy this link: {link}"
+    "copy_by_hand": "Copy this link: {link}",
+    "compare": "The comparison in this address cannot be read."
+  },
+  "share": {
+    "title": "Share",
+    "link": "Link to this view",
+    "moves": "It opens playing and rocking",
+    "file": "Save as one file (.html)",
+    "copied": "The link is copied.",
+    "by_hand": "The link is selected: copy it with Ctrl+C.",
+    "key": "Whoever opens the link needs a key of their own, if this service asks for one. The file holds the scene itself: it plays and turns in a browser, without the service."
   },
   "tool": {
     "tools": "Tools",
@@ -890,7 +908,7 @@ export const EN = {
     "rock": "Rock the view to and fro, or end it",
     "controls": "Controls of the theatre, or all",
     "eye": "Left eye, right eye",
-    "compare": "Compare with the recording: with a seam, beside it, off",
+    "compare": "Compare with the recording or another scene: with a seam, beside it, off",
     "measure": "Measure, or end it",
     "full_screen": "Full screen",
     "copy_link": "Copy the link to this view",

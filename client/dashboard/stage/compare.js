@@ -1,32 +1,48 @@
-// The recorded frame beside or over the model's picture of the same moment. Both show the same only from the
-// endoscope's own pose and in the light of the recording: choosing it goes there, and turning away ends it.
+// The model's picture beside or under another of the same moment: the recorded frame, or another scene. Recording and model
+// show the same only from the endoscope's own pose and in the light of the recording: choosing it goes there, and turning
+// away ends it. Another scene follows wherever the viewer goes.
 
-import { setText } from "../base/element.js";
-import { languageEvents, words } from "../base/messages.js";
+import { element, setText } from "../base/element.js";
+import { figure, languageEvents, words } from "../base/messages.js";
+import { nameOf } from "../library/card.js";
+import { reasonsIn } from "../library/report.js";
+import { lightMark, trustOf } from "../library/trustlight.js";
+import { Hatch } from "./hatch.js";
+import { OtherScene } from "./otherscene.js";
+import { Pictures, warningOf } from "./pictures.js";
 import { RecordedFrames } from "./recordedframes.js";
 
 /** @typedef {import("../base/wire.js").Report} Report */
-/** @typedef {"off"|"wipe"|"side"} Mode wipe: the recorded frame left of a seam, the model right; side: both whole */
+/** @typedef {import("../base/wire.js").JobView} Job */
+/** @typedef {"off"|"wipe"|"side"} Mode wipe: the other picture left of a seam, the model right; side: both whole */
 
 const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDown: -10, PageUp: 10 };
 const ENDS = { Home: 0, End: 100 };
 const MIDDLE = 50;
 const TOLD_MS = 10_000;
-/** The hatch of what nobody saw (intrasplat/view/unseen.py). */
-const GREYS = ["rgb(40 40 40)", "rgb(74 74 74)"];
-const STRIPES_A_PICTURE = 96;
+const COMPARISON = /^(wipe|side)(?:,([0-9a-f]{32}))?$/;
+
+/** @param {string} text of an address */
+export const isComparison = (text) => COMPARISON.test(text);
+
 
 export class Compare {
   /**
    * @param {import("./viewer.js").Viewer} viewer
    * @param {{stage: HTMLElement, box: HTMLElement, canvas: HTMLCanvasElement, seam: HTMLElement,
-   *   ofRecorded: HTMLElement, ofModel: HTMLElement, mode: HTMLSelectElement, tools: HTMLInputElement,
-   *   message: HTMLElement}} parts
+   *   ofRecorded: HTMLElement, ofModel: HTMLElement, mode: HTMLSelectElement,
+   *   beside: HTMLSelectElement, tools: HTMLInputElement, message: HTMLElement}} parts
+   * @param {() => void} onChange there is another comparison, or none
    */
-  constructor(viewer, parts) {
+  constructor(viewer, parts, onChange) {
     this.viewer = viewer;
     this.parts = parts;
-    this.hatch = document.createElement("canvas");
+    this.onChange = onChange;
+    this.pictures = new Pictures();
+    /** @type {Job[]} */
+    this.offered = [];
+    viewer.awaits = () => this.other?.isExpected === true;
+    this.hatch = new Hatch();
     /** @type {Mode} */
     this.mode = "off";
     this.seam = MIDDLE;
@@ -34,10 +50,13 @@ export class Compare {
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.#end(""));
     languageEvents.addEventListener("changed", () => {
+      this.#fill();
+      this.labelled = "";
       this.#label();
       this.#moveSeam(this.seam);
     });
     parts.mode.addEventListener("change", () => this.choose(parts.mode.value));
+    parts.beside.addEventListener("change", () => this.choose(this.mode === "off" ? "wipe" : this.mode));
     parts.tools.addEventListener("change", () => this.#draw());
     this.#listenToSeam();
   }
@@ -47,13 +66,79 @@ export class Compare {
     this.scene = scene;
     /** @type {Report | null} */
     this.report = null;
+    this.wanted = null;
     this.#end("");
-    this.parts.mode.disabled = scene === null;
+    this.parts.mode.disabled = this.parts.beside.disabled = scene === null;
+    this.parts.beside.value = "";
+    this.#fill();
+  }
+
+  /** @param {Job[]} jobs of which the finished ones can be chosen, but not the one in view */
+  offer(jobs) {
+    this.offered = jobs.sort((a, b) => b.created_at_s - a.created_at_s);
+    this.#fill();
+    this.#label(); // the scene in view may have another name
+  }
+
+  #fill() {
+    const { beside } = this.parts;
+    const { value } = beside;
+    const jobs = this.offered.filter(({ id, state }) => state === "done" && id !== this.scene);
+    const { job } = this.other ?? {};
+    if (job && !jobs.some(({ id }) => id === job.id)) jobs.push(job);
+    const options = [["", words("compare.with_recording")], ...jobs.map((each) => [each.id, nameOf(each)])];
+    const filled = JSON.stringify(options);
+    if (filled === this.filled) return; // an open list would close
+    this.filled = filled;
+    beside.replaceChildren(...options.map(([id, name]) => Object.assign(element("option", { text: name }), { value: id })));
+    beside.value = options.some(([id]) => id === value) ? value : "";
+    beside.hidden = options.length === 1;
   }
 
   /** @param {string} scene @param {Report} report its report, which says what it keeps */
   know(scene, report) {
-    if (scene === this.scene) this.report = report;
+    if (scene !== this.scene) return;
+    this.report = report;
+    this.#label();
+    const { wanted } = this;
+    this.wanted = null;
+    if (wanted) this.choose(wanted, "");
+  }
+
+  /** @returns {string | null} what is compared, as an address spells it */
+  get text() {
+    if (this.mode === "off") return null;
+    return this.other ? `${this.mode},${this.other.scene}` : this.mode;
+  }
+
+  /** Whether it goes on when the view turns. */
+  get mayTurn() {
+    return this.mode === "off" || this.other !== null;
+  }
+
+  /** @returns {string} the names of what is compared, or that of the scene in view */
+  get names() {
+    const { name } = this;
+    return this.other ? words("compare.names", { name, other: this.#otherName }) : name;
+  }
+
+  /** @returns {string} of the scene in view */
+  get name() {
+    const job = this.offered.find(({ id }) => id === this.scene);
+    return job ? nameOf(job) : words("compare.model");
+  }
+
+  get #otherName() {
+    return this.other.job ? nameOf(this.other.job) : words("compare.other");
+  }
+
+  /** Compare as an address says. @param {string | null} text */
+  restore(text) {
+    if (text === this.text) return;
+    const [, mode, other = ""] = COMPARISON.exec(text ?? "") ?? [];
+    if (!mode || other === this.scene) this.#end("");
+    else if (other || this.report) this.choose(mode, other);
+    else this.wanted = mode; // what the scene keeps is not known yet
   }
 
   /** The next mode. */
@@ -62,35 +147,62 @@ export class Compare {
     this.choose(modes[(modes.indexOf(this.mode) + 1) % modes.length]);
   }
 
-  /** @param {Mode} mode */
-  choose(mode) {
+  /** @param {Mode} mode @param {string} other scene; empty: the recording */
+  choose(mode, other = this.parts.beside.value) {
+    this.wanted = null;
     if (mode === "off") return this.#end("");
+    if (other !== (this.other?.scene ?? "")) this.#end("");
+    if (other) return this.#chooseScene(mode, other);
     if (!this.report) return this.#end(words("compare.not_yet"));
     if (!this.report.recorded) return this.#end(words("compare.none"));
     if (this.mode === "off") this.isComing = true; // until the view from home, as recorded, is there
-    this.mode = this.parts.mode.value = mode;
-    this.#say("");
-    this.parts.stage.dataset.compare = mode;
-    this.parts.box.hidden = false;
+    this.#begin(mode);
     this.parts.tools.closest("label").hidden = !this.report.recorded.masks;
-    this.#moveSeam(MIDDLE);
-    this.#draw();
     const { orbit, parts } = this.viewer;
     const wish = { light: "recorded", ...(parts.layer.value === "recorded" ? { layer: "rgb" } : {}) };
     this.viewer.look(orbit.isHome ? wish : { ...wish, pose: null }); // at home either eye may stay
   }
 
+  #begin(mode) {
+    this.mode = this.parts.mode.value = mode;
+    this.#say("");
+    this.parts.stage.dataset.compare = mode;
+    this.parts.box.hidden = false;
+    this.#moveSeam(MIDDLE);
+    this.#draw();
+    this.onChange();
+  }
+
+  #chooseScene(mode, scene) {
+    const { viewer, parts } = this;
+    this.other ??= new OtherScene(scene, this.pictures, {
+      onChange: () => {
+        this.#fill();
+        parts.beside.value = scene;
+        this.#draw();
+      },
+      onFail: (error) => this.#end(words("compare.other_failed", { name: this.#otherName, why: error.message })),
+    });
+    this.#begin(mode);
+    if (viewer.shown) this.#follow(viewer.shown);
+  }
+
   /** @param {string} why empty where the user knows */
   #end(why) {
+    const isNew = this.mode !== "off";
+    const { other } = this;
     this.mode = this.parts.mode.value = "off";
     this.frames?.close();
-    this.frames = this.drawn = null;
+    this.frames = this.drawn = this.other = null;
+    other?.close();
+    this.labelled = "";
     this.t = null;
     delete this.parts.stage.dataset.compare;
     this.parts.box.hidden = this.parts.tools.closest("label").hidden = true;
     this.parts.canvas.width = this.parts.canvas.height = 0; // its pixels are gone, not only hidden
     this.#say(why);
     if (this.viewer.light === "recorded") this.viewer.look({ light: "steady" });
+    if (isNew) this.onChange();
   }
 
   /** @param {string} text for a while: it lies over the picture */
@@ -103,6 +215,7 @@ export class Compare {
   /** @param {import("./viewer.js").Shown} shown */
   #follow({ scene, t, pose, layer, eye, light }) {
     if (this.mode === "off" || scene !== this.scene) return;
+    if (this.other) return this.#followScene(t);
     const isHome = pose === null && layer !== "recorded";
     if (this.isComing && !(isHome && light === "recorded")) return;
     if (!isHome) return this.#end(layer === "recorded" ? "" : words("compare.turned"));
@@ -121,8 +234,14 @@ export class Compare {
     this.#draw();
   }
 
+  #followScene(t) {
+    const { cameras } = this.viewer.timeline;
+    if (cameras) this.other.follow(this.viewer.shown, cameras.seconds(t) - cameras.seconds(0));
+  }
+
   /** The frame of the moment in view, if it is there; until then the one before stays, under its own number. */
   #draw() {
+    if (this.other) return this.#drawScene();
     if (this.t === null) return this.#label();
     const found = this.frames.seek(this.t);
     if (found) {
@@ -132,32 +251,27 @@ export class Compare {
       if (canvas.height !== height) canvas.height = height;
       const context = canvas.getContext("2d");
       context.drawImage(found.picture, 0, 0);
-      if (found.mask && !tools.checked) context.drawImage(this.#hatched(found.mask), 0, 0);
+      if (found.mask && !tools.checked) context.drawImage(this.hatch.over(found.mask), 0, 0);
       this.drawn = found.frame;
     }
     this.#label();
   }
 
-  /** @param {ImageBitmap} mask opaque where the hatch is to be */
-  #hatched(mask) {
-    const { hatch } = this;
-    if (hatch.width !== mask.width || hatch.height !== mask.height) {
-      Object.assign(hatch, { width: mask.width, height: mask.height });
-      this.stripes = null;
+  #drawScene() {
+    const { canvas } = this.parts;
+    const image = this.other.shown?.image;
+    if (image && image !== this.drawn) {
+      Object.assign(canvas, { width: image.width, height: image.height });
+      canvas.getContext("2d").drawImage(image, 0, 0);
+      this.drawn = image;
     }
-    const context = hatch.getContext("2d");
-    this.stripes ??= stripesOn(context, Math.max(2, Math.round(mask.width / STRIPES_A_PICTURE)));
-    context.globalCompositeOperation = "copy";
-    context.drawImage(mask, 0, 0);
-    context.globalCompositeOperation = "source-in";
-    context.fillStyle = this.stripes;
-    context.fillRect(0, 0, mask.width, mask.height);
-    return hatch;
+    this.#label();
   }
 
   #label() {
     const { ofRecorded, ofModel, canvas } = this.parts;
     if (this.mode === "off") return;
+    if (this.other) return this.#labelScenes();
     const wanted = this.t === null ? null : this.frames.frameAt(this.t);
     const isLate = this.drawn === null || this.drawn !== wanted;
     canvas.hidden = this.drawn === null;
@@ -166,6 +280,27 @@ export class Compare {
     ofRecorded.toggleAttribute("data-late", isLate);
     ofModel.textContent = words("compare.model");
     canvas.setAttribute("aria-label", text);
+  }
+
+  /** Each half has its scene's name, moment and verdict. */
+  #labelScenes() {
+    const { other, parts, viewer } = this;
+    const { shown, report, isOver } = other;
+    parts.canvas.hidden = this.drawn === null;
+    parts.ofRecorded.toggleAttribute("data-late", other.isLate);
+    const time = Number.isFinite(other.shownS) ? words("time.moment", { seconds: figure(other.shownS, 2) }) : words("compare.loading_scene");
+    const guess = (isGuess) => (isGuess ? [words("screen.extrapolated")] : []);
+    const silent = other.isSilent ? [words("compare.silent")] : isOver ? [words("compare.over")] : [];
+    const left = [this.#otherName, time, ...silent, ...guess(shown?.picture.isExtrapolated)];
+    const right = [this.name, viewer.timeline.momentOf(viewer.shown?.t ?? 0), ...guess(viewer.screen.shown?.isExtrapolated)];
+    const labelled = JSON.stringify([left, right, report?.scored, this.report?.scored]);
+    if (labelled === this.labelled) return;
+    this.labelled = labelled;
+    fillLabel(parts.ofRecorded, left, report);
+    fillLabel(parts.ofModel, right, this.report);
+    const reasons = report ? reasonsIn(report, trustOf(report)) : [];
+    parts.ofRecorded.title = shown ? warningOf(shown.picture.codes, shown.view, reasons) : "";
+    parts.canvas.setAttribute("aria-label", left.join(", "));
   }
 
   #listenToSeam() {
@@ -203,16 +338,8 @@ export class Compare {
   }
 }
 
-/** Diagonal stripes, px wide along a row. @param {CanvasRenderingContext2D} context @param {number} px */
-function stripesOn(context, px) {
-  const tile = document.createElement("canvas");
-  tile.width = tile.height = 2 * px;
-  const drawing = tile.getContext("2d");
-  for (let y = 0; y < 2 * px; y++) {
-    for (let x = 0; x < 2 * px; x++) {
-      drawing.fillStyle = GREYS[Math.floor((x + y) / px) % 2];
-      drawing.fillRect(x, y, 1, 1);
-    }
-  }
-  return context.createPattern(tile, "repeat");
+/** @param {HTMLElement} label @param {string[]} texts the name first @param {Report | null} report */
+function fillLabel(label, [name, ...texts], report) {
+  const mark = report ? [" ", lightMark(trustOf(report).light)] : [];
+  label.replaceChildren(element("b", { text: name }), ...mark, ` · ${texts.filter(Boolean).join(" · ")}`);
 }

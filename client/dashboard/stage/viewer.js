@@ -76,7 +76,9 @@ export class Viewer extends EventTarget {
     this.memory = new Memory(mayDownload);
     this.drawnBy = new DrawnBy(parts.way, this.memory, () => this.refresh());
     this.screen = new Screen(parts);
-    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isWanted || this.#isFull, () => this.screen.isStale);
+    /** Whether something beside the picture is not there yet, for which playing waits. @type {() => boolean} */
+    this.awaits = () => false;
+    this.timeline = new Timeline(parts, () => this.refresh(), () => this.isWanted || this.#isFull || this.awaits(), () => this.screen.isStale);
     this.clip = new Clip((cameras) => this.#know(cameras));
     this.#listen();
     setInterval(() => this.#again(), AGAIN_MS / 3);
@@ -136,6 +138,13 @@ export class Viewer extends EventTarget {
     if (t !== undefined) this.timeline.set(t); // asks for the picture: all of the wish is set before
     if (layer !== undefined) parts.layer.dispatchEvent(new Event("change"));
     this.refresh();
+  }
+
+  /** Begin to rock as soon as it is known where the endoscope was. */
+  swing(visit = this.visit) {
+    if (visit !== this.visit) return;
+    if (this.timeline.cameras) this.rock.toggle();
+    else this.addEventListener("known", () => this.swing(visit), { once: true });
   }
 
   /** Whether a picture takes so long that only other answers can tell whether the service is there. */

@@ -1,0 +1,48 @@
+"""What is handed on of a scene: a link that opens at once, playing and rocking, and one file; in a real browser."""
+
+from __future__ import annotations
+
+from tests.client.page import Page, Site, grey_of
+from tests.client.words import say
+
+FIRST = """
+const canvas = document.querySelector("#first");
+if (!canvas || canvas.hidden || canvas.width === 0) return -1;
+return canvas.getContext("2d").getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[0];
+"""
+HOLD_MODULES = "*/main.js"
+
+
+def test_a_shared_link_shows_its_picture_before_the_modules_and_plays_and_rocks(site: Site, page: Page) -> None:
+    scene = site.scene("a0")
+    page.press(scene, "View")
+    page.until_state("live")
+    page.find("#share").click()
+    link = page.find("#sharing .link").get_attribute("value") or ""
+    assert link.endswith(f"#/scene/{scene}?play=1&rock=1")
+    page.find("#sharing .moves").click()
+    assert (page.find("#sharing .link").get_attribute("value") or "").endswith(f"#/scene/{scene}")
+    assert page.find("#sharing .file").text == say("share.file")
+    page.find("#sharing .copy").click()
+    page.until(lambda: page.text("#sharing .message") in (say("share.copied"), say("share.by_hand")))
+
+    page.driver.get("about:blank")
+    page.driver.execute_cdp_cmd("Network.enable", {})
+    page.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": [HOLD_MODULES]})
+    page.driver.get(link)
+    page.until(lambda: abs(page.script(FIRST) - grey_of(scene)) <= 2)
+    assert page.shade == -1
+
+    page.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": []})
+    page.driver.get("about:blank")
+    page.driver.get(link)
+    page.until(lambda: page.shade == grey_of(scene))
+    page.until(lambda: page.script("return document.querySelector('#first') === null"))
+    for css in ("#play", "#rock"):
+        page.until(
+            lambda css=css: page.script("return document.querySelector(arguments[0]).ariaPressed", css) == "true"
+        )
+    page.find("#rock").click()  # it goes back to where it began, and plays on
+    page.until(lambda: say("view.endoscope") in page.view)
+    page.find("#play").click()
+    page.until(lambda: "play=1" not in page.driver.current_url and "rock=1" not in page.driver.current_url)
