@@ -11,7 +11,7 @@ import { currentKey, keyEvents, showKeyForm } from "./base/key.js";
 import { listenToKeys, onKeys } from "./base/keys.js";
 import { figure, languageEvents, showWords, words } from "./base/messages.js";
 import { pause } from "./base/pause.js";
-import { connectionLost, failureOf } from "./base/problem.js";
+import { failureOf } from "./base/problem.js";
 import { fileName, save } from "./base/save.js";
 import { Scopes } from "./base/scopes.js";
 import { ClipForm } from "./form/form.js";
@@ -23,6 +23,7 @@ import { baselinesOf } from "./library/figures.js";
 import { SceneImport } from "./library/importing.js";
 import { JobList } from "./library/joblist.js";
 import { Jobs } from "./library/jobs.js";
+import { Painting } from "./library/painting.js";
 import { progressOf, shareOf, shareOfSending, workOn } from "./library/progress.js";
 import { showReport } from "./library/report.js";
 import { Share } from "./library/share.js";
@@ -39,6 +40,7 @@ import { prepareFive } from "./stage/five.js";
 import { stepBackWhileIdle } from "./stage/idle.js";
 import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
+import { setMoving } from "./stage/moving.js";
 import { Scale } from "./stage/scale.js";
 import { Snapshot } from "./stage/snapshot.js";
 import { steer } from "./stage/steer.js";
@@ -158,7 +160,7 @@ async function report(id) {
     compare.know(id, found);
     offerError(found);
     verdict.know(found);
-    showReport(get("report"), id, found, { onMasks: sendAgain, onPaint: paintMasks });
+    showReport(get("report"), id, found, { onMasks: sendAgain, onPaint: (...scene) => painting.open(...scene) });
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
@@ -211,20 +213,7 @@ function sendAgain(id, part = "masks", painted) {
   form.sendAgain(job, part, painted);
 }
 
-/** @type {typeof import("./masks/brush.js") | null} loaded when it is wanted first */
-let brush = null;
-
-/** @param {string} id @param {import("./base/wire.js").Report} found its report */
-async function paintMasks(id, found) {
-  viewer.timeline.play(false);
-  try {
-    brush ??= await import("./masks/brush.js");
-    await brush.styled();
-  } catch {
-    return tell(connectionLost().message);
-  }
-  brush.openBrush(id, found, (masks) => sendAgain(id, "masks", masks));
-}
+const painting = new Painting(viewer, tell, (id, masks) => sendAgain(id, "masks", masks));
 
 function offerMasks() {
   const isOffered = viewer.scene !== null && get("layer").value === "recorded";
@@ -330,19 +319,12 @@ viewer.timeline.playEvents.addEventListener("changed", () => {
   light.keep(viewer.isRunning || jobs.byId.get(viewer.scene)?.state === "running");
   address.note();
 });
-/** Let the scene play and rock, as its address says; not for whoever wants less motion. */
-function move({ plays, rocks }) {
-  if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
-  if (plays) viewer.timeline.play(true);
-  if (rocks && !viewer.rock.isOn) viewer.swing();
-}
-
 const goTo = (place) => {
   if (place.scene !== viewer.scene) view(place.scene);
   viewer.look(place);
   compare.restore(place.compare);
   measure.restore(place.measures);
-  move(place);
+  setMoving(viewer, place);
 };
 const address = new Address(viewer, get("layer"), goTo, tell, () => ({ compare: compare.text, measures: measure.texts }));
 
@@ -358,7 +340,7 @@ const form = new ClipForm(
   },
   {
     onJob(id) {
-      brush?.forgetStrokes();
+      painting.forget();
       expect(id);
     },
     onSend: send,
@@ -395,7 +377,6 @@ get("upload").addEventListener("submit", () => closeBanner(get("jobs-message")))
 fitPicture(get("theatre"), get("stage"));
 const isInUse = () => measure.isOn || (get("way").open && get("way").checkVisibility()) || document.querySelector("dialog[open]") !== null;
 stepBackWhileIdle(get("theatre"), () => viewer.scene !== null && drawers.isOpen === null && !isInUse());
-
 const showHelp = () => toggleHelp(get("help"));
 const toggleFullScreen = prepareFullScreen(get("full-screen"));
 prepareHelp(get("help"));
