@@ -38,10 +38,8 @@ def test_a_shared_link_shows_its_picture_before_the_modules_and_plays_and_rocks(
     page.driver.get(link)
     page.until(lambda: page.shade == grey_of(scene))
     page.until(lambda: page.script("return document.querySelector('#first') === null"))
-    for css in ("#play", "#rock"):
-        page.until(
-            lambda css=css: page.script("return document.querySelector(arguments[0]).ariaPressed", css) == "true"
-        )
+    pressed = "return ['play', 'rock'].every((id) => document.getElementById(id).ariaPressed === 'true')"
+    page.until(lambda: page.script(pressed))
     page.find("#rock").click()  # it goes back to where it began, and plays on
     page.until(lambda: say("view.endoscope") in page.view)
     page.find("#play").click()
