@@ -185,10 +185,11 @@ class CameraPoses(BaseModel):
 
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""The unit matrix 3x3, row-major."""
 
 
 class RecordedPixels(BaseModel):
-    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a kept frame shows.
+    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a stored frame shows.
 
     x, y count in pixels of the full size, from the middle of the first one. With (X, Y, Z) = rays (x, y, 1), the
     recorded pixel is camera (D(X / Z, Y / Z), 1), where D is OpenCV's distortion. The defaults move nothing.
@@ -215,7 +216,7 @@ class Recorded(BaseModel):
     masks: bool = Field(description="whether masks are kept with them; False: every pixel counts as tissue")
     size_bytes: int = Field(ge=0, description="what they take on the disk")
     pixels: RecordedPixels | None = Field(
-        default=None, description="which pixels of the recording they show; None: a report of before it was said"
+        default=None, description="which pixels of the recording they show; None: the report is of an earlier version"
     )
 
 

@@ -729,11 +729,11 @@ class Recorded(Model):
     size_bytes: int
     """what they take on the disk"""
     pixels: RecordedPixels | None = None
-    """which pixels of the recording they show; None: a report of before it was said"""
+    """which pixels of the recording they show; None: the report is of an earlier version"""
 
 
 class RecordedPixels(Model):
-    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a kept frame shows.
+    """The left eye's pixels as they were recorded, and which of them a pixel (x, y) of a stored frame shows.
 
     x, y count in pixels of the full size, from the middle of the first one. With (X, Y, Z) = rays (x, y, 1),
     the recorded pixel is camera (D(X / Z, Y / Z), 1), where D is OpenCV's distortion. The defaults move

@@ -125,7 +125,7 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.scene.checkpoint import check_is_scene, load_scene
     from intrasplat.splat.backend import choose_device
     from intrasplat.view.camera import camera_of, pose_of
-    from intrasplat.view.encode import encode_layer
+    from intrasplat.view.encode import FOR_EYES, encode_layer
     from intrasplat.view.error import AS_RECORDED, check_comparable, error_levels
     from intrasplat.view.recorded import stored_picture
     from intrasplat.view.render import render_frame
@@ -155,7 +155,9 @@ def run_cli(options: argparse.Namespace) -> int:
             highlights=highlights, light=how["light"], smoke=how["smoke"],
             detail=how["detail"] if layer is Layer.RGB else "off",
         )  # fmt: skip
-        range_mm = _depth_range(renderer_of(scene, device).depth_range, pose, options) if layer is Layer.DEPTH else None
+        range_mm = None
+        if layer is Layer.DEPTH and image_format in FOR_EYES:
+            range_mm = _depth_range(renderer_of(scene, device).depth_range, pose, options)
         path.parent.mkdir(parents=True, exist_ok=True)
         error = None if recorded is None else error_levels(frame.rgb, recorded, frame.unseen)
         unseen = Unseen(options.unseen)
@@ -184,8 +186,12 @@ def _depth_range(
 
 def _without_effect(options: argparse.Namespace, scene: TrainedScene) -> Iterator[str]:
     """Why an option changes nothing."""
-    if (options.near_mm, options.far_mm) != (None, None) and options.layer != Layer.DEPTH:
-        yield f"Layer {options.layer} has no range of depths: --near-mm and --far-mm change nothing."
+    from intrasplat.view.encode import FOR_EYES
+
+    if (options.near_mm, options.far_mm) != (None, None):
+        has_colours = options.frames is None and SUFFIX_FORMATS.get(options.out.suffix.lower()) in FOR_EYES
+        if options.layer != Layer.DEPTH or not has_colours:
+            yield "Only depth as JPEG or WebP has false colours: --near-mm and --far-mm change nothing."
     if options.smoke == "show" and scene.veil is None:
         yield "No smoke was found in the clip of this scene: --smoke show changes nothing."
     if options.light == "recorded" and scene.log_gains is None and scene.vignetting is None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +17,6 @@ Rgb = NDArray[np.uint8]  # [H, W, 3]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
-Colour = tuple[Image, Image, Image]
 
 COARSE_WIDTH, FINE_WIDTH = 160, 320
 """Widths, px, of the reduced pictures in which instruments, then their outlines, are searched."""
@@ -51,7 +51,8 @@ DARK_EDGE, COLOURED_EDGE = 0.6, 0.15
 """Signs of an instrument's edge: maximum brightness relative to the surrounding tissue's; minimum difference of
 (green - blue) / (green + blue) from it."""
 ENTRY_SHARE = 0.05
-"""Share of the width: this near to the border, where the eyes hardly overlap, masks extend so far without depth."""
+"""Share of the width. Beside the field's left edge, which the right eye hardly sees, masks extend so far without
+depth."""
 COLOURLESS, MAX_LIGHT, MIN_COLOURED = 0.18, 1.25, 0.9
 """Signs of an instrument that lies on tissue: maximum relative redness; maximum brightness relative to the picture's,
 because highlights have no colour either; minimum share of its outline with a step in redness."""
@@ -60,6 +61,19 @@ REDDISH, REDDISH_STEP, MIN_REDDISH_OUTLINE, MIN_IN_FRONT = 0.7, 0.15, 0.6, 0.7
 outline with it; minimum score of its depth."""
 UNSURE = 0.5
 """Minimum score of a masked candidate; the score of instruments that reflect tissue."""
+
+
+class Colour(NamedTuple):
+    """Images [h, w] of a picture, or of the tissue around its pixels.
+
+    redness     (red - green) / (red + green), relative to the tissue's
+    brightness  of the brightest channel, 0 to 255
+    hue         (green - blue) / (green + blue)
+    """
+
+    redness: Image
+    brightness: Image
+    hue: Image
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,19 +282,18 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
     """
     size = picture.fine.shape[1::-1]
     enlarged = [_resized(each.pixels, size) for each in candidates]
-    zone_px = 2 * round(ZONE_SHARE * size[0]) + 1
     colour, tissue = _colour(picture.fine, look), _around(picture, candidates, look)
-    redness, around = colour[0], np.minimum(tissue[0], MAX_LOCAL_REDNESS)
-    entry = _box(2 * round(ENTRY_SHARE * COARSE_WIDTH) + 1)
-    strip = (cv2.dilate(picture.border.view(np.uint8), entry) > 0) & picture.field
+    redness, around = colour.redness, np.minimum(tissue.redness, MAX_LOCAL_REDNESS)
+    entry_px = round(ENTRY_SHARE * COARSE_WIDTH)
+    strip = picture.field & (np.cumsum(picture.field, axis=1) <= entry_px)
     found = np.zeros(size[::-1], np.uint8)
     for each, whole in zip(candidates, enlarged, strict=True):
         core = cv2.erode(whole, _box(3), borderValue=1)
         own = float(np.median(redness[core > 0])) if core.any() else 0.2
         beyond = (_around_tip(each.pixels, picture.border) & in_front) | (
-            strip & (cv2.dilate(each.pixels.view(np.uint8), entry) > 0)
+            strip & (cv2.dilate(each.pixels.view(np.uint8), _box(2 * entry_px + 1)) > 0)
         )
-        zone = cv2.dilate(whole, _box(zone_px)) | _resized(beyond, size)
+        zone = cv2.dilate(whole, _zone(size[0])) | _resized(beyond, size)
         like = ((redness < (own + around) / 2) & (zone > 0)).astype(np.uint8) | core
         found |= _closed(_connected(like, core), CLOSED_PX)
     found = cv2.dilate(found | _edge(found, colour, tissue), _box(GROWN_PX))
@@ -291,29 +304,40 @@ def _outlined(picture: Looked, candidates: Sequence[_Candidate], in_front: Mask,
 def _edge(found: Bits, colour: Colour, tissue: Colour) -> Bits:
     """An instrument [h, w] with the pixels beside it that are darker than the surrounding tissue or of another hue: its
     shaded side, its shadow, and coloured parts that reflect tissue."""
-    beside = cv2.dilate(found, _box(2 * round(ZONE_SHARE * found.shape[1]) + 1))
-    other = (colour[1] < np.float32(DARK_EDGE) * tissue[1]) | (cv2.absdiff(colour[2], tissue[2]) > COLOURED_EDGE)
+    beside = cv2.dilate(found, _zone(found.shape[1]))
+    is_dark = colour.brightness < np.float32(DARK_EDGE) * tissue.brightness
+    other = is_dark | (cv2.absdiff(colour.hue, tissue.hue) > COLOURED_EDGE)
     return _closed(_connected(found | (other & beside), found), CLOSED_PX)
 
 
 def _colour(rgb: Rgb, look: TissueLook) -> Colour:
-    """Images [h, w] of a picture: redness relative to the tissue's, brightness, (green - blue) / (green + blue)."""
-    red, green, blue = (each.astype(np.float32) for each in cv2.split(cv2.GaussianBlur(rgb, (3, 3), 0)))
-    redness = (red - green) / (red + green + np.float32(DARK_LEVELS)) / np.float32(look.redness)
+    """The colour of a picture, smoothed."""
+    smooth = cv2.GaussianBlur(rgb, (3, 3), 0)
+    red, green, blue = (each.astype(np.float32) for each in cv2.split(smooth))
     hue = (green - blue) / (green + blue + np.float32(DARK_LEVELS))
-    return redness, cv2.max(cv2.max(red, green), blue), hue
+    return Colour(_redness(smooth) / np.float32(look.redness), cv2.max(cv2.max(red, green), blue), hue)
 
 
 def _around(picture: Looked, candidates: Sequence[_Candidate], look: TissueLook) -> Colour:
-    """The mean colour (_colour) of the tissue around each pixel of the fine picture."""
-    size, (width, height) = picture.coarse.shape[1::-1], picture.fine.shape[1::-1]
+    """The mean colour of the tissue around each pixel of the fine picture.
+
+    Where none is near it is that of all tissue; NaN without any.
+    """
+    width, size = picture.coarse.shape[1], picture.fine.shape[1::-1]
     taken = np.logical_or.reduce([each.pixels for each in candidates]).view(np.uint8)
-    far = cv2.dilate(taken, _box(2 * round(ZONE_SHARE * size[0]) + 1)) < picture.field
-    weight, window = far.astype(np.float32), round(LOCAL_SHARE * size[0]) | 1
-    count = np.maximum(_mean(weight, window), np.float32(1e-3))
-    means = [_mean(each * weight, window) / count for each in _colour(picture.coarse, look)]
-    redness, light, hue = (cv2.resize(each, (width, height), interpolation=cv2.INTER_LINEAR) for each in means)
-    return redness, light, hue
+    is_tissue = picture.field & (cv2.dilate(taken, _zone(width)) == 0)
+    weight, window, little = is_tissue.astype(np.float32), round(LOCAL_SHARE * width) | 1, np.float32(1e-3)
+    count, means = _mean(weight, window) + little, []
+    for each in _colour(picture.coarse, look):
+        overall = np.float32(each[is_tissue].mean() if is_tissue.any() else np.nan)
+        mean = (_mean(each * weight, window) + little * overall) / count
+        means.append(cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR))
+    return Colour(*means)
+
+
+def _zone(width: int) -> Bits:
+    """The square around a pixel of a picture of that width in which the outline is searched."""
+    return _box(2 * round(ZONE_SHARE * width) + 1)
 
 
 def _connected(like: Bits, core: Bits) -> Bits:

@@ -113,21 +113,7 @@ class Feed:
         status, numbers, window = self._source.status, self._source.numbers(), self._model.span()
         past = range_of(window, self._past)
         age_s = None if past is None else time.time() - past.ends_at
-        state, reason, text = status.state, status.reason, status.text
-        if state in (FeedState.LIVE, FeedState.BEHIND):
-            trouble = self._model.trouble
-            if self._watch is not None and self._watch.is_out:
-                state, reason, text = (
-                    FeedState.NO_TISSUE,
-                    None,
-                    "the pictures show no tissue: nothing of them is stored",
-                )
-            elif trouble is not None:
-                state, reason, text = FeedState.STALLED, trouble.reason, trouble.text
-            elif age_s is None or not self._model.has_begun:
-                state, reason, text = FeedState.CONNECTING, None, "the model begins"
-            elif age_s > self.settings.max_age_s:
-                state, reason, text = FeedState.BEHIND, FeedReason.TOO_SLOW, "the model does not keep up"
+        state, reason, text = self._situation(age_s)
         numbers = replace(
             numbers,
             used_fps=self._model.used_fps(),
@@ -147,6 +133,22 @@ class Feed:
             segment=self._source.segment,
         )
 
+    def _situation(self, age_s: float | None) -> tuple[FeedState, FeedReason | None, str]:
+        """State, reason and text of source and model; age_s: of the newest moment that is known, if one is."""
+        status = self._source.status
+        if status.state not in (FeedState.LIVE, FeedState.BEHIND):
+            return status.state, status.reason, status.text
+        if self._watch is not None and self._watch.is_out:
+            return FeedState.NO_TISSUE, None, "the pictures show no tissue: nothing of them is stored"
+        trouble = self._model.trouble
+        if trouble is not None:
+            return FeedState.STALLED, trouble.reason, trouble.text
+        if age_s is None or not self._model.has_begun:
+            return FeedState.CONNECTING, None, "the model begins"
+        if age_s > self.settings.max_age_s:
+            return FeedState.BEHIND, FeedReason.TOO_SLOW, "the model does not keep up"
+        return status.state, status.reason, status.text
+
     def moment(self, when: FeedTime = LIVE) -> FeedMoment | None:
         """The moment of a time, to be rendered; None: nothing is known yet.
 
@@ -155,9 +157,9 @@ class Feed:
         Raises:
             InputError: the time lies before the past that is stored; its field is "t".
         """
-        is_out = self._watch is not None and self._watch.is_out
-        is_fed = self._source.state in (FeedState.LIVE, FeedState.BEHIND)
-        goes_on = is_fed and not is_out and self._model.trouble is None
+        past = range_of(self._model.span(), self._past)
+        state, _, _ = self._situation(None if past is None else time.time() - past.ends_at)
+        goes_on = state in (FeedState.LIVE, FeedState.BEHIND)
         return find_moment(when, self._model.scene(), self._past, self.settings.max_age_s, goes_on=goes_on)
 
     def picture(self) -> FeedPair | None:

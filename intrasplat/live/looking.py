@@ -62,8 +62,8 @@ def find_moment(
 ) -> FeedMoment | None:
     """The moment of a time; None: nothing is known yet.
 
-    goes_on: whether the model is to learn what comes in: of a time that it has not come to yet, the newest moment is
-    shown, without a notice.
+    goes_on: whether the model learns what comes in. Then a time after the newest moment gives that moment without a
+    notice, if it is at most max_age_s old: the time will be known soon.
 
     Raises:
         InputError: the time lies before the past that is stored.
@@ -114,7 +114,7 @@ def _moment(
     shown, source_s, captured_at = (float(np.interp(place, frames, each)) for each in (along, *times.values()))
     age_s, is_live = time.time() - captured_at, source_s >= newest_s
     off_s, notices = abs(shown - wanted), tuple[Notice, ...]()
-    is_to_come = goes_on and is_live and wanted > shown and off_s <= age_s + TOLERANCE_S
+    is_to_come = goes_on and is_live and age_s <= max_age_s and wanted > shown and off_s <= age_s + TOLERANCE_S
     if off_s > TOLERANCE_S and asked != LIVE and not is_to_come:
         text = f"Nothing is known of this moment: the nearest one is shown, {off_s:.1f} s {_side(shown, wanted)} it."
         notices = (Notice.warning(NoticeCode.TIME_IN_GAP, text),)

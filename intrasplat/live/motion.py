@@ -19,7 +19,8 @@ Floats = NDArray[np.float32]
 NOISE_PX, DEPTH_NOISE_PX = 0.2, 0.3
 """Motion across the view, and change of disparity, in px of the coarse grid, that are as likely noise as motion."""
 MAX_OFF = 0.2
-"""Relative difference of depth from which on the model shows something else than the recorded frame."""
+"""Relative difference of depth from which on the model shows something else than the recorded frame, and a Gaussian is
+not part of the surface that flow follows."""
 
 
 class FlowStart:
@@ -71,7 +72,7 @@ class Carried:
     colour: Floats
 
     def of(self, means_mm: Floats) -> tuple[Floats, Floats]:
-        """Displacement in mm and change of the constant harmonic, [3, N] each, of Gaussians.
+        """Displacement in mm and change of the constant harmonic, [3, N] each, of Gaussians; 0 off the surface.
 
         means_mm: [N, 3] centres in the first frame, world.
         """
@@ -84,5 +85,5 @@ class Carried:
         column = np.clip(np.rint(column), 0, width - 1).astype(np.intp)
         moved_mm, colour = (np.ascontiguousarray(each[row, column].T) for each in (self.displacement_mm, self.colour))
         depth_mm = start.depth_mm[row, column]
-        moved_mm *= np.abs(z - depth_mm) <= MAX_OFF * depth_mm
-        return moved_mm, np.asarray(colour / np.float32(SH_C0), np.float32)
+        is_there = np.abs(z - depth_mm) <= MAX_OFF * depth_mm
+        return moved_mm * is_there, np.asarray(colour * (is_there / np.float32(SH_C0)), np.float32)

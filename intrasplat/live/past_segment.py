@@ -134,7 +134,7 @@ def _drawn(scene: TrainedScene) -> TrainedScene:
 
 
 def _anchored(scene: TrainedScene) -> TrainedScene:
-    """The same scene, whose centres at rest are their means over its frames: motion is short, as float16 needs it."""
+    """The same scene with the mean of the weights of its motion in the centres at rest: float16 has small weights."""
     motion = scene.deformation
     assert isinstance(motion, SharedBasis)
     weight = motion.weight.clone()

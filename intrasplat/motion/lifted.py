@@ -70,7 +70,8 @@ class PointGrid:
 class CoarseFrame:
     """A frame on the coarse grid: colour, grey, depth, points (world, mm), and the confidence of depth and mask.
 
-    Missing depth is completed from the surroundings; it is 0 in a frame without any depth.
+    Missing depth is completed from the surroundings; it is 0 in a frame without any depth. Only correct_depth() changes
+    it.
     """
 
     def __init__(self, clip: DepthClip, index: int, grid: PointGrid) -> None:
@@ -90,7 +91,7 @@ class CoarseFrame:
         self.points_mm: Floats = (self.grid.rays * depth_mm[..., None]) @ self.axes.T + self.place_mm
 
     def correct_depth(self, depth_mm: Floats, where: NDArray[np.bool_]) -> None:
-        """Take another depth [h, w], without any confidence, where [h, w] tells so."""
+        """Take another depth [h, w], without any confidence; where: [h, w] bool."""
         self._put(np.where(where, depth_mm, self.depth_mm))
         self.trust[where] = 0
 

@@ -101,9 +101,13 @@ def train(
         if (now := clock.elapsed_s) - reported >= REPORT_EVERY_S:
             reported = now
             made_s = now - began
-            left_s = made_s / (iteration - first) * (run.iterations - iteration) if made_s > REMAINING_AFTER_S else None
-            if left_s is not None and has_budget and run.schedule.fitted_at is not None:
-                left_s = min(left_s, max(run.setup.budget_s - now, 0.0))  # the last cycle will be fitted into it
+            step_s = made_s / (iteration - first) if made_s > REMAINING_AFTER_S else None
+            left_s = None if step_s is None else step_s * (run.iterations - iteration)
+            if step_s is not None and has_budget and (least := run.schedule.least_end) is not None:
+                # the last cycle will be fitted into the budget, as far as it can be
+                left_s = min(
+                    step_s * (run.iterations - iteration), max(run.setup.budget_s - now, step_s * (least - iteration))
+                )
             hooks.on_progress(run.progress("train", iteration / run.iterations, left_s))
     check_sums(run.model.wait(), run.iteration)
     _check_finite(run)

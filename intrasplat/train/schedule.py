@@ -125,6 +125,12 @@ class Schedule:
         ends = self._planned_ends
         return ends[-2] if len(ends) > 1 and self.fitted is None and self.stopped_at is None else None
 
+    @property
+    def least_end(self) -> int | None:
+        """The last iteration if the last cycle is fitted to as few iterations as it can be; None: see fitted_at."""
+        *_, end = self._planned_ends
+        return None if self.fitted_at is None else self.fitted_at + (end - self.fitted_at) // MAX_REFIT
+
     def with_last_cycle(self, fitting: int) -> Schedule:
         """The schedule with a last cycle of the iterations that fit, from half to twice as many as planned."""
         *_, start, end = self._planned_ends

@@ -3,10 +3,10 @@
     python -m lab.benchmarks.bm_page [--visits 3] [--rest-s 30] [--moving-s 15]
 
 Headless Chromium opens a page with one finished scene: visits without and with a cache, with milliseconds to the
-first paint and to the first picture, requests and bytes; then requests and bytes at rest; then pictures a second
-while the clip plays over a line of 400 kbit/s and 400 ms. A stand-in for a worker sends pictures that are as hard to
-code as tissue, so that no figure depends on a renderer. Bytes are of answers with their heads, without what comes
-over the WebSocket.
+first paint and until the first picture was noticed, requests and bytes; then requests and bytes at rest; then
+pictures a second while the clip plays over a line of 400 kbit/s and 400 ms. A stand-in for a worker sends pictures
+that are as hard to code as tissue, so that no figure depends on a renderer. Bytes are of answers with their heads,
+without what comes over the WebSocket.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ import time
 from pathlib import Path
 from statistics import median
 
+from intrasplat.commands.arguments import positive
 from tests.client.page import Page, Site, browser, site_at
 from tests.client.slow_line import slow_line
 from tests.client.test_line_in_browser import BIT_PER_S, LATENCY_S, WATCH, TissuePainter
 
 COUNT = """
-const paint = performance.getEntriesByName("first-contentful-paint")[0]?.startTime ?? NaN;
-const sent = [...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
-  .filter((each) => each.transferSize > 0);
+const paint = performance.getEntriesByName("first-contentful-paint")[0]?.startTime ?? -1;
+const sent = ["navigation", "resource"].slice(arguments[0] ? 0 : 1)
+  .flatMap((kind) => performance.getEntriesByType(kind)).filter((each) => each.transferSize > 0);
 return [paint, performance.now(), sent.length, sent.reduce((sum, each) => sum + each.transferSize, 0)];
 """
-"""Milliseconds to the first paint and until now, requests to the service, bytes of their answers."""
+"""Milliseconds to the first paint, -1 without one, and until now; requests to the service, without that for the page if
+the argument is false, and bytes of their answers."""
 
 
 def main() -> None:
     """Print a line for each kind of visit, for rest, and for the slow line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--visits", type=int, default=3, help="of each kind (default: %(default)s)")
+    parser.add_argument("--visits", type=positive, default=3, help="of each kind (default: %(default)s)")
     parser.add_argument("--rest-s", type=float, default=30.0, help="seconds at rest (default: %(default)s)")
     parser.add_argument("--moving-s", type=float, default=15.0, help="over the slow line (default: %(default)s)")
     options = parser.parse_args()
@@ -68,14 +70,14 @@ def _visit(site: Site, page: Page, *, is_cold: bool = False) -> tuple[float, flo
         page.driver.execute_cdp_cmd("Network.clearBrowserCache", {})
     page.open()
     page.until_state("live")
-    paint_ms, now_ms, requests, sent_bytes = page.script(COUNT)
+    paint_ms, now_ms, requests, sent_bytes = page.script(COUNT, True)
     return paint_ms, now_ms, requests, sent_bytes
 
 
 def _rest(site: Site, page: Page, rest_s: float) -> None:
     page.script("performance.setResourceTimingBufferSize(10000); performance.clearResourceTimings()")
     _wait(site, rest_s)
-    requests, sent_bytes = page.script(COUNT.replace('...performance.getEntriesByType("navigation"), ', ""))[2:]
+    requests, sent_bytes = page.script(COUNT, False)[2:]
     print(f"at rest, {rest_s:g} s: {requests} requests, {sent_bytes / 1e3:.1f} kB", flush=True)
 
 

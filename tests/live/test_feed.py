@@ -87,9 +87,12 @@ def _frames() -> Iterator[object]:
 def test_every_way_to_name_a_moment_shows_the_same_one(followed: Follow) -> None:
     feed = followed(replace(FEED, keep_s=60.0))
     until_known(feed, 2.5)
-    now = feed.moment(FeedTime.at(time.time()))
-    assert now is not None
-    assert (now.is_live, now.notices) == (True, ())
+
+    def is_shown_as_newest() -> bool:
+        now = feed.moment(FeedTime.at(time.time()))
+        return now is not None and (now.is_live, now.notices) == (True, ())
+
+    until(is_shown_as_newest)
     feed.pause()
     live = feed.moment()
     assert live is not None

@@ -254,8 +254,9 @@ def test_the_last_iteration_is_scored_and_reported() -> None:
     assert all(each.stage == "train" and 0 <= each.fraction <= 1 and each.iterations == 5 for each in told)
 
 
-def test_the_time_left_is_at_most_that_of_the_budget_while_the_last_cycle_is_not_fitted_yet(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("step_s", "iterations"), [(1.0, 500), (3.0, 450)])
+def test_the_time_left_foresees_that_the_last_cycle_is_fitted_to_the_budget(
+    step_s: float, iterations: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, _ = prepared(phantom_clip())
     options = run.setup.options.model_copy(update={"iterations": None, "budget_s": 500.0})
@@ -263,23 +264,23 @@ def test_the_time_left_is_at_most_that_of_the_budget_while_the_last_cycle_is_not
     run.schedule = Schedule(planned=600, warm_restarts=True)
 
     class SlowSteps(Stopwatch):
-        """A second a step."""
+        """Equal seconds a step."""
 
         @property
         def elapsed_s(self) -> float:
-            return float(run.iteration)
+            return step_s * run.iteration
 
     def advance(run: Run) -> int:
         run.iteration += 1
         return run.iteration
 
     monkeypatch.setattr("intrasplat.train.loop._advance", advance)
-    told: list[Progress] = []
-    train(run, SlowSteps(), lambda: HeldOutScore(31.5, math.nan), TrainingHooks(on_progress=told.append))
-    ends_s = [each.iteration + each.seconds_left for each in told if each.seconds_left is not None]
-    assert run.iterations == 500
+    reported: list[Progress] = []
+    train(run, SlowSteps(), lambda: HeldOutScore(31.5, math.nan), TrainingHooks(on_progress=reported.append))
+    ends_s = [step_s * each.iteration + each.seconds_left for each in reported if each.seconds_left is not None]
+    assert run.iterations == iterations
     assert len(ends_s) > 400
-    assert ends_s == pytest.approx([500.0] * len(ends_s))
+    assert ends_s == pytest.approx([step_s * iterations] * len(ends_s))
 
 
 def test_without_held_out_frames_there_is_no_curve() -> None:
