@@ -71,7 +71,7 @@ def test_a_picture_of_the_view_says_what_it_shows(site: Site, page: Page, tmp_pa
 def saved(page: Page, folder: Path) -> NDArray[np.uint8]:
     """[H, W, 3] BGR of the picture that the key saves."""
     page.find("#stage").send_keys("p")
-    page.until(lambda: list(folder.glob("*.png")))
+    page.until(lambda: [file for file in folder.glob("*.png") if file.stat().st_size])
     (file,) = folder.glob("*.png")
     content = np.frombuffer(file.read_bytes(), np.uint8)
     file.unlink()
