@@ -105,8 +105,8 @@ def test_of_a_feed_that_goes_on_what_the_model_has_not_come_to_yet_is_no_gap() -
     past, window = Past(PastSpec(keep_s=1000.0)), scene(0.0, frames=6)
     newest_s, newest_at = 1.0, NOW - 19.0
 
-    def codes(when: FeedTime, *, goes_on: bool) -> list[str]:
-        view = find_moment(when, window, past, 1.0, goes_on=goes_on)
+    def codes(when: FeedTime, *, goes_on: bool, max_age_s: float = 1000.0) -> list[str]:
+        view = find_moment(when, window, past, max_age_s, goes_on=goes_on)
         assert view is not None
         assert (view.source_s, view.is_live) == (pytest.approx(newest_s), True)
         return [each.code for each in view.notices]
@@ -115,6 +115,7 @@ def test_of_a_feed_that_goes_on_what_the_model_has_not_come_to_yet_is_no_gap() -
     for when in (FeedTime.at(time.time() - 0.5), FeedTime.of_source(newest_s + age_s - 0.5)):
         assert codes(when, goes_on=True) == []
         assert codes(when, goes_on=False) == ["time_in_gap"]
+        assert codes(when, goes_on=True, max_age_s=1.0) == ["time_in_gap"]  # it may be of before an outage
     for later in (FeedTime.at(time.time() + 30.0), FeedTime.of_source(newest_s + age_s + 30.0)):
         assert codes(later, goes_on=True) == ["time_in_gap"]
 
