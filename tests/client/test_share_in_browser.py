@@ -66,3 +66,24 @@ def test_the_early_picture_goes_as_soon_as_another_scene_is_opened(site: Site, p
     assert page.shade == -1
     site.painter.pause_s = 0
     page.until(lambda: page.shade == grey_of(other))
+
+
+def test_a_link_that_rocks_does_not_end_the_rocking_that_was_begun_by_hand(site: Site, page: Page) -> None:
+    scene = site.scene("a0")
+    hold = """
+        const ask = window.fetch;
+        window.fetch = async (path, how) => {
+          if (String(path).endsWith("/cameras")) await new Promise((go) => (window.letGo = go));
+          return ask(path, how);
+        };
+    """
+    held = page.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": hold})
+    page.driver.get("about:blank")
+    page.driver.get(f"{site.url}/#/scene/{scene}?rock=1")
+    page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", held)
+    page.until(lambda: page.shade == grey_of(scene))
+    page.find("#rock").click()
+    page.until(lambda: page.script("return window.letGo !== undefined"))
+    page.script("letGo()")
+    page.until_text("#time-value", "of 40")  # its cameras are known
+    assert page.find("#rock").get_attribute("aria-pressed") == "true"
