@@ -10,7 +10,7 @@ from contract.wire.labels import LabelChange
 from tests.cameras import CAMERAS
 from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
 from tests.client.test_camera_in_browser import SHORTER_CAMERAS, SHORTER_FRAMES
-from tests.client.test_compare_in_browser import choose, recorded_scene, shade_at, view
+from tests.client.test_compare_in_browser import choose, shade_at, view
 from tests.client.words import say
 
 
@@ -21,7 +21,7 @@ def until_halves(page: Page, left: int, right: int) -> None:
 
 def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page) -> None:
     site.queued_job("10")
-    other, scene = site.finish(site.claim(), scored=False), recorded_scene(site)
+    other, scene = site.finish(site.claim(), scored=False), site.scene("e0")
     for job_id, label in ((other, "fast"), (scene, "quality")):
         site.queue.relabel(job_id, LabelChange(label=label))
     view(page, scene)
@@ -59,7 +59,8 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     page.until_text("#of-recorded", say("compare.over"))
     site.painter.cameras = CAMERAS
 
-    Select(page.find("#layer")).select_by_value("recorded")  # only the scene in view has it
+    site.painter.not_recorded = other
+    Select(page.find("#layer")).select_by_value("recorded")
     page.until_text("#of-recorded", say("compare.no_frames"))
     assert shade_at(page, 0.5) == 0
     Select(page.find("#layer")).select_by_value("rgb")

@@ -57,7 +57,8 @@ def test_the_early_picture_goes_as_soon_as_another_scene_is_opened(site: Site, p
     load = """
         history.replaceState(null, "", arguments[0]);
         const [main] = [...document.scripts].filter(({ src }) => src.endsWith("/main.js"));
-        document.head.append(Object.assign(document.createElement("script"), { type: "module", src: `${main.src}?again` }));
+        const again = Object.assign(document.createElement("script"), { type: "module", src: `${main.src}?again` });
+        document.head.append(again);
     """
     page.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": []})
     page.script(load, f"#/scene/{other}")
