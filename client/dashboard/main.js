@@ -35,6 +35,7 @@ import { csvOf } from "./measure/measurements.js";
 import { Probe } from "./measure/probe.js";
 import { Compare } from "./stage/compare.js";
 import { prepareControlSets } from "./stage/controlsets.js";
+import { endFirst } from "./stage/early.js";
 import { fitPicture } from "./stage/fit.js";
 import { prepareFive } from "./stage/five.js";
 import { stepBackWhileIdle } from "./stage/idle.js";
@@ -106,20 +107,18 @@ const measure = new Measure(viewer, { ...over, button: get("measure"), panel: ge
   },
 });
 const facts = () => ({
-  name: compare.names,
   badge: get("badge").textContent,
   verdict: get("verdict").querySelector(".shape + span")?.textContent ?? "",
   warning: get("picture-warning").textContent,
-  seam: compare.seam,
 });
 const sides = { recorded: get("recorded"), ofRecorded: get("of-recorded"), ofModel: get("of-model") };
 const pictured = { ...sides, stage: get("stage"), measured: get("over").querySelector("svg"), button: get("snapshot") };
-const snapshot = new Snapshot(viewer, pictured, facts, tell);
+const snapshot = new Snapshot(viewer, pictured, compare, facts, tell);
 const drawers = new Drawers(get("tools"));
 const waiting = new Waiting(viewer.screen, { box: get("waiting"), preview: get("preview") });
 const times = new TimesLeft();
 viewer.addEventListener("shown", () => viewer.scene === waiting.job && waiting.end());
-viewer.addEventListener("shown", () => get("first")?.remove(), { once: true });
+endFirst(viewer);
 const verdict = new Verdict(viewer, { verdict: get("verdict"), warning: get("picture-warning") }, () => drawers.open("report-drawer"));
 
 /** @type {string | null} the job that opens by itself as soon as there is something to see of it */

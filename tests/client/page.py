@@ -41,7 +41,7 @@ from contract.wire.rendering import (
     SceneRequest,
     WorkerAddress,
 )
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, SceneError
 from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
@@ -141,6 +141,8 @@ class Painter:
         self.asked: RenderRequest | None = None
         self.lacks_frames = False
         """Whether nothing recorded can be compared with."""
+        self.not_recorded: str | None = None
+        """The scene without recorded frames."""
         self.cameras = CAMERAS
 
     def answer(self, request: SceneRequest) -> Reply:
@@ -151,6 +153,8 @@ class Painter:
         if isinstance(request, ExportRequest):
             return Reply(b"ply\n", "application/octet-stream", request.options.t or 0.0)
         if isinstance(request, RecordedRequest):
+            if request.scene_id == self.not_recorded:
+                raise SceneError("This scene keeps no recorded frames.")
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
             return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)

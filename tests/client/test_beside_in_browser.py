@@ -8,7 +8,7 @@ from selenium.webdriver.support.ui import Select
 
 from contract.wire.labels import LabelChange
 from tests.cameras import CAMERAS
-from tests.client.page import Page, Site, grey_of
+from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
 from tests.client.test_camera_in_browser import SHORTER_CAMERAS, SHORTER_FRAMES
 from tests.client.test_compare_in_browser import choose, shade_at, view
 from tests.client.words import say
@@ -20,7 +20,8 @@ def until_halves(page: Page, left: int, right: int) -> None:
 
 
 def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page) -> None:
-    other, scene = site.scene("10"), site.scene("e0")
+    site.queued_job("10")
+    other, scene = site.finish(site.claim(), scored=False), site.scene("e0")
     for job_id, label in ((other, "fast"), (scene, "quality")):
         site.queue.relabel(job_id, LabelChange(label=label))
     view(page, scene)
@@ -36,7 +37,11 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     for css, name in (("#of-recorded", "fast"), ("#of-model", "quality")):
         page.until_text(css, name)
         page.until_text(css, "0.00 s")
+    page.until_text("#of-recorded", say("light.pending"))
+    site.store.add_scores(WORKER, other, 1, REPORT_OF_THE_PAGE)
+    for css in ("#of-recorded", "#of-model"):
         page.until_text(css, say("light.care"))
+    page.until_text("#of-recorded", page.text("#picture-warning"))  # of the same report
 
     page.find("#stage").send_keys(Keys.ARROW_LEFT)  # both turn, and the comparison goes on
     page.until(lambda: "turned" in page.view)
@@ -47,13 +52,21 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     assert site.painter.asked is not None
     assert site.painter.asked.pose is not None
     moments = ("#of-recorded", "#of-model")
-    page.until(lambda: len({page.text(css).partition(" · ")[2] for css in moments}) == 1)  # the same second
+    page.until(lambda: len({page.text(css).split(" · ")[1] for css in moments}) == 1)  # the same second
     assert "0.00 s" not in page.text("#of-recorded")
 
     page.script("const time = document.querySelector('#time'); time.value = 35; time.dispatchEvent(new Event('input'))")
     page.until_text("#of-recorded", say("compare.over"))
     site.painter.cameras = CAMERAS
 
+    site.painter.not_recorded = other
+    Select(page.find("#layer")).select_by_value("recorded")
+    page.until_text("#of-recorded", say("compare.no_frames"))
+    assert shade_at(page, 0.5) == 0
+    Select(page.find("#layer")).select_by_value("rgb")
+    until_halves(page, grey_of(other), grey_of(scene))
+
+    page.script("document.querySelector('#beside').value = ''")  # as before the other scene is listed
     choose(page, "side")
     page.until(lambda: f"compare=side,{other}" in page.driver.current_url)
     address = page.driver.current_url
@@ -70,3 +83,4 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     assert shade_at(page, 0.5) == -1
     assert page.state == "live"
     page.until(lambda: "compare=" not in page.driver.current_url)
+    assert not page.find("#of-recorded").get_attribute("title")

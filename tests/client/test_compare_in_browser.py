@@ -309,6 +309,10 @@ def test_scenes_without_recorded_frames_and_jobs_that_train_say_so(site: Site, p
     assert page.text("#compare-message") == ""
     choose(page, "wipe")
     page.until_text("#compare-message", say("compare.not_yet"))
+    page.driver.get(f"{site.url}/#/scene/{job_id}?compare=wipe")  # for when it is finished
+    page.find("#stage").send_keys(Keys.ARROW_LEFT)
+    page.until(lambda: "pose=" in page.driver.current_url)
+    assert "compare=wipe" in page.driver.current_url
 
 
 def test_another_scene_or_a_purge_ends_it_and_leaves_no_picture(site: Site, page: Page) -> None:

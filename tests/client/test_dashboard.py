@@ -143,3 +143,6 @@ def test_the_page_comes_with_its_words_and_the_names_of_all_its_modules(
         assert any(each.endswith("/player/draw.js") for each in named)  # which only others import
         assert {service.http.get("/" + each).status_code for each in named} == {200}
         assert len(set(named)) == len(named)
+        live = service.http.get("/live.html").text
+        assert "/stage/orbit.js" in live
+        assert "/stage/compare.js" not in live

@@ -44,3 +44,47 @@ def test_a_shared_link_shows_its_picture_before_the_modules_and_plays_and_rocks(
     page.until(lambda: say("view.endoscope") in page.view)
     page.find("#play").click()
     page.until(lambda: "play=1" not in page.driver.current_url and "rock=1" not in page.driver.current_url)
+
+
+def test_the_early_picture_goes_as_soon_as_another_scene_is_opened(site: Site, page: Page) -> None:
+    scene, other = site.scene("a0"), site.scene("40")
+    page.driver.get("about:blank")
+    page.driver.execute_cdp_cmd("Network.enable", {})
+    page.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": [HOLD_MODULES]})
+    page.driver.get(f"{site.url}/#/scene/{scene}")
+    page.until(lambda: abs(page.script(FIRST) - grey_of(scene)) <= 2)
+    site.painter.pause_s = 0.8
+    load = """
+        history.replaceState(null, "", arguments[0]);
+        const [main] = [...document.scripts].filter(({ src }) => src.endsWith("/main.js"));
+        const again = Object.assign(document.createElement("script"), { type: "module", src: `${main.src}?again` });
+        document.head.append(again);
+    """
+    page.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": []})
+    page.script(load, f"#/scene/{other}")
+    page.until(lambda: page.script("return document.querySelector('#scene-id').dataset.scene") == other)
+    assert page.script("return document.querySelector('#first') === null")
+    assert page.shade == -1
+    site.painter.pause_s = 0
+    page.until(lambda: page.shade == grey_of(other))
+
+
+def test_a_link_that_rocks_does_not_end_the_rocking_that_was_begun_by_hand(site: Site, page: Page) -> None:
+    scene = site.scene("a0")
+    hold = """
+        const ask = window.fetch;
+        window.fetch = async (path, how) => {
+          if (String(path).endsWith("/cameras")) await new Promise((go) => (window.letGo = go));
+          return ask(path, how);
+        };
+    """
+    held = page.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": hold})
+    page.driver.get("about:blank")
+    page.driver.get(f"{site.url}/#/scene/{scene}?rock=1")
+    page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", held)
+    page.until(lambda: page.shade == grey_of(scene))
+    page.find("#rock").click()
+    page.until(lambda: page.script("return window.letGo !== undefined"))
+    page.script("letGo()")
+    page.until_text("#time-value", "of 40")  # its cameras are known
+    assert page.find("#rock").get_attribute("aria-pressed") == "true"

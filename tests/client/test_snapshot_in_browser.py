@@ -8,8 +8,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
 
 from contract.wire.labels import LabelChange
 from tests.client.page import Page, Site, grey_of
@@ -68,13 +70,19 @@ def test_a_picture_of_the_view_says_what_it_shows(site: Site, page: Page, tmp_pa
     assert (caption > 200).mean() > 0.02  # written
 
 
-def saved(page: Page, folder: Path) -> NDArray[np.uint8]:
-    """[H, W, 3] BGR of the picture that the key saves."""
+def saved_file(page: Page, folder: Path) -> bytes:
+    """The PNG that the key saves."""
     page.find("#stage").send_keys("p")
     page.until(lambda: [file for file in folder.glob("*.png") if file.stat().st_size])
     (file,) = folder.glob("*.png")
-    content = np.frombuffer(file.read_bytes(), np.uint8)
+    content = file.read_bytes()
     file.unlink()
+    return content
+
+
+def saved(page: Page, folder: Path) -> NDArray[np.uint8]:
+    """[H, W, 3] BGR of the picture that the key saves."""
+    content = np.frombuffer(saved_file(page, folder), np.uint8)
     return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), np.uint8)
 
 
@@ -82,7 +90,7 @@ def test_a_picture_of_a_comparison_names_both_sides_and_has_the_measurements_tha
     site: Site, page: Page, tmp_path: Path
 ) -> None:
     page.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
-    scene = viewed(site, page)
+    other, scene = site.scene("10"), viewed(site, page)
     follow_measured(site, page, scene)
 
     def lines(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -107,6 +115,15 @@ def test_a_picture_of_a_comparison_names_both_sides_and_has_the_measurements_tha
         of_recorded, of_model = picture[6:60, :middle], picture[6:60, middle:]
         assert min((of_recorded > 200).mean(), (of_model < 60).mean()) > 0.005
         assert shade_of(0) < 60 < grey_of(MODEL_MARK) < 220
+    Select(page.find("#beside")).select_by_value(other)
+    page.until_text("#of-recorded", "0.00 s")
+    site.painter.pause_s = 0.3
+    page.find("#step-on").click()
+    view = json.loads(texts_of(saved_file(page, tmp_path))["View"])  # both halves are of the next frame
+    assert view["compared"]["scene"] == other
+    assert view["compared"]["t"] == pytest.approx(view["t"], abs=1e-5)
+    assert view["t"] > 0
+    site.painter.pause_s = 0
     choose(page, "off")
     page.click("#measuring .end")
     assert not lines(saved(page, tmp_path)).any()

@@ -4,18 +4,16 @@
 
 import { addressOf } from "../live/links.js";
 import { measurementOf } from "../measure/measurements.js";
-import { isComparison } from "../stage/compare.js";
 import { words } from "./messages.js";
+import { comparisonOf } from "./spelling.js";
 
 /**
- * pose: as GET /render spells it, or RIGHT_EYE. range: of depth's false colours in mm; null: the clip's. compare: as text of
+ * pose: as GET /render spells it, or RIGHT_EYE of spelling.js. range: of depth's false colours in mm; null: the clip's. compare: as text of
  * stage/compare.js; null: with nothing. measures: as textOf() of measure/measurements.js writes them. plays, rocks: as it opens.
  * @typedef {{scene: string, t: number, pose: string | null, layer: string, range: [number, number] | null,
  *   compare: string | null, measures: string[], plays?: boolean, rocks?: boolean}} Place
  */
 
-/** Not a pose of the service's: the endoscope's right eye, wherever it is at t. */
-export const RIGHT_EYE = "right";
 const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
 const LIVE = /^#\/live\/([0-9a-f]{32}(?:\?at=[^&]+)?)$/;
 const ID = /^[0-9a-f]{32}$/;
@@ -46,7 +44,7 @@ export function placeOf(hash, layers) {
   const pose = read("pose", (text) => POSE.test(text), null);
   const layer = read("layer", (text) => layers.includes(text), layers[0]);
   const range = read("range", isRange, null)?.split(",").map(Number) ?? null;
-  const compare = read("compare", isComparison, null);
+  const compare = read("compare", comparisonOf, null);
   const asked = query.getAll("m");
   const measures = asked.filter((text) => measurementOf(text) !== null);
   if (measures.length < asked.length) wrong.push(words("address.measures"));

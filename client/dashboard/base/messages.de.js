@@ -518,6 +518,9 @@ export const DE = {
     "loading_scene": "wird geladen",
     "silent": "der Dienst antwortet nicht",
     "over": "ihr Clip ist zu Ende",
+    "late": "nicht aktuell",
+    "no_frames": "keine Bilder der Aufnahme",
+    "no_verdict": "Urteil unbekannt",
     "other_failed": "Der Vergleich ist beendet: {name} kann nicht mehr gezeigt werden. {why}"
   },
   "measure": {

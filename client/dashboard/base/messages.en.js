@@ -518,6 +518,9 @@ export const EN = {
     "loading_scene": "is loading",
     "silent": "the service does not answer",
     "over": "its clip is over",
+    "late": "not up to date",
+    "no_frames": "no recorded frames",
+    "no_verdict": "verdict unknown",
     "other_failed": "The comparison has ended: {name} cannot be shown any more. {why}"
   },
   "measure": {

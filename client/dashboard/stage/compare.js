@@ -4,12 +4,13 @@
 
 import { element, setText } from "../base/element.js";
 import { figure, languageEvents, words } from "../base/messages.js";
+import { comparisonOf } from "../base/spelling.js";
 import { nameOf } from "../library/card.js";
 import { reasonsIn } from "../library/report.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { Hatch } from "./hatch.js";
 import { OtherScene } from "./otherscene.js";
-import { Pictures, warningOf } from "./pictures.js";
+import { Pictures, warningsOf } from "./pictures.js";
 import { RecordedFrames } from "./recordedframes.js";
 
 /** @typedef {import("../base/wire.js").Report} Report */
@@ -20,11 +21,6 @@ const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDow
 const ENDS = { Home: 0, End: 100 };
 const MIDDLE = 50;
 const TOLD_MS = 10_000;
-const COMPARISON = /^(wipe|side)(?:,([0-9a-f]{32}))?$/;
-
-/** @param {string} text of an address */
-export const isComparison = (text) => COMPARISON.test(text);
-
 
 export class Compare {
   /**
@@ -56,7 +52,7 @@ export class Compare {
       this.#moveSeam(this.seam);
     });
     parts.mode.addEventListener("change", () => this.choose(parts.mode.value));
-    parts.beside.addEventListener("change", () => this.choose(this.mode === "off" ? "wipe" : this.mode));
+    parts.beside.addEventListener("change", () => this.choose(this.mode === "off" ? "wipe" : this.mode, parts.beside.value));
     parts.tools.addEventListener("change", () => this.#draw());
     this.#listenToSeam();
   }
@@ -66,6 +62,7 @@ export class Compare {
     this.scene = scene;
     /** @type {Report | null} */
     this.report = null;
+    /** @type {Mode | null} of the recording, while it is not known what the scene keeps of it */
     this.wanted = null;
     this.#end("");
     this.parts.mode.disabled = this.parts.beside.disabled = scene === null;
@@ -100,26 +97,45 @@ export class Compare {
     if (scene !== this.scene) return;
     this.report = report;
     this.#label();
-    const { wanted } = this;
-    this.wanted = null;
-    if (wanted) this.choose(wanted, "");
+    if (this.wanted) this.choose(this.wanted, "");
   }
 
-  /** @returns {string | null} what is compared, as an address spells it */
+  /** @returns {string | null} what is compared, or shall be, as an address spells it */
   get text() {
-    if (this.mode === "off") return null;
+    if (this.mode === "off") return this.wanted;
     return this.other ? `${this.mode},${this.other.scene}` : this.mode;
   }
 
   /** Whether it goes on when the view turns. */
   get mayTurn() {
-    return this.mode === "off" || this.other !== null;
+    return this.text === null || this.other !== null;
   }
 
   /** @returns {string} the names of what is compared, or that of the scene in view */
   get names() {
     const { name } = this;
     return this.other ? words("compare.names", { name, other: this.#otherName }) : name;
+  }
+
+  /** Whether the other picture, if there is one, is of the view. */
+  get isCurrent() {
+    if (this.mode === "off") return true;
+    return this.other ? this.other.isCurrent : this.drawn !== null && this.drawn === this.#frame;
+  }
+
+  /** @returns {Record<string, unknown> | null} what the other picture shows; frame: of the recording, from 0 */
+  get compared() {
+    if (this.mode === "off") return null;
+    if (!this.other) return { scene: this.scene, frame: this.drawn };
+    const { scene, shown } = this.other;
+    if (!shown) return { scene, t: null };
+    const { pose = null, eye = "left", layer } = shown.view;
+    return { scene, t: shown.picture.t, pose, eye, layer, codes: shown.picture.codes };
+  }
+
+  /** The recorded frame that belongs to the view; null: not known. */
+  get #frame() {
+    return this.t === null ? null : this.frames.frameAt(this.t);
   }
 
   /** @returns {string} of the scene in view */
@@ -135,7 +151,7 @@ export class Compare {
   /** Compare as an address says. @param {string | null} text */
   restore(text) {
     if (text === this.text) return;
-    const [, mode, other = ""] = COMPARISON.exec(text ?? "") ?? [];
+    const { mode, scene: other } = comparisonOf(text) ?? {};
     if (!mode || other === this.scene) this.#end("");
     else if (other || this.report) this.choose(mode, other);
     else this.wanted = mode; // what the scene keeps is not known yet
@@ -148,8 +164,7 @@ export class Compare {
   }
 
   /** @param {Mode} mode @param {string} other scene; empty: the recording */
-  choose(mode, other = this.parts.beside.value) {
-    this.wanted = null;
+  choose(mode, other = this.other?.scene ?? this.parts.beside.value) {
     if (mode === "off") return this.#end("");
     if (other !== (this.other?.scene ?? "")) this.#end("");
     if (other) return this.#chooseScene(mode, other);
@@ -165,6 +180,7 @@ export class Compare {
 
   #begin(mode) {
     this.mode = this.parts.mode.value = mode;
+    this.wanted = null;
     this.#say("");
     this.parts.stage.dataset.compare = mode;
     this.parts.box.hidden = false;
@@ -189,13 +205,14 @@ export class Compare {
 
   /** @param {string} why empty where the user knows */
   #end(why) {
-    const isNew = this.mode !== "off";
+    const isNew = this.text !== null;
     const { other } = this;
+    this.wanted = null;
     this.mode = this.parts.mode.value = "off";
     this.frames?.close();
     this.frames = this.drawn = this.other = null;
     other?.close();
-    this.labelled = "";
+    this.labelled = this.parts.ofRecorded.title = "";
     this.t = null;
     delete this.parts.stage.dataset.compare;
     this.parts.box.hidden = this.parts.tools.closest("label").hidden = true;
@@ -259,12 +276,13 @@ export class Compare {
 
   #drawScene() {
     const { canvas } = this.parts;
-    const image = this.other.shown?.image;
+    const image = this.other.shown?.image ?? null;
     if (image && image !== this.drawn) {
       Object.assign(canvas, { width: image.width, height: image.height });
       canvas.getContext("2d").drawImage(image, 0, 0);
-      this.drawn = image;
     }
+    if (this.other.lacksFrames) blacken(canvas, this.viewer.parts.canvas);
+    this.drawn = image;
     this.#label();
   }
 
@@ -272,11 +290,10 @@ export class Compare {
     const { ofRecorded, ofModel, canvas } = this.parts;
     if (this.mode === "off") return;
     if (this.other) return this.#labelScenes();
-    const wanted = this.t === null ? null : this.frames.frameAt(this.t);
-    const isLate = this.drawn === null || this.drawn !== wanted;
+    const isLate = !this.isCurrent;
     canvas.hidden = this.drawn === null;
     const text = this.drawn === null ? words("compare.loading") : words("compare.recorded", { frame: this.drawn + 1 });
-    setText(ofRecorded, text);
+    setText(ofRecorded, isLate && this.drawn !== null ? `${text} · ${words("compare.late")}` : text);
     ofRecorded.toggleAttribute("data-late", isLate);
     ofModel.textContent = words("compare.model");
     canvas.setAttribute("aria-label", text);
@@ -285,21 +302,24 @@ export class Compare {
   /** Each half has its scene's name, moment and verdict. */
   #labelScenes() {
     const { other, parts, viewer } = this;
-    const { shown, report, isOver } = other;
-    parts.canvas.hidden = this.drawn === null;
-    parts.ofRecorded.toggleAttribute("data-late", other.isLate);
-    const time = Number.isFinite(other.shownS) ? words("time.moment", { seconds: figure(other.shownS, 2) }) : words("compare.loading_scene");
+    const { shown, report, isOver, isSilent, isLate } = other;
+    parts.canvas.hidden = this.drawn === null && !other.lacksFrames;
+    parts.ofRecorded.toggleAttribute("data-late", isLate);
+    const nothing = words(other.lacksFrames ? "compare.no_frames" : "compare.loading_scene");
+    const time = Number.isFinite(other.shownS) ? words("time.moment", { seconds: figure(other.shownS, 2) }) : nothing;
     const guess = (isGuess) => (isGuess ? [words("screen.extrapolated")] : []);
-    const silent = other.isSilent ? [words("compare.silent")] : isOver ? [words("compare.over")] : [];
-    const left = [this.#otherName, time, ...silent, ...guess(shown?.picture.isExtrapolated)];
+    const late = isSilent ? [words("compare.silent")] : isLate && shown ? [words("compare.late")] : [];
+    const over = isOver ? [words("compare.over")] : [];
+    const reasons = report ? reasonsIn(report, trustOf(report)) : [];
+    const warnings = shown ? warningsOf(shown.picture.codes, shown.view, reasons) : [];
+    const left = [this.#otherName, time, ...late, ...over, ...guess(shown?.picture.isExtrapolated), ...warnings.slice(0, 1)];
     const right = [this.name, viewer.timeline.momentOf(viewer.shown?.t ?? 0), ...guess(viewer.screen.shown?.isExtrapolated)];
-    const labelled = JSON.stringify([left, right, report?.scored, this.report?.scored]);
+    const labelled = JSON.stringify([left, right, warnings, report?.scored, this.report?.scored]);
     if (labelled === this.labelled) return;
     this.labelled = labelled;
     fillLabel(parts.ofRecorded, left, report);
     fillLabel(parts.ofModel, right, this.report);
-    const reasons = report ? reasonsIn(report, trustOf(report)) : [];
-    parts.ofRecorded.title = shown ? warningOf(shown.picture.codes, shown.view, reasons) : "";
+    parts.ofRecorded.title = warnings.join(" ");
     parts.canvas.setAttribute("aria-label", left.join(", "));
   }
 
@@ -338,8 +358,15 @@ export class Compare {
   }
 }
 
+/** The model's picture would show through. @param {HTMLCanvasElement} canvas @param {HTMLCanvasElement} picture of the model */
+function blacken(canvas, { width, height }) {
+  Object.assign(canvas, { width, height });
+  canvas.getContext("2d").fillRect(0, 0, width, height);
+}
+
 /** @param {HTMLElement} label @param {string[]} texts the name first @param {Report | null} report */
 function fillLabel(label, [name, ...texts], report) {
   const mark = report ? [" ", lightMark(trustOf(report).light)] : [];
-  label.replaceChildren(element("b", { text: name }), ...mark, ` · ${texts.filter(Boolean).join(" · ")}`);
+  const said = [report ? "" : words("compare.no_verdict"), ...texts].filter(Boolean);
+  label.replaceChildren(element("b", { text: name }), ...mark, ` · ${said.join(" · ")}`);
 }

@@ -19,20 +19,24 @@
   socket.binaryType = "arraybuffer";
   const key = sessionStorage.getItem("intrasplat-key");
   const isComplete = () => document.readyState !== "loading";
+  const isOver = () => isComplete() && document.getElementById("first") === null; // early.js
   const show = async ({ data }) => {
     socket.close();
     if (typeof data === "string") return; // what is wrong is for the modules to say
     const image = await createImageBitmap(new Blob([new Uint8Array(data, 4 + new DataView(data).getUint32(0))]));
     if (!isComplete()) await new Promise((go) => document.addEventListener("readystatechange", go, { once: true }));
     const canvas = document.getElementById("first");
-    if (!canvas) return; // they were faster
+    if (!canvas || (canvas.dataset.scene ?? scene) !== scene) return; // they were faster, or have another scene in view
+    canvas.dataset.scene = scene;
     Object.assign(canvas, { width: image.width, height: image.height, hidden: false });
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close();
     setTimeout(() => canvas.remove(), COUNTS_MS);
   };
   socket.addEventListener("message", show);
+  addEventListener("first-over", () => socket.readyState === WebSocket.OPEN && socket.close());
   socket.addEventListener("open", () => {
+    if (isOver()) return socket.close();
     if (key) socket.send(JSON.stringify({ authorize: key }));
     socket.send(JSON.stringify(view));
   });

@@ -7,5 +7,5 @@
 export function setMoving(viewer, { plays, rocks }) {
   if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
   if (plays) viewer.timeline.play(true);
-  if (rocks && !viewer.rock.isOn) viewer.swing();
+  if (rocks) viewer.swing();
 }

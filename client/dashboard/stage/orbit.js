@@ -1,7 +1,7 @@
 // Where the viewer stands: at one of the endoscope's eyes, or turned about a point. Beyond what the clip taught, turning
 // takes more and more movement, and ends at MAX_AWAY_DEG.
 
-import { RIGHT_EYE } from "../base/address.js";
+import { RIGHT_EYE } from "../base/spelling.js";
 import { words } from "../base/messages.js";
 
 /** @typedef {import("../player/camera.js").Cameras} Cameras */

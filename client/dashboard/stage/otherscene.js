@@ -3,6 +3,7 @@
 
 import { getCameras, getJob, getReport, stillThere } from "../base/api.js";
 import { pause } from "../base/pause.js";
+import { isPending } from "../library/trustlight.js";
 import { Cameras } from "../player/camera.js";
 import { judged } from "./pictures.js";
 
@@ -10,6 +11,9 @@ const CONFIRM_MS = 3000;
 const AFTER_TROUBLE_MS = 1000;
 /** Nothing more comes of it. */
 const FINAL = [401, 403, 404, 409, 422];
+/** Layers that scenes without recorded frames do not have, and how the service says so; it says the same of no scene. */
+const OF_FRAMES = ["recorded", "error"];
+const LACKING = [404, 422];
 /** So long playing waits for its picture, so that both halves show the same moment. */
 const WAIT_MS = 700;
 
@@ -21,20 +25,23 @@ export class OtherScene {
   /**
    * @param {string} scene
    * @param {Pictures} pictures where they come from, for nobody else
-   * @param {{onChange: () => void, onFail: (error: Error) => void}} told onChange: there is more to show or to say; onFail:
-   *   nothing of it comes any more
+   * @param {{onChange: () => void, onFail: (error: Error) => void}} handlers onChange: there is more to show or to say;
+   *   onFail: nothing of it comes any more
    */
-  constructor(scene, pictures, told) {
-    Object.assign(this, { scene, pictures, told, isClosed: false, isAsking: false, isSilent: false, askedAt: 0, confirmedAt: 0 });
+  constructor(scene, pictures, handlers) {
+    Object.assign(this, { scene, pictures, handlers, isClosed: false, isAsking: false, isSilent: false, askedAt: 0, confirmedAt: 0 });
+    /** Whether it has no recorded frames for the layer in view. */
+    this.lacksFrames = false;
     /** @type {import("../base/wire.js").JobView | null} */
     this.job = null;
-    /** @type {import("../base/wire.js").Report | null} null: not known, or not scored yet */
+    /** @type {import("../base/wire.js").Report | null} null: not known */
     this.report = null;
     /** @type {{picture: Picture, view: import("./stream.js").View, image: ImageBitmap} | null} the newest */
     this.shown = null;
     /** @type {{shown: Shown, seconds: number} | null} what is asked for next */
     this.wish = null;
     this.#learn();
+    this.#judge();
     this.timer = setInterval(() => this.#confirm(), CONFIRM_MS);
   }
 
@@ -44,8 +51,24 @@ export class OtherScene {
     clearInterval(this.timer);
     this.pictures.giveUp();
     this.pictures.stream.close();
+    this.#take(null);
+  }
+
+  #take(shown) {
     this.shown?.image.close();
-    this.shown = null;
+    this.shown = shown;
+    this.lacksFrames = false;
+  }
+
+  /** The service has just answered. */
+  #hear() {
+    this.isSilent = false;
+    this.confirmedAt = performance.now();
+    this.#change();
+  }
+
+  #change() {
+    if (!this.isClosed) this.handlers.onChange();
   }
 
   /** Whether its picture of the view is on its way, and soon there. */
@@ -55,7 +78,12 @@ export class OtherScene {
 
   /** Whether what is shown is not, or not known to be, of the view. */
   get isLate() {
-    return this.isSilent || this.shown === null || (this.isAsking && !this.isExpected);
+    return this.isSilent || (this.shown === null && !this.lacksFrames) || (this.isAsking && !this.isExpected);
+  }
+
+  /** Whether what is shown is of the view, or it is known that there is nothing. */
+  get isCurrent() {
+    return !this.isLate && !this.isAsking && this.wish === null;
   }
 
   /** Whether the clip is over at the moment in view: its last frame stays. */
@@ -82,18 +110,24 @@ export class OtherScene {
   async #learn() {
     while (!this.isClosed && !this.cameras) {
       try {
-        const [job, cameras, report] = await Promise.all([
-          getJob(this.scene),
-          getCameras(this.scene),
-          getReport(this.scene).catch(() => null), // the pictures stand without it
-        ]);
+        const [job, cameras] = await Promise.all([getJob(this.scene), getCameras(this.scene)]);
         if (this.isClosed) return;
-        Object.assign(this, { job, report, cameras: new Cameras(cameras) });
-        this.told.onChange();
+        Object.assign(this, { job, cameras: new Cameras(cameras) });
+        this.#change();
         this.#work();
       } catch (error) {
         await this.#trouble(error);
       }
+    }
+  }
+
+  /** Ask for the verdict until it is final; the pictures stand without it. */
+  async #judge() {
+    while (!this.isClosed) {
+      this.report = await getReport(this.scene).catch(() => this.report);
+      this.#change();
+      if (this.report && !isPending(this.report)) return;
+      await pause(CONFIRM_MS);
     }
   }
 
@@ -103,15 +137,17 @@ export class OtherScene {
     while (this.wish && !this.isClosed) {
       const { wish } = this;
       this.askedAt = performance.now();
+      const late = setTimeout(() => this.#change(), 1.1 * WAIT_MS);
       try {
-        await this.#show(wish);
+        await this.#show(wish).catch((error) => this.#lack(error, wish));
         if (this.wish === wish) this.wish = null;
       } catch (error) {
         await this.#trouble(error);
       }
+      clearTimeout(late);
     }
     this.isAsking = false;
-    if (!this.isClosed) this.told.onChange();
+    this.#change();
   }
 
   async #show({ shown, seconds }) {
@@ -120,11 +156,18 @@ export class OtherScene {
     const picture = judged(await this.pictures.ask(view, how), view);
     const image = await createImageBitmap(picture.blob);
     if (this.isClosed) return image.close();
-    this.shown?.image.close();
-    this.shown = { picture, view, image };
-    this.isSilent = false;
-    this.confirmedAt = performance.now();
-    this.told.onChange();
+    this.#take({ picture, view, image });
+    this.#hear();
+  }
+
+  /** Throws the error, unless only recorded frames are lacking. */
+  async #lack(error, { shown: { layer } }) {
+    if (!OF_FRAMES.includes(layer) || !LACKING.includes(error.status)) throw error;
+    await stillThere(this.scene);
+    if (this.isClosed) return;
+    this.#take(null);
+    this.lacksFrames = true;
+    this.#hear();
   }
 
   /** @param {Shown} shown @param {number} seconds @returns {import("./stream.js").View} the same view of this scene */
@@ -139,28 +182,26 @@ export class OtherScene {
     return view;
   }
 
-  /** A scene that is deleted leaves the screen; one that rests is asked after. */
+  /** While no picture is asked for: ask whether the scene is still there. */
   async #confirm() {
     if (this.isAsking || performance.now() - this.confirmedAt < CONFIRM_MS) return;
     try {
       await stillThere(this.scene);
-      this.isSilent = false;
-      this.confirmedAt = performance.now();
+      this.#hear();
     } catch (error) {
       await this.#trouble(error);
     }
-    if (!this.isClosed) this.told.onChange();
   }
 
   async #trouble(error) {
     if (this.isClosed) return;
     if (FINAL.includes(error.status)) {
       this.close();
-      this.told.onFail(error);
+      this.handlers.onFail(error);
       return;
     }
     this.isSilent = true;
-    this.told.onChange();
+    this.#change();
     await pause(AFTER_TROUBLE_MS);
   }
 }

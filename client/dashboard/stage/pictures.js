@@ -66,12 +66,12 @@ function wordsOf(code, view) {
  * What to know of a picture: of this view first, then of its scene.
  * @param {string[]} codes of the picture @param {View} view
  * @param {{code: string, text: string}[]} reasons for care with the scene, in words
- * @returns {string}
+ * @returns {string[]} sentences, each once
  */
-export function warningOf(codes, view, reasons) {
+export function warningsOf(codes, view, reasons) {
   const own = codes.filter((code) => !reasons.some((reason) => reason.code === code));
   const sentences = [...withViewFirst(own).map((code) => wordsOf(code, view)), ...reasons.map(({ text }) => text)];
-  return [...new Set(sentences)].filter(Boolean).join(" ");
+  return [...new Set(sentences)].filter(Boolean);
 }
 
 /** Note of a picture of a view what its codes mean. @param {Picture} picture @param {View} view @returns {Picture} */

@@ -116,6 +116,7 @@ export class Screen {
     const [state, badge, message] = this.#state();
     this.stage.dataset.state = this.status.dataset.state = state;
     this.stage.toggleAttribute("data-empty", this.scene === null);
+    this.stage.toggleAttribute("data-failed", this.trouble !== "");
     this.status.toggleAttribute("data-recorded", this.shown?.isRecorded === true);
     this.canvas.hidden = this.shown === null || this.isCovered === true;
     setText(this.badge, badge);

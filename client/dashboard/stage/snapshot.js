@@ -19,11 +19,12 @@ export class Snapshot {
    * @param {import("./viewer.js").Viewer} viewer
    * @param {{stage: HTMLElement, recorded: HTMLCanvasElement, ofRecorded: HTMLElement, ofModel: HTMLElement, measured: SVGSVGElement,
    *   button: HTMLButtonElement}} parts measured: as measure/overlay.js draws it
-   * @param {() => {name: string, badge: string, verdict: string, warning: string, seam: number}} facts of what is in view
+   * @param {import("./compare.js").Compare} compare
+   * @param {() => {badge: string, verdict: string, warning: string}} facts of what is in view
    * @param {(text: string) => void} tell what went wrong
    */
-  constructor(viewer, parts, facts, tell) {
-    Object.assign(this, { viewer, parts, facts, tell });
+  constructor(viewer, parts, compare, facts, tell) {
+    Object.assign(this, { viewer, parts, compare, facts, tell });
     parts.button.addEventListener("click", () => this.take());
   }
 
@@ -34,13 +35,13 @@ export class Snapshot {
     parts.button.disabled = true;
     try {
       viewer.timeline.play(false);
+      const { version } = await getInfo();
       await this.#rested();
-      const { name, ...about } = this.facts();
-      const texts = await this.#texts(name, about);
-      const canvas = captioned(this.#picture(about.seam), texts.Description.split("\n"));
+      const texts = this.#texts(version); // of the same moment as the picture
+      const canvas = captioned(this.#picture(), texts.Description.split("\n"));
+      const name = fileName(`${texts.Title}-${viewer.timeline.momentOf(viewer.shown.t)}`);
       const png = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
-      const seconds = viewer.timeline.momentOf(viewer.shown.t);
-      save(`${fileName(`${name}-${seconds}`)}.png`, withTexts(png, texts));
+      save(`${name}.png`, withTexts(png, texts));
     } catch (error) {
       this.tell(error.message);
     } finally {
@@ -48,20 +49,22 @@ export class Snapshot {
     }
   }
 
-  /** Wait for the exact picture of the view. */
+  /** Wait for the exact picture of the view, and for what it is compared with. */
   async #rested() {
-    const { viewer } = this;
+    const { viewer, compare } = this;
     const until = performance.now() + PATIENCE_MS;
-    while (viewer.isBusy || viewer.isWanted || viewer.shown?.isMoving) {
+    while (viewer.isBusy || viewer.isWanted || viewer.shown?.isMoving || !compare.isCurrent) {
       if (performance.now() > until) throw new Error(words("snapshot.too_slow"));
       await pause(LOOK_MS);
     }
     if (!viewer.shown) throw new Error(words("screen.nothing"));
   }
 
-  async #texts(name, { badge, verdict, warning }) {
+  /** @param {string} version of the service @returns {Record<string, string>} of the PNG */
+  #texts(version) {
     const { shown, timeline, parts } = this.viewer;
-    const { version } = await getInfo();
+    const { badge, verdict, warning } = this.facts();
+    const name = this.compare.names;
     const layer = parts.layer.selectedOptions[0].text;
     const light = shown.light === "recorded" ? [words("picture.recorded_light")] : [];
     const guesses = shown.unseen === "guess" ? [words("picture.guesses")] : [];
@@ -74,12 +77,12 @@ export class Snapshot {
       Software: `intrasplat ${version}`,
       "Creation Time": new Date().toISOString(),
       Description: [view, trust, made].filter(Boolean).join("\n"),
-      View: JSON.stringify({ ...shown, codes: this.viewer.screen.shown?.codes ?? [] }),
+      View: JSON.stringify({ ...shown, codes: this.viewer.screen.shown?.codes ?? [], compared: this.compare.compared }),
     };
   }
 
   /** What the stage shows: the model's picture, the recorded frame over or beside it, with their names, and measurements. */
-  #picture(seam) {
+  #picture() {
     const { canvas } = this.viewer.parts;
     const { stage, recorded, ofRecorded, ofModel, measured } = this.parts;
     const factor = Math.max(1, Math.ceil(MIN_WIDTH_PX / canvas.width));
@@ -89,7 +92,7 @@ export class Snapshot {
     const context = made.getContext("2d");
     context.drawImage(canvas, isBeside ? width : 0, 0, width, height);
     const isCompared = stage.dataset.compare !== undefined && !recorded.hidden;
-    const shownTo = isBeside ? width : (seam / 100) * width;
+    const shownTo = isBeside ? width : (this.compare.seam / 100) * width;
     if (isCompared) {
       context.save();
       context.beginPath();

@@ -5,7 +5,7 @@ import { setText } from "../base/element.js";
 import { languageEvents, words } from "../base/messages.js";
 import { reasonsIn } from "../library/report.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
-import { warningOf } from "./pictures.js";
+import { warningsOf } from "./pictures.js";
 
 const TRAINING_GOES_ON = "training_goes_on";
 
@@ -40,7 +40,7 @@ export class Verdict {
     const { shown, screen } = this.viewer;
     const isOfModel = shown !== null && !screen.shown?.isRecorded;
     const codes = (screen.shown?.codes ?? []).filter((code) => code !== TRAINING_GOES_ON || screen.work === "");
-    setText(this.warning, isOfModel ? warningOf(codes, shown, this.reasons) : "");
+    setText(this.warning, isOfModel ? warningsOf(codes, shown, this.reasons).join(" ") : "");
     this.warning.toggleAttribute("data-of-scene", screen.shown?.codes.length === 0);
     this.warning.title = this.warning.textContent;
   }

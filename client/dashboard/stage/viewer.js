@@ -140,11 +140,11 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
-  /** Begin to rock as soon as it is known where the endoscope was. */
+  /** Rock as soon as it is known where the endoscope was. */
   swing(visit = this.visit) {
     if (visit !== this.visit) return;
-    if (this.timeline.cameras) this.rock.toggle();
-    else this.addEventListener("known", () => this.swing(visit), { once: true });
+    if (!this.timeline.cameras) this.addEventListener("known", () => this.swing(visit), { once: true });
+    else if (!this.rock.isOn) this.rock.toggle();
   }
 
   /** Whether a picture takes so long that only other answers can tell whether the service is there. */
