@@ -348,6 +348,17 @@ def test_a_key_that_may_not_send_is_told_so_and_asks_for_nothing_that_is_refused
         page.find("#key-text").send_keys(sending, Keys.ENTER)
         page.show("drawer")
         page.until(lambda: page.find("#upload [type=submit]").is_enabled())
+        scene = site.scene()
+        masked = REPORT_OF_THE_PAGE.model_copy(update={"masks": Masks(source="given", share=0.07)})
+        site.store.add_scores("worker-1", scene, 1, masked)
+        page.press(scene, "View")
+        page.until_text("#report", say("report.send_better_masks"))
+        page.click("#forget-key")
+        page.until(lambda: page.find("#key-text").is_displayed())
+        page.find("#key-text").send_keys(viewing, Keys.ENTER)
+        page.press(scene, "View")
+        page.until_text("#report", say("report.trusted"))
+        page.until(lambda: say("report.send_better_masks") not in page.text("#report"))
         high = "return document.querySelector('#upload [name=priority] [value=high]').disabled"
         page.until(lambda: page.script(high))
         assert page.faults() == []
