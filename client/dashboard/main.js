@@ -51,7 +51,7 @@ import { Waiting } from "./stage/waiting.js";
 
 const get = (id) => document.getElementById(id);
 
-const scopes = new Scopes(() => showJobs());
+const scopes = new Scopes(() => showJobs({ isOther: true })); // the report offers what they allow
 export const viewer = new Viewer({
   stage: get("stage"),
   fitted: get("fitted"),
@@ -159,7 +159,7 @@ async function report(id) {
     compare.know(id, found);
     offerError(found);
     verdict.know(found);
-    showReport(get("report"), id, found, { onMasks: sendAgain, onPaint: (...scene) => painting.open(...scene) });
+    showReport(get("report"), id, found, { maySend: scopes.has("reconstruct"), onMasks: sendAgain, onPaint: (...scene) => painting.open(...scene) });
     drawStrip(get("light-strip"), found.light);
     const csv = await getCurve(id).catch(() => "");
     if (!isStill()) return;
@@ -174,8 +174,9 @@ async function report(id) {
   }
 }
 
-/** A job that was sent just now. */
-function expect(id) {
+/** A job that was sent just now. @param {string} id @param {import("./form/sending.js").Plan} [plan] that it was made of */
+function expect(id, plan) {
+  if (plan) painting.forget(plan);
   awaited = id;
   announcer.await(id);
   if (waiting.isOn) viewer.open(null, "");
@@ -209,14 +210,15 @@ function sendAgain(id, part = "masks", painted) {
   const job = jobs.byId.get(id);
   if (!job) return;
   drawers.open("drawer", false);
-  form.sendAgain(job, part, painted);
+  if (form.isSending) tell(words("upload.one_at_a_time"));
+  else form.sendAgain(job, part, painted);
 }
 
-const painting = new Painting(viewer, tell, (id, masks) => sendAgain(id, "masks", masks));
+const painting = new Painting(viewer, tell, () => form.isSending, (id, masks) => sendAgain(id, "masks", masks));
 
 function offerMasks() {
   const isOffered = viewer.scene !== null && get("layer").value === "recorded";
-  get("better-masks").hidden = !isOffered;
+  get("better-masks").hidden = !isOffered || !scopes.has("reconstruct");
   get("home").hidden = isOffered; // recorded frames are the endoscope's
 }
 
@@ -248,7 +250,9 @@ function openFirst() {
   get("empty").hidden = !isIdle || viewer.scene !== null || jobs.byId.size > 0;
 }
 
-function showJobs() {
+/** @param {{isOther?: boolean}} [report] isOther: it says or offers something else now */
+function showJobs({ isOther = false } = {}) {
+  if (isOther) reported = null;
   scopes.refresh();
   form.allow(scopes);
   sceneImport.allow(scopes);
@@ -338,10 +342,7 @@ const form = new ClipForm(
     refusal: get("upload-refusal"),
   },
   {
-    onJob(id) {
-      painting.forget();
-      expect(id);
-    },
+    onJob: expect,
     onSend: send,
     onShare(share) {
       announcer.send(share);
@@ -363,8 +364,7 @@ showKeyForm({ form: get("key"), message: get("key-message"), forget: get("forget
 languageEvents.addEventListener("changed", () => {
   jobs.poll();
   list.forget();
-  reported = null;
-  showJobs();
+  showJobs({ isOther: true });
 });
 showWords(document);
 keyEvents.addEventListener("changed", () => {

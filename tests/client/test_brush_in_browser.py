@@ -41,6 +41,7 @@ MOVED = Rectification(
     projection=((171.0, 0.0, 90.0, 0.0), (0.0, 171.0, 79.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
 )
 """Moves pixels by some ten of them."""
+ASKED = "return performance.getEntriesByType('resource').map(({ name }) => name)"
 PLACES = """
 const [width, height, pixels, done] = arguments;
 import(new URL("masks/strokes.js", document.scripts[0].src)).then(({ recordedPlace }) => {
@@ -99,11 +100,24 @@ def scene_of(site: Site, page: Page, clip: DepthClip) -> str:
     return scene
 
 
+HOLD = """
+const fetch = window.fetch;
+const released = new Promise((done) => (window.release = done));
+window.fetch = async (asked, ...more) => {
+  if (String(asked.url ?? asked).includes("/uploads")) await released;
+  return fetch(asked, ...more);
+};
+"""
+"""No byte of a clip goes until release() is called."""
+LABEL = "document.querySelector('#upload [name=label]')"
+
+
 class Brush:
     """The screen, as somebody who paints on it uses it."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: Page, scene: str) -> None:
         self._page = page
+        self._scene = scene
 
     def until_frame(self, frame: int) -> None:
         shown = "return document.querySelector('.brush')?.dataset.shown"
@@ -145,8 +159,8 @@ class Brush:
     @property
     def strokes(self) -> list[dict[str, Any]]:
         """Those that the tab remembers."""
-        text = self._page.script("return sessionStorage.getItem('intrasplat-strokes')")
-        strokes: list[dict[str, Any]] = json.loads(text)["strokes"] if text else []
+        text = self._page.script("return sessionStorage.getItem(arguments[0])", f"intrasplat-strokes-{self._scene}")
+        strokes: list[dict[str, Any]] = json.loads(text) if text else []
         return strokes
 
     @property
@@ -184,17 +198,20 @@ def test_strokes_over_found_masks_are_in_the_masks_of_the_next_job(site: Site, p
     found = zipfile.ZipFile(io.BytesIO(content))
     as_found = [found.read(name) for name in found.namelist()]
     page.show("report-drawer")
-    asked = "return performance.getEntriesByType('resource').filter(({ name }) => name.includes('/masks/')).length"
+    asked = f"{ASKED}.filter((name) => name.includes('/masks/')).length"
     page.until_text("#report", say("brush.title"))
     assert page.script(asked) == 0  # the first visit is no heavier
     page.click(f'#report button[aria-label="{say("brush.title")}"]')
-    brush, places = Brush(page), recorded_places()
+    brush, places = Brush(page, scene), recorded_places()
     page.until_text(".brush .message", say("problem.http_404"))
     (site.store.scene_folder(scene, 1) / MASKS).write_bytes(content)
-    page.click(".strip button")
+    asked_for_masks = f"{ASKED}.filter((name) => name.endsWith('/{scene}/masks')).length"
+    loads = page.script(asked_for_masks)
+    page.script("for (const n of [2, 1, 0]) document.querySelectorAll('.strip button')[n].click()")
     brush.until_frame(0)
+    assert page.script(asked_for_masks) == loads + 1  # once for all frames
     assert page.text(".brush .message") == ""
-    assert page.text(".brush .told").endswith(say("brush.nearest"))
+    assert page.text(".brush .state").endswith(say("brush.nearest"))
     assert page.script(asked) > 0
     pixels = site.store.newest_report(scene, 1).recorded.pixels.model_dump()  # type: ignore[union-attr]
     computed = page.driver.execute_async_script(PLACES, WIDTH, HEIGHT, pixels)  # type: ignore[no-untyped-call]
@@ -252,26 +269,51 @@ def test_strokes_over_found_masks_are_in_the_masks_of_the_next_job(site: Site, p
 def test_a_stroke_to_all_frames_is_in_every_given_mask_and_strokes_can_be_discarded(site: Site, page: Page) -> None:
     scene = scene_of(site, page, GIVEN)
     page.click(f'#report button[aria-label="{say("brush.title")}"]')
-    brush = Brush(page)
+    brush = Brush(page, scene)
     brush.until_frame(0)
+    recorded = site.store.scene_folder(scene, 1) / RECORDED
+    away = recorded.rename(recorded.with_suffix(".away"))
+    brush.press(".")
+    page.until(lambda: page.text(".brush .message"))
+    hidden = "return getComputedStyle(document.querySelector('.paper canvas')).visibility"
+    page.until(lambda: page.script(hidden) == "hidden")  # not frame 0 under another's number
+    away.rename(recorded)
+    brush.press(",")
+    brush.until_frame(0)
+    assert page.script(hidden) == "visible"
     brush.click("brush.all")
     brush.drag((150, 10), (170, 10))
     assert brush.changed == list(range(FRAMES))
-    page.script("sessionStorage.setItem('copy', sessionStorage.getItem('intrasplat-strokes'))")
+    name = f"intrasplat-strokes-{scene}"
+    page.script("sessionStorage.setItem('copy', sessionStorage.getItem(arguments[0]))", name)
     brush.press(Keys.ESCAPE)
     page.click(f'.leaving button[aria-label="{say("brush.discard")}"]')
     page.until(lambda: not page.script("return document.querySelector('.brush') !== null"))
     assert brush.strokes == []
-    page.script("sessionStorage.setItem('intrasplat-strokes', sessionStorage.getItem('copy'))")  # as after a reload
+    page.script("sessionStorage.setItem(arguments[0], sessionStorage.getItem('copy'))", name)  # as after a reload
+    page.script(HOLD)
+    page.send(CLIP)  # another clip, which is on its way while masks are painted
+    page.until(lambda: page.script("return !document.querySelector('#upload-progress').hidden"))
+    page.script(f"{LABEL}.value = 'next'; {LABEL}.dispatchEvent(new Event('input', {{ bubbles: true }}))")
     page.click(f'#report button[aria-label="{say("brush.title")}"]')
     brush.until_frame(0)
     strokes = brush.strokes
     assert len(strokes) == 1
     brush.click("brush.send")
+    page.until_text(".brush .message", say("upload.one_at_a_time"))
+    page.script("window.release()")
+    page.until(lambda: len(site.queue.records()) == 2)
+    page.until(lambda: page.script("return document.querySelector('#upload-progress').hidden"))
+    assert brush.strokes == strokes  # they are another clip's
+    assert page.script(f"return {LABEL}.value") == "next"
+    press = "for (const name of arguments) document.querySelector(`.brush button[aria-label='${name}']`).click()"
+    page.script(press, say("brush.send"), say("page.close"))  # which waits for the masks
+    assert not page.script("return document.querySelector('.leaving') !== null")
     page.until(lambda: not page.script("return document.querySelector('.brush') !== null"))
     page.click("#upload [type=submit]")
-    page.until(lambda: [each.clip_of for each in site.queue.records() if each.job_id != scene] == [scene])
-    (record,) = (each for each in site.queue.records() if each.job_id != scene)
+    page.until(lambda: scene in [each.clip_of for each in site.queue.records()])
+    page.until(lambda: brush.strokes == [])
+    (record,) = (each for each in site.queue.records() if each.clip_of == scene)
     with zipfile.ZipFile(site.store.spool_folder(record.job_id) / "masks.zip") as sent:
         assert len(sent.namelist()) == FRAMES
         for name, tissue in zip(sent.namelist(), GIVEN.tissue, strict=True):

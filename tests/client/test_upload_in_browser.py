@@ -16,8 +16,9 @@ from selenium.webdriver.common.keys import Keys
 from contract.access.keys import KeyFile, KeyScope
 from contract.wire.job import JobError
 from intrasplat.errors import ErrorCode
+from intrasplat.report import Masks
 from tests.client.local_service import CLIP
-from tests.client.page import CALIBRATION, Page, Site, site_at
+from tests.client.page import CALIBRATION, REPORT_OF_THE_PAGE, Page, Site, site_at
 from tests.client.test_sheet_in_browser import drop
 from tests.client.test_theatre_in_browser import is_on_screen, screen_of
 from tests.client.test_waiting_in_browser import BAR
@@ -350,5 +351,16 @@ def test_a_key_that_may_not_send_is_told_so_and_asks_for_nothing_that_is_refused
         page.until(lambda: page.find("#upload [type=submit]").is_enabled())
         high = "return document.querySelector('#upload [name=priority] [value=high]').disabled"
         page.until(lambda: page.script(high))
+        scene = site.scene()
+        masked = REPORT_OF_THE_PAGE.model_copy(update={"masks": Masks(source="given", share=0.07)})
+        site.store.add_scores("worker-1", scene, 1, masked)
+        page.press(scene, "View")
+        page.until_text("#report", say("report.send_better_masks"))
+        page.click("#forget-key")
+        page.until(lambda: page.find("#key-text").is_displayed())
+        page.find("#key-text").send_keys(viewing, Keys.ENTER)
+        page.press(scene, "View")
+        page.until_text("#report", say("report.trusted"))
+        assert say("report.send_better_masks") not in page.text("#report")
         assert page.faults() == []
         driver.get("about:blank")

@@ -810,6 +810,7 @@ export const DE = {
     "changed": "Eine Datei wurde geändert oder verschoben, seit sie gewählt wurde. Wählen Sie sie noch einmal.",
     "stop": "Senden abbrechen",
     "look": "Vor dem Senden ist etwas zu berichtigen: siehe das Formular.",
+    "one_at_a_time": "Ein Clip wird gerade gesendet. Warten Sie, bis er angekommen ist, oder brechen Sie es im Formular ab.",
     "not_allowed": "Ihr Schlüssel erlaubt nicht, Clips zu senden.",
     "interrupted": "Ein Clip wurde gerade gesendet, als die Seite verlassen wurde. Wählen Sie dieselben Dateien noch einmal, dann geht es weiter, wo es war.",
     "choose_again": "Noch einmal wählen: {names}",

@@ -810,6 +810,7 @@ export const EN = {
     "changed": "A file was changed or moved since it was chosen. Choose it again.",
     "stop": "Stop sending",
     "look": "Something is to be put right before it can be sent: see the form.",
+    "one_at_a_time": "A clip is being sent. Wait until it is there, or stop it in the form.",
     "not_allowed": "Your key does not allow sending clips.",
     "interrupted": "A clip was being sent when the page was left. Choose the same files again, and it goes on where it was.",
     "choose_again": "Choose again: {names}",

@@ -39,9 +39,10 @@ export class ClipForm {
   /**
    * @param {{form: HTMLFormElement, again: HTMLElement, message: HTMLElement, progress: HTMLElement,
    *   stop: HTMLElement, refusal: HTMLElement}} parts
-   * @param {{onJob: (id: string) => void, onSend: (clip: File | undefined, isExample: boolean) => void, onShare: (share: number | null) => void,
-   *   onAsked: () => void, onScene: (file: File) => void}} told of the job that was made; that a clip is being sent; of the
-   *   share that is sent, null at the end; that something is asked of the user; of a scene that was saved and is dropped
+   * @param {{onJob: (id: string, plan: import("./sending.js").Plan) => void, onSend: (clip: File | undefined, isExample: boolean) => void,
+   *   onShare: (share: number | null) => void, onAsked: () => void, onScene: (file: File) => void}} told of the job that was made,
+   *   and of what; that a clip is being sent; of the share that is sent, null at the end; that something is asked of the user;
+   *   of a scene that was saved and is dropped
    */
   constructor(parts, told) {
     Object.assign(this, parts, told);
@@ -52,6 +53,7 @@ export class ClipForm {
     /** @type {{sending: Sending, missing: import("./sending.js").PlannedFile[]} | null} what a reload interrupted */
     this.resumed = null;
     this.isSending = false;
+    this.isEdited = false; // there is something in it that was not sent
     this.isAllowed = true;
     this.looks = 0; // counts checks: only the newest is shown
     limit(this.form);
@@ -60,6 +62,7 @@ export class ClipForm {
       event.preventDefault();
       this.#send();
     });
+    this.form.addEventListener("input", () => (this.isEdited = true));
     this.form.addEventListener("change", () => this.#look());
     this.stop.addEventListener("click", () => this.controller?.abort());
     this.again.querySelector("button").addEventListener("click", () => this.#giveUp());
@@ -80,7 +83,7 @@ export class ClipForm {
   }
 
   /**
-   * Use a job's clip again with another file: its options are chosen, and the file is asked for.
+   * Use a job's clip again with another file: its options are chosen, and the file is asked for. Not while one is sent.
    * @param {import("../base/api.js").Job} job
    * @param {"masks"|"calibration"} part
    * @param {File} [painted] the masks, white on instruments
@@ -89,6 +92,7 @@ export class ClipForm {
     this.#startAnew();
     this.earlier = job;
     this.asked = part;
+    this.isEdited = true;
     for (const name of OPTIONS) {
       const value = part === "masks" && name === "mask_source" ? "given" : job.options[name];
       if (value != null) this.form.elements[name].value = value;
@@ -103,6 +107,7 @@ export class ClipForm {
 
   /** Send the clip that comes with the page. @param {string} label its name */
   async sendExample(label) {
+    if (this.isSending) return;
     this.#startAnew();
     const files = EXAMPLE.map(async (name) => new File([await (await fetch(`example/${name}`)).blob()], name));
     this.take(await Promise.all(files));
@@ -112,6 +117,7 @@ export class ClipForm {
 
   #startAnew() {
     this.form.reset();
+    this.isEdited = false;
     this.earlier = null;
     this.resumed = null;
     showFindings(this.form, []);
@@ -179,6 +185,7 @@ export class ClipForm {
   take(files) {
     const parts = partsOf(files);
     if (this.earlier && (parts.has("clip") || parts.has("right"))) this.#startAnew();
+    this.isEdited = true;
     for (const [part, file] of parts) {
       const transfer = new DataTransfer();
       transfer.items.add(file);
@@ -227,6 +234,7 @@ export class ClipForm {
     }
     const files = this.#files();
     const sending = this.#begin(planOf(files, this.#submission()));
+    this.isEdited = false;
     await this.#run(sending, files, isExample);
   }
 
@@ -244,14 +252,23 @@ export class ClipForm {
     this.#show(true);
     this.onSend(files.get("clip") ?? files.get("left"), isExample);
     try {
-      this.onJob(await sending.run(files));
-      this.#startAnew();
+      this.onJob(await sending.run(files), sending.plan);
+      if (this.isEdited) this.#goOnWithNext();
+      else this.#startAnew();
     } catch (error) {
       this.#tellEnd(sending, error);
     } finally {
       this.#show(false);
       this.onShare(null);
     }
+  }
+
+  /** What was put into the form while another clip was sent stays there. */
+  #goOnWithNext() {
+    this.resumed = null;
+    this.#showSource();
+    this.#say("");
+    this.#look();
   }
 
   /** It ended without a job. @param {Sending} sending @param {Error} error */
@@ -301,7 +318,9 @@ export class ClipForm {
         picker.closest("label").after(element("div", { class: "finding bad", text: words("upload.other_file", { name: planned.name }) }));
       } else if (file) files.set(planned.part, file);
     }
-    if (files.size === missing.length && !this.isSending) await this.#run(sending, files);
+    if (files.size < missing.length || this.isSending) return null;
+    this.isEdited = false;
+    await this.#run(sending, files);
     return null;
   }
 

@@ -1,5 +1,6 @@
 // Opens the brush, whose modules are loaded when it is wanted first.
 
+import { storeStrokes } from "../base/drafts.js";
 import { connectionLost } from "../base/problem.js";
 
 export class Painting {
@@ -9,12 +10,11 @@ export class Painting {
   /**
    * @param {import("../stage/viewer.js").Viewer} viewer stands still while masks are painted
    * @param {(text: string) => void} onFailure told when the modules cannot be loaded
+   * @param {() => boolean} isSending whether a clip is being sent, so that no other can be
    * @param {(id: string, masks: File) => void} onMasks given the masks of a scene
    */
-  constructor(viewer, onFailure, onMasks) {
-    this.viewer = viewer;
-    this.onFailure = onFailure;
-    this.onMasks = onMasks;
+  constructor(viewer, onFailure, isSending, onMasks) {
+    Object.assign(this, { viewer, onFailure, isSending, onMasks });
   }
 
   /** @param {string} id a scene @param {import("../base/wire.js").Report} found its report */
@@ -26,11 +26,11 @@ export class Painting {
     } catch {
       return this.onFailure(connectionLost().message);
     }
-    this.#brush.openBrush(id, found, (masks) => this.onMasks(id, masks));
+    this.#brush.openBrush(id, found, this.isSending, (masks) => this.onMasks(id, masks));
   }
 
-  /** Forget the strokes, which were sent. */
-  forget() {
-    this.#brush?.forgetStrokes();
+  /** Forget the strokes that were sent: those of the scene whose clip got other masks. @param {import("../form/sending.js").Plan} plan */
+  forget({ submission, files }) {
+    if (submission.clip_of && files.some(({ part }) => part === "masks")) storeStrokes(submission.clip_of, []);
   }
 }

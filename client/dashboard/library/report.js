@@ -13,7 +13,7 @@ import { isPending, lightMark, reasonsOf, trustOf } from "./trustlight.js";
 /** @param {Report["masks"]} masks */
 const areFound = (masks) => masks?.source === "found" || masks?.source === "segmenter";
 
-/** Coefficients of a lens that the brush knows; further ones tilt the sensor. */
+/** Coefficients of distortion that the brush computes with; any after them stand for a tilted sensor. */
 const MAX_DISTORTION = 12;
 /** More reasons for care than these are under "details". */
 const MAX_REASONS = 3;
@@ -79,25 +79,26 @@ function canPaint({ masks, recorded, frame_count: count }) {
   return recorded.frames.length === count && recorded.width === pixels.width && isAsRecorded;
 }
 
-/** How to send better masks. */
-function correction(id, report, message, { onMasks, onPaint }) {
+/** How to save the masks, and to send better ones. */
+function correction(id, report, message, { maySend, onMasks, onPaint }) {
   const { masks } = report;
   if (!masks) return [];
+  const save = areFound(masks) && masks.share ? [button(words("report.save_masks"), () => download(() => getMasks(id), message))] : [];
+  if (!maySend) return save;
   const paint = canPaint(report) ? [button(words("brush.title"), () => onPaint(id, report))] : [];
   const send = button(words(masks.source === "none" ? "report.send_masks" : "report.send_better_masks"), () => onMasks(id));
-  if (!areFound(masks) || !masks.share) return [...paint, send];
-  const save = button(words("report.save_masks"), () => download(() => getMasks(id), message));
-  return [...paint, save, send, element("p", { class: "quiet", text: words("report.how_to_correct") })];
+  const how = save.map(() => element("p", { class: "quiet", text: words("report.how_to_correct") }));
+  return [...paint, ...save, send, ...how];
 }
 
 /**
  * @param {HTMLElement} target
  * @param {string} id
  * @param {Report} report
- * @param {{onMasks: (id: string) => void, onPaint: (id: string, report: Report) => void}} told better masks are to be sent
- *   for this scene's clip, or to be painted
+ * @param {{maySend: boolean, onMasks: (id: string) => void, onPaint: (id: string, report: Report) => void}} sending whether
+ *   the key may send clips; better masks are to be sent for this scene's clip, or to be painted
  */
-export function showReport(target, id, report, told) {
+export function showReport(target, id, report, sending) {
   const trust = trustOf(report);
   const message = element("div", { class: "message bad" });
   const isOpen = target.querySelector("details.figures")?.open ?? false;
@@ -110,7 +111,7 @@ export function showReport(target, id, report, told) {
     ...careful(report, trust),
     ...lightList(report.light),
     figures,
-    ...correction(id, report, message, told),
+    ...correction(id, report, message, sending),
     message,
   );
 }

@@ -6,9 +6,7 @@ import { button, element } from "../base/element.js";
 import { figure, words } from "../base/messages.js";
 import { showProblem } from "../base/problem.js";
 import { Paper } from "./paper.js";
-import { forgetStrokes, PaintedMasks } from "./strokes.js";
-
-export { forgetStrokes } from "./strokes.js";
+import { PaintedMasks } from "./strokes.js";
 
 const MIN_SIZE = 1;
 const MAX_SIZE = 200;
@@ -29,23 +27,24 @@ export function styled() {
 /**
  * Open the screen, once it is styled.
  * @param {string} scene
- * @param {import("../base/wire.js").Report} report of a scene with recorded frames, whose pixels it tells
+ * @param {import("../base/wire.js").Report} report with recorded frames and their pixels
+ * @param {() => boolean} isSending whether a clip is being sent, so that no other can be
  * @param {(masks: File) => void} onMasks the masks that are to be sent
  */
-export function openBrush(scene, report, onMasks) {
-  if (!document.querySelector("dialog.brush")) new Brush(scene, report, onMasks);
+export function openBrush(scene, report, isSending, onMasks) {
+  if (!document.querySelector("dialog.brush")) new Brush(scene, report, isSending, onMasks);
 }
 
 class Brush {
-  constructor(scene, report, onMasks) {
-    Object.assign(this, { scene, onMasks });
+  constructor(scene, report, isSending, onMasks) {
+    Object.assign(this, { scene, isSending, onMasks });
     this.masks = new PaintedMasks(scene, report);
     this.paper = new Paper(report.recorded.pixels, (stroke) => {
       this.masks.add(stroke);
       this.#tell();
     });
-    this.frame = this.masks.kept[0];
-    this.brush = { isTool: true, isForAll: false };
+    this.frame = this.masks.storedFrames[0];
+    this.chosen = { isTool: true, isForAll: false };
     this.size = Math.max(MIN_SIZE, Math.min(MAX_SIZE, Math.round(this.masks.width * FIRST_SHARE)));
     /** @type {Map<number, Promise<Blob>>} */
     this.pictures = new Map();
@@ -69,9 +68,10 @@ class Brush {
     this.undoes = button(words("brush.undo"), () => this.#undo());
     this.sends = button(words("brush.send"), () => this.#send());
     this.sends.className = "sends";
+    this.closes = button(words("page.close"), () => this.#leave());
     this.message = Object.assign(element("div", { class: "message" }), { role: "alert" });
-    this.told = Object.assign(element("p", { class: "told" }), { role: "status" });
-    this.strip = element("div", { class: "strip" }, ...this.masks.kept.map((frame) => this.#thumbnail(frame)));
+    this.state = Object.assign(element("p", { class: "state" }), { role: "status" });
+    this.strip = element("div", { class: "strip" }, ...this.masks.storedFrames.map((frame) => this.#thumbnail(frame)));
     Object.assign(this.strip, { role: "group", ariaLabel: words("brush.frames") });
     const title = Object.assign(element("h2", { text: words("brush.title") }), { id: "brush-title" });
     const group = (name, ...parts) => Object.assign(element("div", { class: "group" }, ...parts), { role: "group", ariaLabel: words(name) });
@@ -80,7 +80,7 @@ class Brush {
     this.dialog = element(
       "dialog",
       { class: "brush" },
-      element("header", {}, title, this.told, button(words("page.close"), () => this.#leave())),
+      element("header", {}, title, this.state, this.closes),
       this.paper.stage,
       this.message,
       element(
@@ -137,14 +137,15 @@ class Brush {
     this.dialog.remove();
   }
 
-  /** Close it; strokes that were not sent are asked about. */
+  /** Close it; strokes that were not sent are asked about. Not while masks are made of them. */
   #leave() {
+    if (this.isMaking) return;
     if (this.masks.strokes.length === 0) return this.dialog.close();
     const question = Object.assign(element("p", { text: words("brush.ask") }), { id: "brush-question" });
     const stays = button(words("brush.stay"), () => ask.close());
     const discards = button(words("brush.discard"), () => {
       ask.close();
-      forgetStrokes();
+      this.masks.discard();
       this.dialog.close();
     });
     discards.value = "yes";
@@ -173,8 +174,8 @@ class Brush {
   }
 
   #step(by) {
-    const { kept } = this.masks;
-    this.#go(kept[Math.max(0, Math.min(kept.length - 1, kept.indexOf(this.frame) + by))]);
+    const { storedFrames: stored } = this.masks;
+    this.#go(stored[Math.max(0, Math.min(stored.length - 1, stored.indexOf(this.frame) + by))]);
   }
 
   /** Look at a frame. @param {number} frame */
@@ -182,6 +183,7 @@ class Brush {
     const look = ++this.looks;
     this.frame = frame;
     this.paper.clear();
+    delete this.dialog.dataset.shown;
     this.message.replaceChildren();
     this.#tell();
     const shown = this.strip.querySelector(`[data-frame="${frame}"]`);
@@ -190,10 +192,11 @@ class Brush {
     try {
       await this.masks.load();
       const [picture, mask] = await Promise.all([this.#picture(frame).then(createImageBitmap), this.masks.mask(frame)]);
-      if (look !== this.looks) return;
-      this.paper.show(frame, picture, mask);
+      if (look === this.looks) {
+        this.paper.show(frame, picture, mask);
+        this.dialog.dataset.shown = String(frame);
+      }
       picture.close();
-      this.dialog.dataset.shown = String(frame);
     } catch (error) {
       if (look === this.looks) showProblem(this.message, error);
     }
@@ -207,16 +210,16 @@ class Brush {
   }
 
   /** @param {{isTool?: boolean, isForAll?: boolean, size?: number}} [chosen] */
-  #choose({ size = this.size, ...brush } = {}) {
-    Object.assign(this.brush, brush);
+  #choose({ size = this.size, ...chosen } = {}) {
+    Object.assign(this.chosen, chosen);
     this.size = Math.max(MIN_SIZE, Math.min(MAX_SIZE, Math.round(size)));
     this.slider.value = String(this.size);
     this.slider.ariaValueText = words("brush.pixels", { count: figure(this.size) });
-    const { isTool, isForAll } = this.brush;
+    const { isTool, isForAll } = this.chosen;
     for (const [each, isOn] of [[this.tool, isTool], [this.tissue, !isTool], [this.here, !isForAll], [this.all, isForAll]]) {
       each.setAttribute("aria-pressed", String(isOn));
     }
-    this.paper.take({ ...this.brush, size: this.size });
+    this.paper.take({ ...this.chosen, size: this.size });
   }
 
   #resize(by) {
@@ -226,7 +229,7 @@ class Brush {
 
   /** Say which frame is in view, and mark those that were changed. */
   #tell() {
-    const { kept, strokes, count } = this.masks;
+    const { storedFrames, strokes, count } = this.masks;
     for (const each of this.strip.children) {
       const frame = Number(each.dataset.frame);
       const isChanged = this.masks.isChanged(frame);
@@ -236,9 +239,10 @@ class Brush {
       each.setAttribute("aria-label", words(isChanged ? "brush.frame_changed" : "brush.frame", { frame: frame + 1, count }));
     }
     const now = words(this.masks.isChanged(this.frame) ? "brush.frame_changed" : "brush.frame", { frame: this.frame + 1, count });
-    const more = kept.length < count ? `. ${words("brush.nearest")}` : "";
-    this.told.textContent = now + more;
-    this.undoes.disabled = this.sends.disabled = strokes.length === 0;
+    const more = storedFrames.length < count ? `. ${words("brush.nearest")}` : "";
+    this.state.textContent = now + more;
+    this.undoes.disabled = this.sends.disabled = this.isMaking || strokes.length === 0;
+    this.closes.disabled = this.isMaking;
   }
 
   /** @param {KeyboardEvent} event */
@@ -263,10 +267,12 @@ class Brush {
   }
 
   async #send() {
-    this.sends.disabled = this.undoes.disabled = this.isMaking = this.paper.isResting = true;
     this.message.replaceChildren();
+    if (this.isSending()) return this.message.append(element("p", { text: words("upload.one_at_a_time") }));
+    this.isMaking = this.paper.isResting = true;
+    this.#tell();
     try {
-      const file = await this.masks.file((share) => (this.told.textContent = words("brush.making", { share: figure(100 * share) })));
+      const file = await this.masks.file((share) => (this.state.textContent = words("brush.making", { share: figure(100 * share) })));
       if (this.isClosed) return;
       this.dialog.close();
       this.onMasks(file);

@@ -54,9 +54,10 @@ export class Paper {
     this.#showRing();
   }
 
-  /** Another frame is asked for. */
+  /** Another frame is asked for: the one in view goes. */
   clear() {
     this.mask = this.stroke = null;
+    this.stage.classList.add("stale");
   }
 
   /** @param {number} frame @param {ImageBitmap} picture @param {import("./files.js").Mask} mask painted into */
@@ -64,6 +65,7 @@ export class Paper {
     Object.assign(this, { frame, mask });
     this.recorded.getContext("2d").drawImage(picture, 0, 0, this.width, this.height);
     this.#draw();
+    this.stage.classList.remove("stale");
   }
 
   /**

@@ -2,10 +2,8 @@
 // that reach it: so one is undone by leaving it out, and a mask is decoded only where it is looked at or sent.
 
 import { bodyOf, getMasks, request } from "../base/api.js";
-import { readTabStorage, writeTabStorage } from "../base/storage.js";
+import { readStrokes, storeStrokes } from "../base/drafts.js";
 import { maskOf, pngOf, unusable, unzipped, zipped } from "./files.js";
-
-const STORED_AS = "intrasplat-strokes";
 
 /**
  * isTool: it paints instrument, else tissue. frame: the one that it was painted on. isForAll: it reaches all frames.
@@ -14,13 +12,13 @@ const STORED_AS = "intrasplat-strokes";
  */
 /** @typedef {import("./files.js").Mask} Mask */
 
-/** Forget what is drawn in this tab and was not sent. */
-export const forgetStrokes = () => writeTabStorage(STORED_AS, null);
-
-/** Where the recording has a pixel of a kept frame. @param {import("../base/wire.js").RecordedPixels} pixels */
+/**
+ * The way from a stored frame, which may be rectified, to the recording.
+ * @param {import("../base/wire.js").RecordedPixels} pixels
+ * @returns {(column: number, row: number) => [number, number]} x and y in the recording of a pixel of a stored frame
+ */
 export function recordedPlace({ rays: r, distortion, camera: c }) {
   const [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0] = distortion;
-  /** @param {number} column @param {number} row @returns {[number, number]} */
   return (column, row) => {
     const [X, Y, Z] = [0, 3, 6].map((i) => r[i] * column + r[i + 1] * row + r[i + 2]);
     const [x, y] = [X / Z, Y / Z];
@@ -63,22 +61,22 @@ export class PaintedMasks {
    */
   constructor(scene, report) {
     const { recorded, frame_count: count, masks } = report;
-    Object.assign(this, { scene, count, kept: recorded.frames, source: masks?.share ? masks.source : "none" });
+    Object.assign(this, { scene, count, storedFrames: recorded.frames, source: masks?.share ? masks.source : "none" });
     this.width = recorded.pixels.width;
     this.height = recorded.pixels.height;
-    const draft = readTabStorage(STORED_AS);
-    /** @type {Stroke[]} */
-    this.strokes = draft?.scene === scene ? draft.strokes : [];
+    this.strokes = readStrokes(scene);
     /** @type {Map<string, Uint8Array> | null} PNGs of all frames by name, once they are loaded, where masks were found */
     this.found = null;
+    /** @type {Promise<void> | null} */
+    this.loading = null;
   }
 
-  /** The kept frame that stands for a frame of the clip: the nearest. @param {number} frame */
-  keptFor(frame) {
-    return this.kept.reduce((best, each) => (Math.abs(each - frame) < Math.abs(best - frame) ? each : best));
+  /** The stored frame that stands for a frame of the clip. @param {number} frame */
+  nearestStored(frame) {
+    return this.storedFrames.reduce((best, each) => (Math.abs(each - frame) < Math.abs(best - frame) ? each : best));
   }
 
-  /** @param {number} frame kept @returns {boolean} whether a stroke reaches it */
+  /** @param {number} frame stored @returns {boolean} whether a stroke reaches it */
   isChanged(frame) {
     return this.strokes.some((stroke) => stroke.isForAll || stroke.frame === frame);
   }
@@ -86,23 +84,33 @@ export class PaintedMasks {
   /** @param {Stroke} stroke */
   add(stroke) {
     this.strokes.push(stroke);
-    this.#store();
+    storeStrokes(this.scene, this.strokes);
   }
 
   /** Take the last stroke back. @returns {Stroke | undefined} */
   undo() {
     const last = this.strokes.pop();
-    this.#store();
+    storeStrokes(this.scene, this.strokes);
     return last;
   }
 
-  #store() {
-    writeTabStorage(STORED_AS, this.strokes.length > 0 ? { scene: this.scene, strokes: this.strokes } : null);
+  /** Forget all strokes. */
+  discard() {
+    this.strokes = [];
+    storeStrokes(this.scene, []);
   }
 
-  /** Load what all frames need. */
-  async load() {
-    if (this.found || this.source === "none" || this.source === "given") return;
+  /** Load what all frames need, once. @returns {Promise<void>} */
+  load() {
+    this.loading ??= this.#load().catch((error) => {
+      this.loading = null; // asked for again with the next look
+      throw error;
+    });
+    return this.loading;
+  }
+
+  async #load() {
+    if (this.source === "none" || this.source === "given") return;
     const { blob } = await getMasks(this.scene);
     const found = await unzipped(new Uint8Array(await blob.arrayBuffer()));
     if (found.size !== this.count) throw unusable();
@@ -112,8 +120,8 @@ export class PaintedMasks {
   /** @param {number} frame of the clip @returns {Promise<Mask>} with its strokes */
   async mask(frame) {
     const mask = await this.#mask(frame);
-    const kept = this.keptFor(frame);
-    for (const stroke of this.strokes) if (stroke.isForAll || stroke.frame === kept) paint(mask, stroke);
+    const stored = this.nearestStored(frame);
+    for (const stroke of this.strokes) if (stroke.isForAll || stroke.frame === stored) paint(mask, stroke);
     return mask;
   }
 
@@ -139,10 +147,11 @@ export class PaintedMasks {
    * @returns {Promise<File>} a zip with a PNG for each frame of the clip
    */
   async file(onShare) {
+    await this.load();
     const names = this.found ? [...this.found.keys()] : Array.from({ length: this.count }, (_, n) => `${String(n).padStart(6, "0")}.png`);
     const files = new Map();
     for (const [frame, name] of names.entries()) {
-      const isAsFound = this.found && !this.isChanged(this.keptFor(frame));
+      const isAsFound = this.found && !this.isChanged(this.nearestStored(frame));
       files.set(name, isAsFound ? this.found.get(name) : await pngOf(await this.mask(frame)));
       onShare((frame + 1) / this.count);
     }

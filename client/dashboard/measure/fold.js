@@ -1,4 +1,4 @@
-// The measuring panel folds, where it is a sheet at the lower edge (style/measuring.css), and tells that it scrolls.
+// The measuring panel folds, where it is a sheet at the lower edge (style/measuring.css), and shows whether there is more below.
 
 import { markMore } from "../base/drawers.js";
 
