@@ -14,7 +14,15 @@ from starlette.websockets import WebSocketState
 
 from contract.queue.feeds import FeedsFullError
 from contract.queue.interface import QueueFullError
-from intrasplat.errors import ErrorCode, InputError, LimitError, MissingExtraError, NotListedError, SceneError, UnavailableError
+from intrasplat.errors import (
+    ErrorCode,
+    InputError,
+    LimitError,
+    MissingExtraError,
+    NotListedError,
+    SceneError,
+    UnavailableError,
+)
 from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"

@@ -172,7 +172,9 @@ class SourceSpec:
             if not Path(target.path).exists():
                 raise InputError(FIELD, f"there is no {target.path}.", _REMEDY)
         elif self.hosts is not None and not self.hosts.has(target):
-            raise NotListedError(FIELD, f"{target.origin[:80]} is not allowed.", "Whoever runs the service lists hosts.")
+            raise NotListedError(
+                FIELD, f"{target.origin[:80]} is not allowed.", "Whoever runs the service lists hosts."
+            )
         return target
 
 
