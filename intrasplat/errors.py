@@ -3,6 +3,7 @@
     IntrasplatError
     ├── InputError            the user's input cannot be used: names the field and the remedy
     │   ├── LimitError        the input is larger than this machine accepts
+    │   ├── NotListedError    the user's source is none of those that whoever runs the service has listed
     │   ├── MissingExtraError what is asked for needs an extra that is not installed
     │   └── ResumeMismatch    the folder holds a stopped run that this request does not continue
     ├── TrainingDiverged      the optimiser left the finite numbers, or the model collapsed
@@ -30,6 +31,7 @@ class ErrorCode(StrEnum):
     KEY_EXPIRED = "key_expired"
     LIMIT = "limit"
     MISSING_EXTRA = "missing_extra"
+    NOT_LISTED = "not_listed"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"
     FEEDS_FULL = "feeds_full"
@@ -72,6 +74,12 @@ class LimitError(InputError):
     """The input is larger than this machine accepts (frames, pixels, bytes, seconds)."""
 
     code = ErrorCode.LIMIT
+
+
+class NotListedError(InputError):
+    """A source that whoever runs the service has not listed."""
+
+    code = ErrorCode.NOT_LISTED
 
 
 class MissingExtraError(InputError):

@@ -161,7 +161,7 @@ def _options(services: Deps, text: str) -> FeedOptions:
     try:
         allowed_hosts(options.source, services.settings)
     except InputError as error:
-        raise InputError(f"{FIELD_PREFIX}.{error.field}", error.problem, error.remedy) from None
+        raise type(error)(f"{FIELD_PREFIX}.{error.field}", error.problem, error.remedy) from None
     if options.keep_s <= most_s:
         return options
     if "keep_s" not in options.model_fields_set:

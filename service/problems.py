@@ -14,7 +14,15 @@ from starlette.websockets import WebSocketState
 
 from contract.queue.feeds import FeedsFullError
 from contract.queue.interface import QueueFullError
-from intrasplat.errors import ErrorCode, InputError, LimitError, MissingExtraError, SceneError, UnavailableError
+from intrasplat.errors import (
+    ErrorCode,
+    InputError,
+    LimitError,
+    MissingExtraError,
+    NotListedError,
+    SceneError,
+    UnavailableError,
+)
 from intrasplat.files.disk_errors import DISK_FULL_ERRNOS, StoreFullError
 
 MEDIA_TYPE = "application/problem+json"
@@ -125,7 +133,8 @@ def problem_of(error: Exception) -> Problem | None:
             return lacking(error.problem, error.remedy)
         case InputError():
             status = 413 if isinstance(error, LimitError) else 422
-            return Problem(status, error.problem, field=error.field, remedy=error.remedy)
+            extensions = {"code": error.code.value} if isinstance(error, NotListedError) else None
+            return Problem(status, error.problem, field=error.field, remedy=error.remedy, extensions=extensions)
         case SceneError():
             return Problem(404, str(error), field="scene", remedy=SCENES_REMEDY)
         case QueueFullError():

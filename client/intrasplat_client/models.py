@@ -34,6 +34,7 @@ class ErrorCode(StrEnum):
     KEY_EXPIRED = "key_expired"
     LIMIT = "limit"
     MISSING_EXTRA = "missing_extra"
+    NOT_LISTED = "not_listed"
     NOT_YET = "not_yet"
     OUT_OF_MEMORY = "out_of_memory"
     FEEDS_FULL = "feeds_full"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contract.runtime.settings import Settings
-from intrasplat.errors import InputError
+from intrasplat.errors import NotListedError
 from intrasplat.live.spec import FIELD, AllowedHosts, SourceKind, parsed
 
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_FEED_HOSTS."
@@ -16,7 +16,8 @@ def allowed_hosts(source: str | None, settings: Settings) -> AllowedHosts | None
     source None: a push, which connects to nothing.
 
     Raises:
-        InputError: it is no source, or not listed.
+        NotListedError: it is not listed.
+        InputError: it is no source.
     """
     hosts = AllowedHosts(settings.feed_hosts, settings.feed_private == "yes")
     if source is None:
@@ -24,8 +25,8 @@ def allowed_hosts(source: str | None, settings: Settings) -> AllowedHosts | None
     target = parsed(source)
     if target.kind in (SourceKind.FILE, SourceKind.DEVICE):
         if target.path not in settings.feed_devices:
-            raise InputError(FIELD, f"{target.path[:80]!r} is not allowed.", DEVICES_REMEDY)
+            raise NotListedError(FIELD, f"{target.path[:80]!r} is not allowed.", DEVICES_REMEDY)
         return None
     if not hosts.has(target):
-        raise InputError(FIELD, f"{target.origin[:80]} is not allowed.", HOSTS_REMEDY)
+        raise NotListedError(FIELD, f"{target.origin[:80]} is not allowed.", HOSTS_REMEDY)
     return hosts

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import SplitResult, quote, unquote, urlsplit
 
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, NotListedError
 from intrasplat.intake.addresses import is_permitted
 from intrasplat.intake.limits import ClipLimits
 
@@ -160,18 +160,21 @@ class SourceSpec:
         """The source, checked as far as that is possible without a connection.
 
         Raises:
-            InputError: it is no source, its host is not allowed, or its file is missing.
+            NotListedError: it, or its host, is not allowed.
+            InputError: it is no source, or its file is missing.
         """
         if self.url is None:
             return Target(SourceKind.PICTURES if self.pictures else SourceKind.PUSH)
         target = parsed(self.url)
         if target.kind in (SourceKind.FILE, SourceKind.DEVICE):
             if self.hosts is not None:
-                raise InputError(FIELD, "files and devices of the service's machine are not allowed.", _REMEDY)
+                raise NotListedError(FIELD, "files and devices of the service's machine are not allowed.", _REMEDY)
             if not Path(target.path).exists():
                 raise InputError(FIELD, f"there is no {target.path}.", _REMEDY)
         elif self.hosts is not None and not self.hosts.has(target):
-            raise InputError(FIELD, f"{target.origin[:80]} is not allowed.", "Whoever runs the service lists hosts.")
+            raise NotListedError(
+                FIELD, f"{target.origin[:80]} is not allowed.", "Whoever runs the service lists hosts."
+            )
         return target
 
 

@@ -106,7 +106,8 @@ def test_a_feed_shows_what_its_worker_says(service: ServiceUnderTest, worker: Fe
     ],
 )
 def test_options_that_cannot_be_used_are_refused(service: ServiceUnderTest, options: str, field: str) -> None:
-    assert_problem(posted(service, options), 422, field)
+    problem = assert_problem(posted(service, options), 422, field)
+    assert (problem.get("code") == "not_listed") == (field == "options.source")
     assert service.http.get("/feeds").json() == []
 
 

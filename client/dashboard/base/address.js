@@ -15,7 +15,7 @@ import { comparisonOf } from "./spelling.js";
  */
 
 const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
-const LIVE = /^#\/live\/([0-9a-f]{32}(?:\?at=[^&]+)?)$/;
+const LIVE = /^#\/live\/([0-9a-f]{32}(?:\?.*)?)$/;
 const ID = /^[0-9a-f]{32}$/;
 const POSE = /^(right|orbit:[-\d.e]+(,[-\d.e]+){2}((,[-\d.e]+){3})?|[-\d.e]+(,[-\d.e]+){11})$/;
 const RANGE = /^([1-9]\d{0,3}),([1-9]\d{0,3})$/;

@@ -10,6 +10,8 @@ const TYPED = "textarea, select, dialog[open], input:not([type=range], [type=che
 const PRESSED = "button, summary, a, [type=checkbox]";
 const OWN = { " ": PRESSED, Enter: PRESSED, PageUp: ".drawer", PageDown: ".drawer" };
 const OF_SLIDERS = /^(Arrow|Home)/;
+/** Escape closes a drawer from its fields, too; a search with text in it is emptied first. */
+const LEFT = ".drawers :not([type=search]:not(:placeholder-shown), dialog[open] *)";
 /** Here Space works what has the focus, however it came by it. */
 const FILLED_IN = "form, dialog, .drawer";
 
@@ -38,6 +40,7 @@ let focusCameBy = "";
 function isForOthers({ key, target, ctrlKey, metaKey, altKey }) {
   if (key === undefined || ctrlKey || metaKey || altKey || !(target instanceof Element)) return true; // autofill tells no key
   if (key === " " && focusCameBy === "pointerdown" && !target.closest(FILLED_IN)) return false;
+  if (key === "Escape" && target.matches(LEFT)) return false;
   if (target.closest(TYPED)) return true;
   if (target.closest("[type=range], [role=slider]") && OF_SLIDERS.test(key)) return true;
   return key in OWN && target.closest(OWN[key]) !== null;

@@ -61,7 +61,7 @@
  *   ssim: number | null,
  * }} DetailScores
  */
-/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"missing_extra"|"not_yet"|"out_of_memory"|"feeds_full"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
+/** @typedef {"attempts_exhausted"|"cancelled"|"fault"|"input"|"key_expired"|"limit"|"missing_extra"|"not_listed"|"not_yet"|"out_of_memory"|"feeds_full"|"queue_full"|"record_unreadable"|"resume_mismatch"|"scene"|"store_full"|"decoder_killed"|"training_diverged"|"unavailable"|"unclassified"} ErrorCode */
 /**
  * @typedef {{
  *   format: string,

@@ -3,6 +3,7 @@
 
 import { Orbit } from "../stage/orbit.js";
 import { Rock } from "../stage/rock.js";
+import { isoOf } from "./place.js";
 
 const TICK_MS = 50;
 /** So long without a hand, a view that was turned goes back to the endoscope's. */
@@ -10,8 +11,6 @@ export const RETURN_AFTER_MS = 20_000;
 /** Less than this behind the newest moment is live. */
 const LIVE_S = 0.5;
 const HANDS = ["pointermove", "pointerdown", "wheel", "keydown"];
-
-const isoOf = (atS) => new Date(Math.round(atS * 1000)).toISOString();
 
 /** Tells "changed" when another moment or place is looked at, or a mode is. */
 export class Look extends EventTarget {

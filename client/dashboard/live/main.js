@@ -4,9 +4,10 @@ import { closeBanner } from "../base/banners.js";
 import { clockTime, setText } from "../base/element.js";
 import { prepareFullScreen, ScreenLight } from "../base/fullscreen.js";
 import { listenToGestures } from "../base/gestures.js";
+import { prepareLanguages } from "../base/help.js";
 import { keyEvents, showKeyForm } from "../base/key.js";
 import { listenToKeys, onKeys } from "../base/keys.js";
-import { figure, language, languageEvents, noticeWords, setLanguage, showWords, words } from "../base/messages.js";
+import { figure, language, languageEvents, noticeWords, showWords, words } from "../base/messages.js";
 import { Scopes } from "../base/scopes.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { placeInPicture } from "../measure/pointer.js";
@@ -21,12 +22,13 @@ import { LiveMeasure } from "./measuring.js";
 import { ModelPicture } from "./model.js";
 import { Opening } from "./opening.js";
 import { LivePicture } from "./picture.js";
-import { hashOf, placeOf } from "./place.js";
+import { feedHashOf, feedPlaceOf } from "./place.js";
 import { Push } from "./push.js";
 import { Tape } from "./tape.js";
 
 const TICK_MS = 50;
 const TAPE_MS = 250;
+const WRITE_AFTER_MS = 400;
 const STEP_S = 1;
 const TURN = 20;
 const NEARER = 1.1;
@@ -216,6 +218,11 @@ function showTrust() {
   setText(get("trust-why"), trust?.reasons.length ? noticeWords(trust.reasons[0]) : "");
 }
 
+function showFault(text) {
+  get("message").classList.add("bad");
+  setText(get("message"), text);
+}
+
 async function act(button, work) {
   button.disabled = true;
   closeBanner(get("message"));
@@ -223,8 +230,7 @@ async function act(button, work) {
     const told = await work();
     if (told?.state && told.id === feedId) take(told);
   } catch (error) {
-    get("message").classList.add("bad");
-    setText(get("message"), error.message);
+    showFault(error.message);
   }
   button.disabled = false;
 }
@@ -243,6 +249,16 @@ function askToEnd() {
   dialog.showModal();
 }
 
+let writing = 0;
+/** Say soon in the address what is looked at: browsers refuse to have it written often. */
+function noteAddress() {
+  writing ||= setTimeout(() => {
+    writing = 0;
+    const hash = feedId === null ? location.hash : feedHashOf(feedId, look.mode === "frozen" ? look.atS : null);
+    if (hash !== location.hash) history.replaceState(null, "", hash);
+  }, WRITE_AFTER_MS);
+}
+
 const keep = () => feed && !get("keep").hidden && keeping.keep(feed);
 const isShown = () => feedId !== null;
 
@@ -257,8 +273,8 @@ picture.addEventListener("shown", refresh);
 model.addEventListener("refused", ({ detail }) => (refused = detail));
 look.addEventListener("changed", () => {
   refused = null;
-  if (feedId !== null) history.replaceState(null, "", hashOf(feedId, look.mode === "frozen" ? look.atS : null));
   refresh();
+  noteAddress();
 });
 setInterval(refresh, TICK_MS);
 setInterval(() => {
@@ -310,8 +326,7 @@ const wide = matchMedia("(min-width: 1200px) and (min-height: 640px)");
 const openHealth = () => (get("health").open = wide.matches);
 wide.addEventListener("change", openHealth);
 openHealth();
-get("language").value = language();
-get("language").addEventListener("change", () => setLanguage(get("language").value));
+prepareLanguages([get("language")]);
 languageEvents.addEventListener("changed", () => {
   get("trust").dataset.of = "";
   showTrust();
@@ -324,8 +339,9 @@ showWords(document);
 
 /** Show what the address names. */
 function follow() {
-  const { id, atS } = placeOf(location.hash);
+  const { id, atS, isWrong } = feedPlaceOf(location.hash);
   view(id);
+  if (isWrong) showFault(words("live.at_unreadable"));
   if (id === null || atS === null) return;
   tape.mark({ atS, kind: "frozen" });
   look.freezeAt(atS);

@@ -6,7 +6,7 @@ import { showProblem } from "../base/problem.js";
 import { listFeeds, openFeed } from "./feeds.js";
 import { showFeeds } from "./links.js";
 import { canCapture, openCapture } from "./push.js";
-import { faultOf, isOfSource } from "./sources.js";
+import { faultOf } from "./sources.js";
 
 const LOOK_MS = 2000;
 
@@ -77,7 +77,7 @@ export class Opening {
   #say(fault) {
     const { source } = this.parts.form.elements;
     setText(this.parts.form.querySelector("#source-fault"), fault);
-    source.toggleAttribute("aria-invalid", fault !== "");
+    source.setAttribute("aria-invalid", String(fault !== ""));
   }
 
   /** Names are known once the user has allowed a device. */
@@ -105,7 +105,8 @@ export class Opening {
 
   async #open() {
     const { form, message } = this.parts;
-    const { from, source, device, calibration, layout, label } = form.elements;
+    const { source, device, calibration, layout, label } = form.elements;
+    const isCapture = form.elements.from.value === "capture";
     const submit = form.querySelector("[type=submit]");
     let media = null;
     message.replaceChildren();
@@ -113,19 +114,18 @@ export class Opening {
     if (!this.#judge()) return source.focus();
     submit.disabled = true;
     try {
-      if (from.value === "capture") media = await openCapture(device.value).catch(() => null);
-      if (from.value === "capture" && media === null) throw new Error(words("live.capture_refused"));
+      if (isCapture) media = await openCapture(device.value).catch(() => null);
+      if (isCapture && media === null) throw new Error(words("live.capture_refused"));
       const options = { layout: layout.value };
       if (label.value.trim()) options.label = label.value.trim();
-      if (from.value !== "capture") options.source = source.value.trim();
+      if (!isCapture) options.source = source.value.trim();
       const feed = await openFeed(options, calibration.files[0]);
       form.reset();
       this.#offer();
       this.onOpen(feed.id, media);
     } catch (error) {
       for (const track of media?.getTracks() ?? []) track.stop();
-      const isListed = from.value === "capture" || !isOfSource(error);
-      showProblem(message, isListed ? error : { message: words(`live.source_refused_${from.value}`), details: error.details });
+      showProblem(message, error);
     }
     submit.disabled = false;
   }

@@ -6,13 +6,16 @@ import pytest
 
 from contract.runtime.feed_sources import allowed_hosts
 from contract.runtime.settings import Settings
-from intrasplat.errors import InputError
+from intrasplat.errors import ErrorCode, InputError
 
 SETTINGS = Settings(
     feed_hosts=("rtsp://camera.example.org", "udp://0.0.0.0:5000"),
     feed_private="yes",
     feed_devices=("/dev/video0", "/srv/demo.mp4"),
 )
+
+
+NO_SOURCES = ("ftp://camera.example.org/", "tcp://x")
 
 
 @pytest.mark.parametrize(
@@ -48,8 +51,7 @@ def test_a_push_connects_to_nothing() -> None:
             "/srv/../srv/x/demo.mp4",
             "/srv/x/../demo.mp4",
             "v4l2:///dev/video1",
-            "ftp://camera.example.org/",
-            "tcp://x",
+            *NO_SOURCES,
         ),
     ],
 )
@@ -57,6 +59,7 @@ def test_all_else_is_refused(source: str) -> None:
     with pytest.raises(InputError) as refused:
         allowed_hosts(source, SETTINGS)
     assert refused.value.field == "source"
+    assert (refused.value.code is ErrorCode.NOT_LISTED) == (source not in NO_SOURCES)
     with pytest.raises(InputError):
         allowed_hosts(source, Settings())
 
