@@ -57,7 +57,7 @@ export class Paper {
   /** Another frame is asked for: the one in view goes. */
   clear() {
     this.mask = this.stroke = null;
-    this.stage.classList.add("waiting");
+    this.stage.classList.add("stale");
   }
 
   /** @param {number} frame @param {ImageBitmap} picture @param {import("./files.js").Mask} mask painted into */
@@ -65,7 +65,7 @@ export class Paper {
     Object.assign(this, { frame, mask });
     this.recorded.getContext("2d").drawImage(picture, 0, 0, this.width, this.height);
     this.#draw();
-    this.stage.classList.remove("waiting");
+    this.stage.classList.remove("stale");
   }
 
   /**
