@@ -101,14 +101,14 @@ def scene_of(site: Site, page: Page, clip: DepthClip) -> str:
 
 
 HOLD = """
-const fetch = window.fetch;
+const [path, fetch] = [arguments[0], window.fetch];
 const released = new Promise((done) => (window.release = done));
 window.fetch = async (asked, ...more) => {
-  if (String(asked.url ?? asked).includes("/uploads")) await released;
+  if (new URL(asked.url ?? asked, location).pathname.endsWith(path)) await released;
   return fetch(asked, ...more);
 };
 """
-"""No byte of a clip goes until release() is called."""
+"""What is asked of a path waits until release() is called."""
 LABEL = "document.querySelector('#upload [name=label]')"
 
 
@@ -244,9 +244,16 @@ def test_strokes_over_found_masks_are_in_the_masks_of_the_next_job(site: Site, p
     page.until(lambda: not page.script("return document.querySelector('.brush') !== null"))
     chosen = {name: page.script(f"return document.querySelector('#upload [name={name}]').value") for name in OPTIONS}
     assert chosen == OPTIONS
+    page.script("sessionStorage.setItem('intrasplat-strokes-another', '[]')")  # of a scene that nothing is sent of
+    page.script(HOLD, "/reconstruct")
     page.click("#upload [type=submit]")
+    page.until(lambda: page.script("return document.querySelector('#upload-progress').value") == 1)
+    assert brush.strokes == strokes
+    page.open()  # which makes the job, without the brush's modules
     page.until(lambda: [each.clip_of for each in site.queue.records() if each.job_id != scene] == [scene])
     page.until(lambda: brush.strokes == [])
+    assert page.script("return sessionStorage.getItem('intrasplat-strokes-another')") == "[]"
+    assert page.script(asked) == 0
     (record,) = (each for each in site.queue.records() if each.job_id != scene)
     assert {name: getattr(record.options, name) for name in OPTIONS} == OPTIONS
 
@@ -291,7 +298,7 @@ def test_a_stroke_to_all_frames_is_in_every_given_mask_and_strokes_can_be_discar
     page.until(lambda: not page.script("return document.querySelector('.brush') !== null"))
     assert brush.strokes == []
     page.script("sessionStorage.setItem(arguments[0], sessionStorage.getItem('copy'))", name)  # as after a reload
-    page.script(HOLD)
+    page.script(HOLD, "/uploads")
     page.send(CLIP)  # another clip, which is on its way while masks are painted
     page.until(lambda: page.script("return !document.querySelector('#upload-progress').hidden"))
     page.script(f"{LABEL}.value = 'next'; {LABEL}.dispatchEvent(new Event('input', {{ bubbles: true }}))")
