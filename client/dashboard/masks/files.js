@@ -1,6 +1,7 @@
 // Masks as files: PNGs of one bit a pixel, and the zip that holds one a frame. Pixels do not go through a canvas, whose
 // contents some browsers blur against tracking.
 
+import { chunkOf, crcOf } from "../base/png.js";
 import { Problem } from "../base/problem.js";
 
 const LOCAL = 0x04034b50;
@@ -14,18 +15,6 @@ const NO_DATE = 0x21;
 const PNG_HEAD = [137, 80, 78, 71, 13, 10, 26, 10];
 /** IHDR after width and height: 1 bit, grey, no interlacing. */
 const ONE_BIT_GREY = [1, 0, 0, 0, 0];
-
-const TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
-  for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
-  return n;
-});
-
-/** @param {Uint8Array} bytes */
-function crcOf(bytes) {
-  let crc = 0xffffffff;
-  for (const byte of bytes) crc = TABLE[(crc ^ byte) & 255] ^ (crc >>> 8);
-  return ~crc >>> 0;
-}
 
 /** @param {Uint8Array} bytes @param {TransformStream} coder @returns {Promise<Uint8Array>} */
 const through = async (bytes, coder) =>
@@ -139,17 +128,6 @@ export async function pngOf({ width, height, pixels }) {
   head.setUint32(4, height);
   ONE_BIT_GREY.forEach((value, i) => head.setUint8(8 + i, value));
   const packed = await through(rows, new CompressionStream("deflate"));
-  const chunks = [chunk("IHDR", new Uint8Array(head.buffer)), chunk("IDAT", packed), chunk("IEND", new Uint8Array())];
+  const chunks = [chunkOf("IHDR", new Uint8Array(head.buffer)), chunkOf("IDAT", packed), chunkOf("IEND", new Uint8Array())];
   return new Uint8Array(await new Blob([Uint8Array.from(PNG_HEAD), ...chunks]).arrayBuffer());
-}
-
-/** @param {string} name @param {Uint8Array} content */
-function chunk(name, content) {
-  const made = new Uint8Array(12 + content.length);
-  const view = viewOf(made);
-  view.setUint32(0, content.length);
-  made.set(new TextEncoder().encode(name), 4);
-  made.set(content, 8);
-  view.setUint32(8 + content.length, crcOf(made.subarray(4, 8 + content.length)));
-  return made;
 }

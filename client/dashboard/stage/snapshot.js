@@ -4,7 +4,7 @@ import { getInfo } from "../base/api.js";
 import { dateTime } from "../base/element.js";
 import { figure, words } from "../base/messages.js";
 import { pause } from "../base/pause.js";
-import { withTexts } from "../base/pngtext.js";
+import { withTexts } from "../base/png.js";
 import { fileName, save } from "../base/save.js";
 import { burnMeasurements } from "../measure/burn.js";
 
