@@ -29,7 +29,12 @@ from intrasplat.view.renderer import _renderers, renderer_of
 from tests.intrasplat.scenes import random_scene
 from tests.live.conftest import until
 
-NOW = time.time()
+NOW = time.time() - 2000.0  # each test sets it anew: a suite that takes longer than a past would make it old
+
+
+@pytest.fixture(autouse=True)
+def _now(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "NOW", time.time())
 
 
 def scene(begins_s: float, *, step_s: float = 0.2, frames: int = 4, ago_s: float = 20.0) -> TrainedScene:
