@@ -136,6 +136,7 @@ class Follower:
         self._lock = Lock()
         self._scene: tuple[int, TrainedScene] | None = None
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
+        self._ahead: tuple[FeedPair, Future[DepthClip | Added]] | None = None
         self._rehearsed = self._version = 0
         self._motion_error = 0.0
         self._flow: FlowStart
@@ -161,21 +162,27 @@ class Follower:
         window = self._window
         return 0 if window is None else window.model.count
 
-    def add(self, pair: FeedPair, budget_s: float = 0.2) -> Added:
+    def add(self, pair: FeedPair, budget_s: float = 0.2, coming: Callable[[], FeedPair | None] = lambda: None) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
 
-        While the pair is read, the window's frames train.
+        While the pair is read, the window's frames train. While it is learnt, the one that coming() gives is read; it
+        is the next one to add, or left out.
 
         Raises:
             InputError: its pictures have another size than those before, or the calibration does not fit them.
         """
         end_s = time.perf_counter() + budget_s
-        reading = self._reader.submit(self._prepared, pair)
+        ahead, self._ahead = self._ahead, None
+        clip = ahead[1] if ahead is not None and ahead[0] is pair else self._reader.submit(self._tissue, pair)
+        reading = self._reader.submit(self._prepared, pair, clip)
         try:
             self._rehearse(reading)
             ready = reading.result()
             if isinstance(ready, Added):
                 return ready
+            following = coming()
+            if following is not None:
+                self._ahead = following, self._reader.submit(self._tissue, following)
             if self._window is None or ready.carried is None:
                 return self._begin(ready, end_s)
             self._go_on(self._window, ready.moment, ready.carried)
@@ -249,14 +256,20 @@ class Follower:
                 self._trusted.look(window)
             self._version += 1
 
-    def _prepared(self, pair: FeedPair) -> _Ready | Added:
-        """What can be computed of a pair without the model, or why it is not used."""
+    def _tissue(self, pair: FeedPair) -> DepthClip | Added:
+        """The clip of one frame that a pair gives, or why it is not used."""
         with one_opencv_thread():
             clip = self.read(pair)
             if clip is None:
                 return Added.NO_SCENE
-            if not self._is_tissue(clip):
-                return Added.NO_TISSUE
+            return clip if self._is_tissue(clip) else Added.NO_TISSUE
+
+    def _prepared(self, pair: FeedPair, read: Future[DepthClip | Added]) -> _Ready | Added:
+        """What can be computed of a pair without the model, or why it is not used."""
+        clip = read.result()
+        if isinstance(clip, Added):
+            return clip
+        with one_opencv_thread():
             window = self._window
             if window is not None and self.settings.camera == "moving":
                 placed = self._placer.placed(clip)
@@ -307,7 +320,7 @@ class Follower:
         self._keep(self._scene_of(window, count + 1))  # one more frame: no gap is between them
         with self._lock:
             window.give_up()
-        self._eyes.follow_range(window.newest.clip)
+        self._reader.submit(self._eyes.follow_range, window.newest.clip)
 
     def _keep(self, segment: TrainedScene) -> None:
         """Add a segment, and forget those before keep_s."""

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -30,6 +31,8 @@ from intrasplat.splat.backend import CPU, Device
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
+COMING_S = 0.02
+"""Longest wait for the pair that is read while the one before it is learnt."""
 IDLE_S = 0.1
 """Between looks at a source that is paused or has ended."""
 WINDOW_S = 5.0
@@ -94,6 +97,7 @@ class FeedModel:
         self._trouble: Trouble | None = None
         self._closed = False
         self._used = self._given = 0
+        self._coming: FeedPair | None = None
         self._used_at: deque[float] = deque()
         self._steps: deque[int] = deque(maxlen=JUDGED_PAIRS)
         self._over_s: deque[float] = deque(maxlen=JUDGED_PAIRS)
@@ -169,7 +173,7 @@ class FeedModel:
         failures, after = 0, 0
         while not self._closed:
             try:
-                pair = self._source.newest(after, POLL_S)
+                pair, self._coming = self._coming or self._source.newest(after, POLL_S), None
                 self._past.prune()
                 if pair is None:
                     if self._watch is not None and self._source.state is FeedState.ENDED:
@@ -191,7 +195,7 @@ class FeedModel:
         """Learn a pair."""
         follower = self._follower or self._begun()
         before, budget_s, start_s = follower.iteration, self._budget(), time.perf_counter()
-        became = follower.add(pair, budget_s)
+        became = follower.add(pair, budget_s, partial(self._next, pair.sequence))
         if became is not Added.NO_SCENE or self._used:  # without a scene so far, the calibration may be wrong
             self._saw(pair, is_tissue=became not in (Added.NO_TISSUE, Added.NO_SCENE))
         if became not in (Added.FIRST, Added.FOLLOWED, Added.RESTARTED):
@@ -206,6 +210,11 @@ class FeedModel:
             self._trouble = None
             self.changed.notify_all()
         self._choose_width(pair.left.shape[1])
+
+    def _next(self, after: int) -> FeedPair | None:
+        """The newest pair, to be read while the one before it is learnt."""
+        self._coming = self._source.newest(after, COMING_S)
+        return self._coming
 
     def _is_tissue(self, pair: FeedPair) -> bool:
         """Whether a pair is to be learnt, by its colours."""

@@ -143,6 +143,20 @@ def test_the_same_pairs_and_steps_give_the_same_bits() -> None:
     assert all(bool((first[name] == second[name]).all()) for name in first)
 
 
+def test_a_pair_may_be_read_while_the_one_before_is_learnt() -> None:
+    phantom = _phantom("breathing")
+    pairs = [_pair(phantom, number) for number in range(4)]
+    plain, ahead = (Follower(phantom.settings.calibration, SETTINGS) for _ in range(2))
+    unused = _pair(phantom, 8)
+    for number, pair in enumerate(pairs):
+        plain.add(pair)
+        ahead.add(pair, coming=iter([pairs[2] if number == 1 else unused]).__next__)
+    found, expected = (each.scene_at() or pytest.fail("there is a scene") for each in (ahead, plain))
+    assert found[0].frame_count == len(pairs)
+    tensors = expected[0].tensors()
+    assert all(bool((each == tensors[name]).all()) for name, each in found[0].tensors().items())
+
+
 def test_the_past_and_the_model_are_bounded() -> None:
     phantom = _phantom("breathing", ("pan",))
     follower = Follower(phantom.settings.calibration, replace(SETTINGS, steps=2, keep_s=3.0))
