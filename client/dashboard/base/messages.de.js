@@ -350,7 +350,7 @@ export const DE = {
     "tracks": "Wo jeder Punkt mit der Zeit ist, für NumPy",
     "ply-zip": "Splats jedes Bildes, in mm",
     "scene": "Für den Import in einer anderen Installation",
-    "html": "Eine Seite, die ohne Dienst läuft",
+    "html": "Eine Seite, die ohne Dienst läuft, mit kleinen Aufnahmen",
     "tum": "Der Weg des Endoskops"
   },
   "file": {
@@ -361,9 +361,11 @@ export const DE = {
     "time": "Zeit",
     "seconds": "{now} s von {all} s",
     "home": "Wie das Endoskop sie sah",
+    "compare": "Mit der Aufnahme vergleichen",
+    "model_steady": "Modell, in gleichbleibendem Licht",
     "marked": "Schraffieren, was kein Bild gesehen hat",
     "about": "Was das ist",
-    "keys": "Ziehen oder Pfeiltasten drehen, das Rad oder + und - bringen näher, Pos1 kehrt zum Endoskop zurück, die Leertaste spielt ab.",
+    "keys": "Ziehen oder Pfeiltasten drehen, das Rad oder + und - bringen näher, Pos1 kehrt zum Endoskop zurück, die Leertaste spielt ab, c vergleicht mit der Aufnahme.",
     "opening": "Die Szene wird geöffnet.",
     "slow": "Die Szene wird geöffnet. Dieser Browser zeichnet ohne Grafikkarte: Jedes Bild dauert Sekunden.",
     "no_webgl2": "Dieser Browser hat kein WebGL2, das zum Zeichnen nötig ist. Öffnen Sie die Datei in einem aktuellen Chromium, Firefox oder Safari.",
@@ -376,6 +378,11 @@ export const DE = {
     "fact_frames": "Clip",
     "fact_gaussians": "Gaußfunktionen",
     "fact_size": "Größe der Szene",
+    "fact_recorded": "Bilder der Aufnahme",
+    "recorded_in": "in dieser Datei, {size} MB: Sie zeigen das Gewebe des Patienten und die Instrumente",
+    "recorded_off": "nicht in dieser Datei: Sie wurden weggelassen",
+    "recorded_large": "nicht in dieser Datei: {size} MB sind zu viele",
+    "recorded_none": "nicht in dieser Datei: Die Szene bewahrt keine auf",
     "fact_quality": "Ähnlichkeit auf zurückgehaltenen Bildern"
   },
   "report": {
@@ -841,6 +848,7 @@ export const DE = {
     "title": "Teilen",
     "link": "Link zu dieser Ansicht",
     "moves": "Spielt und pendelt beim Öffnen",
+    "frames": "Mit den Bildern der Aufnahme, wenn sie klein genug für eine Datei sind. Sie zeigen das Gewebe des Patienten und die Instrumente.",
     "file": "Als eine Datei speichern (.html)",
     "copied": "Der Link ist kopiert.",
     "by_hand": "Der Link ist markiert: Kopieren Sie ihn mit Strg+C.",

@@ -350,7 +350,7 @@ export const EN = {
     "tracks": "Where each point is over time, for NumPy",
     "ply-zip": "Splats of every frame, in mm",
     "scene": "To be imported by another installation",
-    "html": "A page that opens without a service",
+    "html": "A page that opens without a service, with small recordings",
     "tum": "The endoscope's path"
   },
   "file": {
@@ -361,9 +361,11 @@ export const EN = {
     "time": "Time",
     "seconds": "{now} s of {all} s",
     "home": "As the endoscope saw it",
+    "compare": "Compare with the recording",
+    "model_steady": "model, in steady light",
     "marked": "Hatch what no frame saw",
     "about": "What this is",
-    "keys": "Drag or arrow keys turn, the wheel or + and - approach, Home returns to the endoscope, space plays.",
+    "keys": "Drag or arrow keys turn, the wheel or + and - approach, Home returns to the endoscope, space plays, c compares with the recording.",
     "opening": "The scene is opening.",
     "slow": "The scene is opening. This browser draws without a graphics card: each picture takes seconds.",
     "no_webgl2": "This browser has no WebGL2, which drawing needs. Open the file in a current Chromium, Firefox or Safari.",
@@ -376,6 +378,11 @@ export const EN = {
     "fact_frames": "Clip",
     "fact_gaussians": "Gaussians",
     "fact_size": "Size of the scene",
+    "fact_recorded": "Recorded frames",
+    "recorded_in": "in this file, {size} MB: they show the patient's tissue and the instruments",
+    "recorded_off": "not in this file: they were left out",
+    "recorded_large": "not in this file: {size} MB are too many",
+    "recorded_none": "not in this file: the scene keeps none",
     "fact_quality": "Likeness on frames that were held out"
   },
   "report": {
@@ -841,6 +848,7 @@ export const EN = {
     "title": "Share",
     "link": "Link to this view",
     "moves": "It opens playing and rocking",
+    "frames": "With the recorded frames, if they are small enough for one file. They show the patient's tissue and the instruments.",
     "file": "Save as one file (.html)",
     "copied": "The link is copied.",
     "by_hand": "The link is selected: copy it with Ctrl+C.",
