@@ -39,10 +39,9 @@ PNG_COMPRESSION = 1
 
 FALSE_COLOURS = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 1, 3)[:, :, ::-1].copy()
 """The false colours [256, 1, 3] in OpenCV's order, BGR."""
-_ENDS = np.frombuffer(ERROR_COLOURS, np.uint8).reshape(3, 3)
-SIGNED_COLOURS = np.stack(
-    [np.rint(np.interp(np.arange(256), (0, 127.5, 255), each)).astype(np.uint8) for each in _ENDS.T[::-1]], axis=-1
-)[:, None]
+_ENDS = np.frombuffer(ERROR_COLOURS, np.uint8).reshape(3, 3)[:, ::-1]
+_CHANNELS = [np.interp(np.arange(256), (0, 127.5, 255), each) for each in _ENDS.T]
+SIGNED_COLOURS = np.asarray(np.rint(np.stack(_CHANNELS, axis=-1))[:, None], np.uint8)
 """The false colours of errors, from -1 to 1, likewise."""
 
 
@@ -108,7 +107,8 @@ def _encode_error(levels: NDArray[np.float32], image_format: ImageFormat, qualit
         return _npy(np.abs(levels))
     missing, known = np.isnan(levels), np.asarray(np.nan_to_num(levels), np.float32)
     if image_format in FOR_EYES:
-        coloured = _coloured((known / np.float32(BRIGHTEST_ERROR) + 1) / 2, SIGNED_COLOURS)
+        shares = np.asarray((known / BRIGHTEST_ERROR + 1) / 2, np.float32)
+        coloured = _coloured(shares, SIGNED_COLOURS)
         return _image(hatched(coloured, missing), image_format, quality)
     return _image(np.rint(np.abs(known)).astype(np.uint8), image_format, quality)
 
