@@ -1,5 +1,5 @@
-"""Write dashboard/base/wire.js: the service's types, the options' choices and limits, and the false colours of depth
-and confidence, generated from contract/wire.
+"""Write dashboard/base/wire.js: the service's types, the options' choices and limits, and the false colours,
+generated from contract/wire.
 
 python -m client.generate_page
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from client.generate_models import definitions
-from intrasplat.colours import COLOUR_TABLE
+from intrasplat.colours import COLOUR_TABLE, ERROR_COLOURS
 from intrasplat.options import JobOptions
 from intrasplat.picture import BRIGHTEST_ERROR
 
@@ -47,8 +47,10 @@ def generate() -> str:
     colours = "".join(f'  "{COLOUR_TABLE[i : i + TABLE_ROW].hex()}",\n' for i in range(0, len(COLOUR_TABLE), TABLE_ROW))
     about = "/** The colours of intrasplat/colours.py, RRGGBB. */\n"
     table = f'{about}export const COLOUR_TABLE = [\n{colours}].join("");\n'
-    about = "/** Levels of the brightest colour of layer error. */\n"
+    about = "/** Levels of the brightest colours of layer error. */\n"
     error = f"{about}export const BRIGHTEST_ERROR = {BRIGHTEST_ERROR};\n"
+    ends = json.dumps([f"#{ERROR_COLOURS[i : i + 3].hex()}" for i in range(0, len(ERROR_COLOURS), 3)])
+    error += f"/** The colours of errors: darker, as bright, brighter. */\nexport const ERROR_COLOURS = {ends};\n"
     return f"{HEAD}\n{types}\n{limits}\n{table}\n{error}"
 
 

@@ -1,7 +1,7 @@
-"""The false colours of depth and confidence, the same in rendered pictures and on the page.
+"""The false colours of depth, confidence and error, the same in rendered pictures and on the page.
 
-The colour map is cividis (Nunez, Anderson and Renslow 2018): its lightness rises evenly, and colour-blind people see
-the same order. Near depth is bright, and high confidence is bright.
+COLOUR_TABLE is cividis (Nunez, Anderson and Renslow 2018): its lightness rises evenly, and colour-blind people see
+the same order. Near depth is bright, and high confidence is bright. ERROR_COLOURS are for signed numbers.
 """
 
 from __future__ import annotations
@@ -26,3 +26,7 @@ COLOUR_TABLE = bytes.fromhex(
 )
 """256 colours, R G B of 8 bit each, from 0 (dark) to 1 (bright). tests/intrasplat/test_colours.py compares them with
 matplotlib's."""
+
+ERROR_COLOURS = bytes.fromhex("6cc6ff 1c1c1c ffa94d")
+"""Three colours, R G B: where a model is much darker than the recording, as bright, much brighter. Those between are
+linear. The ends are equally light, and colour-blind people tell blue and orange apart."""

@@ -15,8 +15,12 @@ from typing import ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from intrasplat.errors import InputError, MissingExtraError
+from intrasplat.names import Keep
 
 VideoView = Literal["endoscope", "orbit", "rock", "stereo"]
+MAX_RECORDED_BYTES = 16_000_000
+"""Recorded frames of at most so many bytes are put into a page by default. With a scene of a few megabytes, the page is
+then about as large as mail servers take."""
 FORMAT_REMEDY = "docs/export.md lists the formats and their options."
 
 
@@ -51,6 +55,11 @@ class ExportOptions(BaseModel):
         le=50,
         allow_inf_nan=False,
         description="distance of the eyes of view=stereo in mm (default: the endoscope's own)",
+    )
+    recorded: Keep | None = Field(
+        default=None,
+        description="for a page, the recorded frames, which show the patient's tissue and the instruments: on: put "
+        f"them in; off: leave them out (default: on if they have at most {MAX_RECORDED_BYTES // 10**6} MB)",
     )
 
     def given(self) -> dict[str, object]:
@@ -101,7 +110,11 @@ EXPORT_FORMATS = {
     "webm": ExportFormat(".webm", "video/webm", _VIDEO, "a video without instruments (VP8)"),
     "mp4": ExportFormat(".mp4", "video/mp4", _VIDEO, "a video without instruments (H.264; else VP9)"),
     "html": ExportFormat(
-        ".html", "text/html", (), "a page with player and scene that opens from a disk", is_stored=True
+        ".html",
+        "text/html",
+        ("recorded",),
+        "a page with player, scene and recorded frames that opens from a disk",
+        is_stored=True,
     ),
     "scene": ExportFormat(
         ".scene.zip", "application/zip", (), "the scene itself, to be imported elsewhere", is_stored=True

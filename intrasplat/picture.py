@@ -13,7 +13,7 @@ MAX_JUDGED_PIXELS = 1 << 21
 
 
 BRIGHTEST_ERROR = 32
-"""Levels of 255 of the brightest false colour of layer error; more looks the same."""
+"""Levels of 255 of the brightest false colours of layer error, darker or brighter; more looks the same."""
 
 
 class Layer(StrEnum):

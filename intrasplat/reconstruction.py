@@ -174,6 +174,7 @@ class Scene:
         every: int | None = None,
         view: str | None = None,
         baseline_mm: float | None = None,
+        recorded: str | None = None,
     ) -> Path:
         """Write the scene as a file for other programs.
 
@@ -184,6 +185,8 @@ class Scene:
             every: for formats over time: use every n-th frame.
             view: for a video: endoscope, orbit or stereo.
             baseline_mm: distance between the eyes, for view="stereo".
+            recorded: for a page: "on" puts in the recorded frames, which show the patient's tissue and the instruments;
+                "off" leaves them out; None: in, if they are small.
 
         Returns:
             The path of the file.
@@ -202,9 +205,10 @@ class Scene:
         if name is None:
             endings = ", ".join(dict.fromkeys(each.suffix for each in EXPORT_FORMATS.values()))
             raise InputError("path", f"{target.name!r} has no known ending.", f"Use {endings}, or name a format.")
-        chosen = check_export(name, {"t": t, "every": every, "view": view, "baseline_mm": baseline_mm})
+        given = {"t": t, "every": every, "view": view, "baseline_mm": baseline_mm, "recorded": recorded}
+        chosen = check_export(name, given)
         if EXPORT_FORMATS[name].is_stored:
-            parts = stored_parts(name, self._folder, None, installed_dashboard())
+            parts = stored_parts(name, self._folder, None, installed_dashboard(), recorded=chosen.recorded)
         else:
             parts = export_parts(self.trained, name, chosen, choose_device(self._device))
         unfinished = target.with_name(f".{target.name}.part")

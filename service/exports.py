@@ -79,8 +79,8 @@ async def export_scene(
     An export that fails after its first bytes is cut off, so that its transfer is not complete.
     """
     if query.format in EXPORT_FORMATS and EXPORT_FORMATS[query.format].is_stored:
-        check_export(query.format, query.model_dump(exclude={"format"}))
-        return await _stored(scene_id, query.format, services, caller)
+        options = check_export(query.format, query.model_dump(exclude={"format"}))
+        return await _stored(scene_id, query.format, options, services, caller)
     shown = await find_finished(services, caller, scene_id)
     request = _request_of(shown, query)
     await run_in_threadpool(services.audit.record, AuditAction.EXPORTED, caller, scene_id)
@@ -144,13 +144,13 @@ def _request_of(shown: Shown, query: ExportQuery) -> ExportRequest:
     )
 
 
-async def _stored(scene_id: str, name: str, services: Deps, caller: Caller) -> Response:
+async def _stored(scene_id: str, name: str, options: ExportOptions, services: Deps, caller: Caller) -> Response:
     """The stored file of a format that needs no worker."""
     caller.require(KeyScope.DOWNLOAD)
     record = await run_in_threadpool(finished_job, services, caller, scene_id)
     folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
     dashboard, label = services.settings.dashboard_dir, record.labels.label
-    parts = await run_in_threadpool(stored_parts, name, folder, scene_id, dashboard, label)
+    parts = await run_in_threadpool(stored_parts, name, folder, scene_id, dashboard, label, options.recorded)
     await run_in_threadpool(services.audit.record, AuditAction.DOWNLOADED, caller, scene_id)
     file_name = file_stem(record) + EXPORT_FORMATS[name].suffix
     headers = {"Content-Disposition": attachment(file_name), "Cache-Control": "no-store"}

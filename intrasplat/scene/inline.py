@@ -15,7 +15,8 @@ from pathlib import Path
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.{1,2}/[^"]+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export ((?:async )?function|class|const) (\w+)", re.MULTILINE)
 _WORKER = re.compile(r'new Worker\(new URL\("(\./[^"]+)", import\.meta\.url\), \{ type: "module" \}\)')
-_OTHER = re.compile(r"^\s*(?:import|export)\b(?!:).*|(?<!\{)\bimport(?:\(|\.meta).*", re.MULTILINE)
+_COMMENT = re.compile(r"^\s*/\*\*.*?\*/", re.MULTILINE | re.DOTALL)
+_OTHER = re.compile(r"^\s*(?:import|export)\b(?!:).*|\bimport(?:\(|\.meta).*", re.MULTILINE)
 _ENDS_SCRIPT = re.compile(r"</script|<!--", re.IGNORECASE)
 
 START_WORKER = """\
@@ -78,6 +79,9 @@ class _Bundle:
 
         exports = [found.group(2) for found in _EXPORT.finditer(source)]
         text = _EXPORT.sub(r"\1 \2", _WORKER.sub(worker, _IMPORT.sub(imported, source)))
-        if other := _OTHER.search(_WORKER.sub("", _EXPORT.sub("", _IMPORT.sub("", source)))):
+        rest = source
+        for known in (_COMMENT, _IMPORT, _EXPORT, _WORKER):  # types in comments are imported, too
+            rest = known.sub("", rest)
+        if other := _OTHER.search(rest):
             raise CannotInlineError(f"{path.name} has a form that is not understood: {other.group().strip()[:80]}")
         return f"{text.rstrip()}\nreturn {{ {', '.join(exports)} }};\n"

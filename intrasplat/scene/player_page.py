@@ -1,7 +1,7 @@
 """A scene and the page's player in one HTML file, which opens from a disk without a server or a network.
 
-The page is in the dashboard's folder `file/`. Its style, its script with all modules, and the scene are inserted. Its
-content security policy allows nothing else.
+The page is in the dashboard's folder `file/`. Inserted are its styles, its script with all modules, the scene, and
+recorded frames where they are wanted. Its content security policy allows nothing else.
 """
 
 from __future__ import annotations
@@ -9,19 +9,26 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from zipfile import ZipInfo
 
 from intrasplat.errors import InputError, LimitError, SceneError, UnavailableError
-from intrasplat.names import MANIFEST, REPORT, SCENE
+from intrasplat.formats import MAX_RECORDED_BYTES
+from intrasplat.names import DETAIL, MANIFEST, REPORT, SCENE, Keep
 from intrasplat.scene.inline import CannotInlineError, inlined
+from intrasplat.scene.recorded_file import read_files, seam_files
 from intrasplat.version import version
 
-PAGE, STYLE, SCRIPT = "alone.html", "alone.css", "alone.js"
+PAGE, SCRIPT = "alone.html", "alone.js"
+STYLE_TAG = re.compile(r'<link rel="stylesheet" href="([^"]+)">')
 CHARSET = '<meta charset="utf-8">'
 SCENE_TAG = '<script type="text/plain" id="scene">'
+VIDEO_TAG = '<script type="text/plain" id="video">'
 DRAWN = ("compact", "shared")
 """Coding and kind of motion of the scenes that the player draws."""
 MAX_SCENE_BYTES = 256 << 20
@@ -30,12 +37,33 @@ PIECE_BYTES = 3 << 18  # a multiple of 3: base64 of it ends on a whole character
 DASHBOARD_REMEDY = "Set INTRASPLAT_DASHBOARD_DIR to the page's files, the folder client/dashboard."
 
 
-def page_parts(folder: Path, scene_id: str | None, dashboard_dir: Path | None) -> Iterator[bytes]:
+@dataclass(frozen=True)
+class _Recorded:
+    """A scene's recorded frames in a page.
+
+    size    bytes of those that there are
+    state   in: they are in the page; off, large, none: why they are not
+    video   detail.mkv; None: not in the page
+    files   of recorded.zip in the page
+    """
+
+    size: int
+    state: Literal["in", "off", "large", "none"]
+    video: Path | None = None
+    files: tuple[ZipInfo, ...] = ()
+
+
+def page_parts(
+    folder: Path, scene_id: str | None, dashboard_dir: Path | None, recorded: Keep | None = None
+) -> Iterator[bytes]:
     """The HTML file of the scene in a folder, piece by piece.
 
+    Args:
+        recorded: whether the recorded frames are put in; None: if they have at most MAX_RECORDED_BYTES.
+
     Raises, before the first piece:
-        InputError: the player does not draw scenes of this kind.
-        LimitError: the scene is too large for one file.
+        InputError: the player does not draw scenes of this kind, or the scene has no recorded frames.
+        LimitError: scene and recorded frames are too large for one file.
         SceneError: there is no scene, or its manifest cannot be read.
         UnavailableError: the page's files are missing.
     """
@@ -51,42 +79,65 @@ def page_parts(folder: Path, scene_id: str | None, dashboard_dir: Path | None) -
     if size > MAX_SCENE_BYTES:
         problem = f"the scene has {size} bytes; one file holds {MAX_SCENE_BYTES}."
         raise LimitError("format", problem, "Export it as scene.")
+    frames = _recorded_frames(folder, recorded, MAX_SCENE_BYTES - size)
     about = {
         "sceneId": scene_id,
         "version": version(),
         "exportedAtMs": round(1000 * time.time()),
         "sceneBytes": size,
+        "recorded": {"bytes": frames.size, "state": frames.state},
         "psnrDb": report.get("psnr_tissue_db"),
         "warnings": [{"code": each["code"], "text": each["text"]} for each in report.get("warnings", ())],
     }
-    head, tail = _page(dashboard_dir, {"manifest": manifest, "about": about})
-    return _written(head, folder / SCENE, tail)
+    contents = read_files(folder, frames.files)
+    pictures = {name: base64.b64encode(content).decode() for name, content in contents.items()}
+    page = _page(dashboard_dir, {"manifest": manifest, "about": about, "pictures": pictures})
+    return _written(page, {SCENE_TAG: folder / SCENE, VIDEO_TAG: frames.video})
 
 
-def _written(head: str, scene: Path, tail: str) -> Iterator[bytes]:
-    yield head.encode()
-    with scene.open("rb") as file:
-        while piece := file.read(PIECE_BYTES):
-            yield base64.b64encode(piece)
-    yield tail.encode()
+def _recorded_frames(folder: Path, recorded: Keep | None, max_bytes: int) -> _Recorded:
+    """The recorded frames that go into the page; raises as page_parts()."""
+    video = folder / DETAIL if (folder / DETAIL).is_file() else None
+    files = seam_files(folder)
+    size = sum(each.file_size for each in files) + (video.stat().st_size if video else 0)
+    if recorded == "on" and size == 0:
+        raise InputError("recorded", "this scene has no recorded frames.", "Leave it out.")
+    if recorded == "on" and size > max_bytes:
+        problem = f"the recorded frames have {size} bytes; in one file there is space for {max_bytes}."
+        raise LimitError("recorded", problem, "Add recorded=off.")
+    if size == 0 or recorded == "off":
+        return _Recorded(size, "off" if size else "none")
+    if recorded is None and size > min(max_bytes, MAX_RECORDED_BYTES):
+        return _Recorded(size, "large")
+    return _Recorded(size, "in", video, files)
 
 
-def _page(dashboard_dir: Path | None, documents: dict[str, object]) -> tuple[str, str]:
-    """The page before and after the scene's bytes."""
+def _written(page: str, inserted: Mapping[str, Path | None]) -> Iterator[bytes]:
+    """The page with a file in base64 behind each tag, in their order."""
+    for tag, path in inserted.items():
+        head, _, page = page.partition(tag)
+        yield f"{head}{tag}".encode()
+        if path is None:
+            continue
+        with path.open("rb") as file:
+            while piece := file.read(PIECE_BYTES):
+                yield base64.b64encode(piece)
+    yield page.encode()
+
+
+def _page(dashboard_dir: Path | None, documents: Mapping[str, object]) -> str:
+    """The page with documents, and with tags for scene and video."""
     if dashboard_dir is None:
         raise UnavailableError("The page's files are not known here.", DASHBOARD_REMEDY)
     folder = dashboard_dir / "file"
     try:
-        page, style, script = (
-            (folder / PAGE).read_text(encoding="utf-8"),
-            (folder / STYLE).read_text(encoding="utf-8"),
-            inlined(folder / SCRIPT),
-        )
+        page, script = (folder / PAGE).read_text(encoding="utf-8"), inlined(folder / SCRIPT)
+        styles = [(folder / each).read_text(encoding="utf-8") for each in STYLE_TAG.findall(page)]
     except (OSError, CannotInlineError) as error:
         problem = f"The page's files cannot be put into one ({type(error).__name__})."
         raise UnavailableError(problem, DASHBOARD_REMEDY) from error
     policy = (
-        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; worker-src blob:; "
+        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(''.join(styles))}; worker-src blob:; "
         "base-uri 'none'; form-action 'none'"
     )
     data = "".join(
@@ -95,15 +146,17 @@ def _page(dashboard_dir: Path | None, documents: dict[str, object]) -> tuple[str
     )
     parts = {
         CHARSET: f'{CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">',
-        f'<link rel="stylesheet" href="{STYLE}">': f"<style>{style}</style>",
-        f'<script type="module" src="{SCRIPT}"></script>': f"{data}{SCENE_TAG}</script>\n<script>{script}</script>",
+        "</head>": f"<style>{''.join(styles)}</style>\n</head>",
+        f'<script type="module" src="{SCRIPT}"></script>': (
+            f"{data}{SCENE_TAG}</script>\n{VIDEO_TAG}</script>\n<script>{script}</script>"
+        ),
     }
+    page = STYLE_TAG.sub("", page)
     for before, after in parts.items():
         if page.count(before) != 1:
             raise UnavailableError(f"The page's file {PAGE} has no {before}.", DASHBOARD_REMEDY)
         page = page.replace(before, after)
-    head, opening, tail = page.partition(SCENE_TAG)
-    return head + opening, tail
+    return page
 
 
 def _hash(text: str) -> str:

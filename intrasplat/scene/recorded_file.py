@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -72,7 +72,40 @@ def read_frame(folder: Path, frame_count: int, t: float, eye: Eye = "left", kind
     except FileNotFoundError:
         raise _no_recorded_frames() from None
     except (OSError, ValueError, LookupError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).") from error
+        raise _unreadable(error) from error
+
+
+def seam_files(folder: Path) -> tuple[zipfile.ZipInfo, ...]:
+    """Entries of recorded.zip for a comparison with the left eye, beside detail.mkv: its pictures, and its masks; both
+    eyes' masks if there is a video. (): the scene has none.
+
+    Raises:
+        SceneError: a file is damaged.
+    """
+    eyes = EYES if (folder / DETAIL).is_file() else EYES[:1]
+    kinds = {(eye, MASK) for eye in eyes} | {(EYES[0], PICTURE)}
+    try:
+        with zipfile.ZipFile(folder / RECORDED) as archive:
+            named = ((NAME.fullmatch(entry.filename), entry) for entry in archive.infolist())
+            found = tuple(entry for match, entry in named if match and match.group(1, 3) in kinds)
+            if any(each.compress_type != zipfile.ZIP_STORED or each.file_size > MAX_FRAME_BYTES for each in found):
+                raise zipfile.BadZipFile
+            return found
+    except FileNotFoundError:
+        return ()
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise _unreadable(error) from error
+
+
+def read_files(folder: Path, entries: Collection[zipfile.ZipInfo]) -> dict[str, bytes]:
+    """Contents of entries of seam_files(), by name. Raises as it does."""
+    if not entries:
+        return {}
+    try:
+        with zipfile.ZipFile(folder / RECORDED) as archive:
+            return {entry.filename: archive.read(entry) for entry in entries}
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise _unreadable(error) from error
 
 
 def complete_zip(folder: Path) -> BinaryIO:
@@ -95,7 +128,7 @@ def complete_zip(folder: Path) -> BinaryIO:
             for each in stored.infolist():
                 archive.writestr(zipfile.ZipInfo(each.filename), stored.read(each))
     except (ValueError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).") from error
+        raise _unreadable(error) from error
     content.seek(0)
     return content
 
@@ -129,6 +162,10 @@ def _run(path: Path, changed_ns: int, eye: int, run: int) -> dict[int, bytes]:
     """The pictures of an eye from a key frame to the next, as JPEG."""
     video = RecordedVideo(path)
     return {frame: video.jpeg(eye, frame) for frame in video.frames[run * KEY_EVERY : (run + 1) * KEY_EVERY]}
+
+
+def _unreadable(error: Exception) -> SceneError:
+    return SceneError(f"The recorded frames of this scene cannot be read ({type(error).__name__}).")
 
 
 def _no_recorded_frames() -> SceneError:

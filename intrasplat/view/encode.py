@@ -5,9 +5,9 @@ rgb         8 bit                       uint8 [H, W, 3]       8 bit
 depth       16 bit, 0.01 mm, 0 invalid  float32 mm [H, W]     false colour, near bright, invalid black
 confidence  8 bit, 255 = 1              float32 [H, W]        false colour, high bright
 smoke       8 bit, 255 = 1              float32 [H, W]        false colour, thick bright
-error       8 bit, levels               float32 levels, NaN   false colour, BRIGHTEST_ERROR levels bright
+error       8 bit, levels               float32 levels, NaN   false colour, darker blue, brighter orange
 
-False colours are those of intrasplat/colours.py.
+False colours are those of intrasplat/colours.py; those of errors end at BRIGHTEST_ERROR levels.
 
 If unseen pixels are marked, rgb and all false colours show a hatch there, and exact files of the other layers are 0.
 Where nothing is compared, an error is NaN, 0 in png, and hatched.
@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from intrasplat.colours import COLOUR_TABLE
+from intrasplat.colours import COLOUR_TABLE, ERROR_COLOURS
 from intrasplat.picture import BRIGHTEST_ERROR, ImageFormat, Layer, Unseen
 from intrasplat.view.unseen import hatched
 
@@ -39,6 +39,10 @@ PNG_COMPRESSION = 1
 
 FALSE_COLOURS = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 1, 3)[:, :, ::-1].copy()
 """The false colours [256, 1, 3] in OpenCV's order, BGR."""
+_ENDS = np.frombuffer(ERROR_COLOURS, np.uint8).reshape(3, 3)[:, ::-1]
+_CHANNELS = [np.interp(np.arange(256), (0, 127.5, 255), each) for each in _ENDS.T]
+SIGNED_COLOURS = np.asarray(np.rint(np.stack(_CHANNELS, axis=-1))[:, None], np.uint8)
+"""The false colours of errors, from -1 to 1, likewise."""
 
 
 class Layers(Protocol):
@@ -75,7 +79,7 @@ def encode_layer(
     Args:
         quality: 1 to 100, for jpeg and webp.
         depth_range_mm: nearest and farthest depth of the false colours; jpeg and webp of depth need it.
-        error: [H, W] levels, NaN where nothing is compared (error.py); layer error needs it.
+        error: [H, W] signed levels, NaN where nothing is compared (error.py); layer error needs it.
     """
     if layer is Layer.ERROR:
         if error is None:
@@ -100,11 +104,13 @@ def encode_layer(
 
 def _encode_error(levels: NDArray[np.float32], image_format: ImageFormat, quality: int) -> bytes:
     if image_format is ImageFormat.NPY:
-        return _npy(levels)
+        return _npy(np.abs(levels))
     missing, known = np.isnan(levels), np.asarray(np.nan_to_num(levels), np.float32)
     if image_format in FOR_EYES:
-        return _image(hatched(_coloured(known / np.float32(BRIGHTEST_ERROR)), missing), image_format, quality)
-    return _image(np.rint(known).astype(np.uint8), image_format, quality)
+        shares = np.asarray((known / BRIGHTEST_ERROR + 1) / 2, np.float32)
+        coloured = _coloured(shares, SIGNED_COLOURS)
+        return _image(hatched(coloured, missing), image_format, quality)
+    return _image(np.rint(np.abs(known)).astype(np.uint8), image_format, quality)
 
 
 def _values(frame: Layers, layer: Layer) -> NDArray[np.float32]:
@@ -143,10 +149,10 @@ def _in_false_colours(
     return coloured
 
 
-def _coloured(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _coloured(shares: NDArray[np.float32], colours: NDArray[np.uint8] = FALSE_COLOURS) -> NDArray[np.uint8]:
     """BGR uint8 [H, W, 3] of numbers, which are clamped to [0, 1]."""
     steps = np.rint(np.clip(shares, 0, 1) * 255).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(steps, FALSE_COLOURS), np.uint8)
+    return np.asarray(cv2.applyColorMap(steps, colours), np.uint8)
 
 
 def _image(pixels: NDArray[np.uint8] | NDArray[np.uint16], image_format: ImageFormat, quality: int) -> bytes:

@@ -38,6 +38,8 @@ def check_comparable(pose: Pose | None, camera: IntrinsicsOverride) -> None:
 def error_levels(rgb: NDArray[np.uint8], recorded: RecordedPicture, unseen: NDArray[np.bool_]) -> NDArray[np.float32]:
     """[H, W] mean of |model - recorded| over R G B in levels of 255; NaN on instruments and where unseen [H, W] is set.
 
+    It is negative where the model is darker in the mean of R G B. Exact files have no sign (encode.py).
+
     Args:
         rgb: [H, W, 3] of the model.
     """
@@ -46,5 +48,6 @@ def error_levels(rgb: NDArray[np.uint8], recorded: RecordedPicture, unseen: NDAr
     how = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
     true = np.asarray(cv2.resize(recorded.rgb, (width, height), interpolation=how), np.float32)
     tool = cv2.resize(recorded.tool.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    levels = np.abs(rgb.astype(np.float32) - true).mean(axis=2)
+    difference = rgb.astype(np.float32) - true
+    levels = np.copysign(np.abs(difference).mean(axis=2), difference.mean(axis=2))
     return np.where(tool | unseen, np.float32(np.nan), levels).astype(np.float32)

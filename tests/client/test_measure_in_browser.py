@@ -12,7 +12,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select
 
-from intrasplat.colours import COLOUR_TABLE
+from intrasplat.colours import COLOUR_TABLE, ERROR_COLOURS
 from intrasplat.picture import BRIGHTEST_ERROR, Layer
 from intrasplat.report import Recorded
 from tests.cameras import FRAMES
@@ -215,7 +215,11 @@ def test_the_error_against_the_recording_is_offered_where_frames_are_kept_and_ha
     page.until(lambda: "+5" in page.view)
     Select(page.find("#layer")).select_by_value("error")
     page.until_text("#legend", say("legend.error"))
-    assert str(BRIGHTEST_ERROR) in page.text("#legend .high")
+    assert page.text("#legend .low") == say("legend.darker", levels=BRIGHTEST_ERROR)
+    assert page.text("#legend .high") == say("legend.brighter", levels=BRIGHTEST_ERROR)
+    colours = page.script("return getComputedStyle(document.querySelector('#legend .colours')).backgroundImage")
+    ends = [f"rgb({', '.join(map(str, ERROR_COLOURS[i : i + 3]))})" for i in (0, 3, 6)]
+    assert colours == f"linear-gradient(to right, {', '.join(ends)})"
     assert site.painter.asked is not None
     assert (site.painter.asked.layer, site.painter.asked.pose) == (Layer.ERROR, None)  # as recorded
     assert not page.find("#legend .range").is_displayed()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import re
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,17 +14,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from client.page import DASHBOARD
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, SceneError, UnavailableError
+from intrasplat.names import DETAIL, RECORDED
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.inline import CannotInlineError, inlined
+from intrasplat.scene.recorded_file import name_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
+from intrasplat.scene.training_pictures import pictures_of
 from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
 from tests.archives import ORIGIN, small_scene, stored
@@ -30,8 +37,11 @@ from tests.client.page import browser
 from tests.client.player import drawing_browser
 from tests.client.test_accessible_in_browser import RUN
 from tests.client.test_accessible_in_browser import axe as axe
+from tests.client.test_player import LEAST_DB as DETAIL_DB
 from tests.client.test_player import scattered
-from tests.client.words import table
+from tests.client.test_player_detail import SIZE
+from tests.client.test_player_detail import stored as with_recorded_frames
+from tests.client.words import say, table
 from tests.intrasplat.scenes import random_scene
 
 LEAST_DB = 50.0
@@ -83,8 +93,13 @@ def opened(driver: webdriver.Chrome, path: Path, state: str, view: str = "") -> 
 def shown(driver: webdriver.Chrome) -> tuple[NDArray[np.uint8], str]:
     """The picture at rest, RGB, and the notices below it."""
     answer = driver.execute_async_script(RESTS)
-    encoded = np.frombuffer(base64.b64decode(answer["picture"].partition(",")[2]), np.uint8)
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], np.uint8), answer["notices"]
+    return png_of(answer["picture"]), answer["notices"]
+
+
+def png_of(address: str) -> NDArray[np.uint8]:
+    """[H, W, 3] RGB of a picture in a data: address."""
+    encoded = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
 
 
 def text(driver: webdriver.Chrome, css: str) -> str:
@@ -160,6 +175,86 @@ def test_its_controls_move_time_and_camera_and_say_what_is_shown(driver: webdriv
     assert driver.get_log("browser") == []
 
 
+HELD_OUT, SHADE = 1, 90
+RECORDED_PICTURE = "return document.getElementById('recorded').toDataURL('image/png')"
+HAS_DETAIL = "return document.getElementById('picture').hasAttribute('data-detail')"
+
+
+def scene_with_recorded_frames(folder: Path) -> TrainedScene:
+    """Its video has the training frames of both eyes, its zip their masks and a grey frame that was held out."""
+    model = dataclasses.replace(scattered(14, moves=True), trained_t=(0.0, 1 / 3, 2 / 3))
+    scene = with_recorded_frames(folder, model, eyes=2)
+    grey = cv2.imencode(".jpg", np.full((*SIZE[::-1], 3), SHADE, np.uint8))[1].tobytes()
+    with zipfile.ZipFile(folder / RECORDED, "a") as archive:
+        for eye in ("left", "right"):
+            archive.writestr(name_of(eye, HELD_OUT, "jpg"), grey)
+    return scene
+
+
+def recorded_picture(driver: webdriver.Chrome) -> NDArray[np.uint8]:
+    """The recorded frame that is shown, RGB."""
+    return png_of(driver.execute_script(RECORDED_PICTURE))
+
+
+def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
+    driver: webdriver.Chrome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, path = tmp_path / "scene", tmp_path / "scene.html"
+    scene = scene_with_recorded_frames(folder)
+    monkeypatch.setenv(DASHBOARD_VARIABLE, str(DASHBOARD))
+    assert main(["export", str(folder), "--format", "html"]) == ExitCode.OK
+    first = scene.trained_frames[1]
+    opened(driver, path, "shown", f"#t={first / scene.frame_count}&compare=wipe")
+    wait = WebDriverWait(driver, OPENS_WITHIN_S)
+    wait.until(lambda _: driver.execute_script(HAS_DETAIL))
+    drawn, _ = shown(driver)
+    camera = scene.intrinsics.resized(drawn.shape[1], drawn.shape[0])
+    frame = render_frame(load_scene(folder), first / scene.frame_count, None, camera)
+    assert psnr_db(drawn, hatched(frame.rgb, frame.unseen)) >= DETAIL_DB
+
+    expected, tissue = pictures_of(folder).picture(0, first)
+    assert text(driver, "#of-recorded") == say("compare.recorded", frame=first + 1)
+    assert text(driver, "#of-model") == say("compare.model")
+    assert psnr_db(recorded_picture(driver), expected) > 40
+    driver.find_element(By.ID, "tools").click()
+    hatch = recorded_picture(driver)
+    assert hatch[~tissue].max() < 80
+    np.testing.assert_allclose(hatch[tissue].astype(int), expected[tissue], atol=8)
+    seam, box = driver.find_element(By.ID, "seam"), driver.find_element(By.ID, "fitted")
+    drag = ActionChains(driver, 0).move_to_element(seam).click_and_hold()
+    drag.move_by_offset(round(0.25 * box.size["width"]), 0).release().perform()
+    assert abs(int(seam.get_attribute("aria-valuenow") or 0) - 75) <= 1
+    seam.send_keys(Keys.END)
+    assert seam.get_attribute("aria-valuenow") == "100"
+
+    at = "const t = arguments[0]; t.value = arguments[1]; t.dispatchEvent(new Event('input'))"
+    driver.execute_script(at, driver.find_element(By.ID, "time"), str(HELD_OUT / scene.frame_count))
+    wait.until(lambda _: text(driver, "#of-recorded") == say("compare.recorded", frame=HELD_OUT + 1))
+    assert abs(int(np.median(recorded_picture(driver))) - SHADE) <= 2
+    driver.find_element(By.ID, "stage").send_keys("\ue012")  # to the left
+    wait.until(lambda _: text(driver, "#message") == say("compare.turned"))
+    assert not driver.find_element(By.ID, "compare-box").is_displayed()
+    driver.find_element(By.ID, "compare").click()
+    wait.until(lambda _: driver.find_element(By.ID, "recorded").is_displayed())
+    assert "tissue and the instruments" in text(driver, "#facts")
+    assert driver.get_log("browser") == []
+
+    inside = (folder / DETAIL).stat().st_size
+    size = path.stat().st_size
+    assert main(["export", str(folder), "--format", "html", "--recorded", "off"]) == ExitCode.OK
+    assert path.stat().st_size < size - 4 * inside / 3
+    opened(driver, path, "shown", "#compare=wipe")
+    assert TABLE["recorded_off"] in text(driver, "#facts")
+    assert not driver.find_element(By.ID, "compare").is_displayed()
+    monkeypatch.setattr("intrasplat.scene.player_page.MAX_RECORDED_BYTES", inside)
+    large = b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD))
+    assert b'"state": "large"' in large
+    assert len(large) < size - 4 * inside / 3
+    asked = b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD, recorded="on"))
+    assert f'"{name_of("left", HELD_OUT, "jpg")}"'.encode() in asked
+    assert f'"{name_of("right", HELD_OUT, "jpg")}"'.encode() not in asked  # nothing shows it
+
+
 def test_its_policy_lets_nothing_out_and_nothing_in(driver: webdriver.Chrome, file: Path) -> None:
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', file.read_text(encoding="utf-8"))
     rules = dict(each.strip().partition(" ")[::2] for each in policy.split(";"))
@@ -212,6 +307,8 @@ def test_what_cannot_be_shown_so_is_refused_before_anything_is_sent(tmp_path: Pa
     assert refused.value.field == "format"
     with pytest.raises(SceneError):
         stored_parts("html", tmp_path, None, DASHBOARD)
+    with pytest.raises(InputError, match="no recorded frames"):
+        stored_parts("html", stored(tmp_path / "plain", small_scene()), None, DASHBOARD, recorded="on")
     with pytest.raises(UnavailableError, match="INTRASPLAT_DASHBOARD_DIR"):
         stored_parts("html", stored(tmp_path / "scene", small_scene()), None, tmp_path)
 

@@ -25,6 +25,11 @@ def test_a_shared_link_shows_its_picture_before_the_modules_and_plays_and_rocks(
     page.find("#sharing .moves").click()
     assert (page.find("#sharing .link").get_attribute("value") or "").endswith(f"#/scene/{scene}")
     assert page.find("#sharing .file").text == say("share.file")
+    asked = "return performance.getEntriesByType('resource').map(({ name }) => name).join().match(/export.*/)?.[0]"
+    assert page.find("#sharing .frames").is_selected()
+    page.find("#sharing .frames").click()
+    page.find("#sharing .file").click()
+    page.until(lambda: (page.script(asked) or "").startswith("export?format=html&recorded=off"))
     page.find("#sharing .copy").click()
     page.until(lambda: page.text("#sharing .message") in (say("share.copied"), say("share.by_hand")))
 

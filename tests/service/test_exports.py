@@ -102,6 +102,8 @@ def newest_offers(service: ServiceUnderTest, scene: str) -> dict[str, Any]:
         ({"format": "ply", "t": "nan"}, "t"),
         ({"format": "ply", "colour": "red"}, "colour"),
         ({"format": "depth", "every": "two"}, "every"),
+        ({"format": "ply", "recorded": "off"}, "recorded"),
+        ({"format": "html", "recorded": "some"}, "recorded"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_the_worker_is_asked(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from contract.store.shelf import new_job_id
 from contract.store.store import Store
 from contract.wire.rendering import RecordedRequest, RenderRequest
-from intrasplat.colours import COLOUR_TABLE
+from intrasplat.colours import ERROR_COLOURS
 from intrasplat.errors import InputError
 from intrasplat.names import RECORDED, REPORT
 from intrasplat.picture import BRIGHTEST_ERROR, ImageFormat, IntrinsicsOverride, Layer, RecordedMasks
@@ -73,8 +73,12 @@ def test_the_error_is_the_difference_of_model_and_recorded_frame_at_the_frames_o
     np.testing.assert_allclose(found[known], np.abs(model - resized).mean(axis=2)[known], atol=1e-3)
 
     shown = picture(views.answer(asked.model_copy(update={"format": ImageFormat.JPEG, "quality": 100})))
-    steps = np.rint(255 * np.clip(np.nan_to_num(found) / BRIGHTEST_ERROR, 0, 1)).astype(int)
-    colours = np.frombuffer(COLOUR_TABLE, np.uint8).reshape(256, 3)[steps].astype(int)
+    signed = np.nan_to_num(found) * np.sign((model - resized).mean(axis=2)) / BRIGHTEST_ERROR
+    darker, alike, brighter = np.frombuffer(ERROR_COLOURS, np.uint8).reshape(3, 3).astype(float)
+    shares = np.clip(np.abs(signed), 0, 1)[..., None]
+    colours = alike + shares * (np.where(signed[..., None] < 0, darker, brighter) - alike)
+    assert (signed[known] < -0.1).any()
+    assert (signed[known] > 0.1).any()
     inner = cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     assert inner.any()
     assert np.abs(shown[inner] - colours[inner]).mean() < 8  # of the encoder

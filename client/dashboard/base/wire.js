@@ -445,5 +445,7 @@ export const COLOUR_TABLE = [
   "f0d846f1d945f2da44f3db42f5dc41f6dd3ff7de3ef8df3cf9e03afbe138fce236fde334fee434fee535fee636fee838",
 ].join("");
 
-/** Levels of the brightest colour of layer error. */
+/** Levels of the brightest colours of layer error. */
 export const BRIGHTEST_ERROR = 32;
+/** The colours of errors: darker, as bright, brighter. */
+export const ERROR_COLOURS = ["#6cc6ff", "#1c1c1c", "#ffa94d"];

@@ -5,6 +5,8 @@ import { listenToGestures } from "../base/gestures.js";
 import { figure, noticeWords, showWords, words } from "../base/messages.js";
 import { Player } from "../player/player.js";
 import { graphics } from "../player/support.js";
+import { Comparison } from "./comparison.js";
+import { bytesOf, Recording } from "./recording.js";
 
 const DEGREES_A_PIXEL = 0.15;
 const KEY_PIXELS = 20;
@@ -15,6 +17,7 @@ const KEY_ZOOM = 1.1;
 const MAX_ENLARGED = 2;
 /** So long after the last movement the picture is drawn with exactly its own order. */
 const REST_MS = 200;
+const SAID_MS = 10_000;
 const TURNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const ZOOMS = { "+": KEY_ZOOM, "=": KEY_ZOOM, "-": 1 / KEY_ZOOM };
 
@@ -28,16 +31,17 @@ function taken(id) {
   return text;
 }
 
-/** @param {string} text in base64 @returns {ArrayBuffer} */
-function decoded(text) {
-  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text).buffer;
-  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
+/** @param {string} text below the picture, for a while */
+function say(text) {
+  get("message").textContent = text;
+  setTimeout(() => get("message").textContent === text && setText(get("message"), ""), SAID_MS);
 }
 
 class View {
-  /** @param {Player} player */
-  constructor(player) {
+  /** @param {Player} player @param {Comparison | null} comparison null: there are no recorded frames */
+  constructor(player, comparison) {
     this.player = player;
+    this.comparison = comparison;
     this.cameras = player.cameras;
     this.last = (this.cameras.frameCount - 1) / this.cameras.frameCount;
     this.durationS = this.cameras.seconds(this.last);
@@ -47,6 +51,13 @@ class View {
 
   goHome() {
     Object.assign(this, { isHome: true, yaw: 0, pitch: 0, zoom: 1 });
+  }
+
+  /** @param {boolean} isOn whether recording and model are parted by a seam */
+  compare(isOn) {
+    if (!this.comparison || this.comparison.isOn === isOn) return;
+    this.comparison.choose(isOn);
+    if (isOn) this.goHome();
   }
 
   turn(dx, dy) {
@@ -62,6 +73,10 @@ class View {
 
   /** Ask for a picture of what is wanted now; isMoving: another will follow. */
   show(isMoving = false) {
+    if (this.comparison?.isOn && !this.isHome) {
+      this.compare(false);
+      say(words("compare.turned"));
+    }
     clearTimeout(this.rest);
     if (isMoving) this.rest = setTimeout(() => this.show(), REST_MS);
     this.isMoving = isMoving;
@@ -80,8 +95,12 @@ class View {
         this.isWanted = false;
         const { yaw, pitch, zoom } = this;
         const pose = this.isHome ? this.cameras.endoscope(this.t) : this.cameras.orbit(yaw, pitch, zoom);
-        const { warnings } = await this.player.draw({ t: this.t, pose, ...this.#size(), isMarked: get("marked").checked, isMoving: this.isMoving });
-        setText(get("notices"), [...new Set(warnings.map(noticeWords))].join(" "));
+        const view = { t: this.t, pose, ...this.#size(), isMarked: get("marked").checked, isMoving: this.isMoving };
+        let [drawn] = await Promise.all([this.player.draw(view), this.#loadRecorded()]);
+        this.comparison?.draw();
+        setText(get("notices"), [...new Set(drawn.warnings.map(noticeWords))].join(" "));
+        if (!this.isMoving) drawn = await this.#refined(view, drawn);
+        get("picture").toggleAttribute("data-detail", drawn.hasDetail);
       }
     } catch (error) {
       refuse(error);
@@ -90,14 +109,35 @@ class View {
     }
   }
 
+  async #loadRecorded() {
+    try {
+      await this.comparison?.load(this.t);
+    } catch (error) {
+      this.compare(false);
+      say(words("compare.failed", { why: error.message }));
+    }
+  }
+
+  /** Draw what rests with the detail of recorded frames, where there are any. */
+  async #refined(view, drawn) {
+    if (drawn.hasDetail || this.isWanted || this.player.opening === null) return drawn;
+    const isOutdated = () => this.isWanted;
+    try {
+      return await this.player.draw({ ...view, isRefined: true, isOutdated });
+    } catch (error) {
+      if (!isOutdated()) say(words("compare.failed", { why: error.message })); // what is drawn stays
+      return drawn;
+    }
+  }
+
   /** The picture's size in pixels: what fits into the stage, in the clip's shape. */
   #size() {
     const { width, height } = this.cameras.intrinsics;
     const { clientWidth, clientHeight } = get("stage");
     const fitting = Math.min(clientWidth / width, clientHeight / height);
-    const canvas = this.player.canvas;
-    canvas.style.width = `${Math.max(1, Math.floor(width * fitting))}px`;
-    canvas.style.height = `${Math.max(1, Math.floor(height * fitting))}px`;
+    const { style } = get("fitted");
+    style.width = `${Math.max(1, Math.floor(width * fitting))}px`;
+    style.height = `${Math.max(1, Math.floor(height * fitting))}px`;
     return this.cameras.drawnSize(Math.min(fitting * devicePixelRatio, MAX_ENLARGED));
   }
 
@@ -119,11 +159,12 @@ class View {
     if (isPlaying) requestAnimationFrame(step);
   }
 
-  /** The view that the address asks for, after #: t=0.5&orbit=10,0,1. Returns whether it asks for any. */
+  /** The view that the address asks for, after #: t=0.5&orbit=10,0,1, or t=0.5&compare=wipe. */
   read(text) {
     const asked = new URLSearchParams(text.slice(1));
     const t = Number(asked.get("t") ?? NaN);
     if (Number.isFinite(t)) this.t = clamp(t, 0, this.last);
+    this.compare(asked.get("compare") === "wipe");
     const [yaw, pitch, zoom] = (asked.get("orbit") ?? "").split(",").map(Number);
     if (![yaw, pitch, zoom].every(Number.isFinite)) return;
     this.isHome = false;
@@ -138,7 +179,7 @@ function refuse(error) {
   get("message").textContent = words("file.refused", { why: error.message });
 }
 
-function tell({ sceneId, version, exportedAtMs, sceneBytes, psnrDb, warnings }, manifest) {
+function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, psnrDb, warnings }, manifest) {
   const { width, height } = manifest.intrinsics;
   const facts = {
     scene: sceneId ?? "–",
@@ -147,6 +188,7 @@ function tell({ sceneId, version, exportedAtMs, sceneBytes, psnrDb, warnings }, 
     frames: words("file.frames", { frames: manifest.frame_times_s.length, seconds: figure(manifest.frame_times_s.at(-1), 2), width, height }),
     gaussians: figure(manifest.gaussians),
     size: words("file.megabytes", { size: figure(sceneBytes / 1e6, 2) }),
+    recorded: words(`file.recorded_${recorded.state}`, { size: figure(recorded.bytes / 1e6, 2) }),
     quality: psnrDb === null ? "–" : `${figure(psnrDb, 1)} dB`,
   };
   for (const [name, text] of Object.entries(facts)) {
@@ -164,6 +206,10 @@ function listen(view) {
   };
   const [turn, approach, home] = [(dx, dy) => view.turn(dx, dy), (by) => view.approach(by), () => view.goHome()].map(moved);
   const play = () => view.play(!view.isPlaying);
+  const compare = () => {
+    view.compare(!view.comparison?.isOn);
+    view.show();
+  };
   const nothing = () => {};
   listenToGestures(get("stage"), { turn, approach, home, play, pan: nothing, focus: nothing });
   addEventListener("keydown", (event) => {
@@ -173,6 +219,7 @@ function listen(view) {
     else if (ZOOMS[event.key]) approach(ZOOMS[event.key]);
     else if (event.key === "Home") home();
     else if (event.key === " ") play();
+    else if (event.key === "c") compare();
     else return;
     event.preventDefault();
   });
@@ -184,6 +231,7 @@ function listen(view) {
   });
   get("play").addEventListener("click", play);
   get("home").addEventListener("click", home);
+  get("compare").addEventListener("click", compare);
   get("marked").addEventListener("change", () => view.show());
   addEventListener("hashchange", () => {
     view.read(location.hash);
@@ -192,19 +240,41 @@ function listen(view) {
   new ResizeObserver(() => view.show()).observe(get("stage"));
 }
 
+/** What shows the recorded frames beside the model. @param {Player} player @returns {Promise<Comparison | null>} null: no frames */
+async function comparisonFor(player) {
+  const recording = new Recording(bytesOf(taken("video")), JSON.parse(taken("pictures")));
+  try {
+    await recording.open(player);
+  } catch (error) {
+    say(words("compare.failed", { why: error.message }));
+  }
+  if (recording.frames.length === 0) return null;
+  const parts = {
+    stage: get("stage"),
+    box: get("compare-box"),
+    canvas: get("recorded"),
+    seam: get("seam"),
+    ofRecorded: get("of-recorded"),
+    ofModel: get("of-model"),
+    button: get("compare"),
+    tools: get("tools"),
+  };
+  return new Comparison(parts, recording, player.hasRecordedLight);
+}
+
 async function start() {
   showWords(document);
   const manifest = JSON.parse(taken("manifest"));
-  tell(JSON.parse(taken("about")), manifest);
+  describe(JSON.parse(taken("about")), manifest);
   const support = graphics();
   if (!support.isFast && support.name === "") throw new Error(words("file.no_webgl2"));
   get("message").textContent = words(support.isFast ? "file.opening" : "file.slow");
-  const player = await Player.of({ manifest, scene: decoded(taken("scene")) }, get("picture"));
-  const view = new View(player);
+  const player = await Player.of({ manifest, scene: bytesOf(taken("scene")).buffer }, get("picture"));
+  get("message").textContent = "";
+  const view = new View(player, await comparisonFor(player));
   view.read(location.hash);
   listen(view);
   view.show();
-  get("message").textContent = "";
   document.body.dataset.state = "shown";
 }
 

@@ -13,11 +13,12 @@ export class Share {
    */
   constructor(dialog, scopes, { link, scene }) {
     const part = (css) => dialog.querySelector(css);
-    Object.assign(this, { dialog, scopes, link, scene, text: part(".link"), moves: part(".moves"), message: part(".message"), file: part(".file") });
+    Object.assign(this, { dialog, scopes, link, scene, text: part(".link"), moves: part(".moves"), message: part(".message") });
+    Object.assign(this, { file: part(".file"), frames: part(".frames") });
     part("[data-close]").addEventListener("click", () => dialog.close());
     part(".copy").addEventListener("click", () => this.#copy());
     this.moves.addEventListener("change", () => this.#show());
-    this.file.addEventListener("click", () => download(() => exportScene(this.scene(), { format: "html" }), this.message));
+    this.file.addEventListener("click", () => this.#save());
     dialog.addEventListener("click", (event) => event.target === dialog && dialog.close()); // beside it
     languageEvents.addEventListener("changed", () => this.#show());
   }
@@ -25,7 +26,7 @@ export class Share {
   open() {
     if (this.scene() === null) return;
     this.#show();
-    this.file.hidden = !this.scopes.has("download");
+    this.file.hidden = this.frames.closest("p").hidden = !this.scopes.has("download");
     this.dialog.showModal();
     this.text.select();
   }
@@ -34,6 +35,11 @@ export class Share {
     this.text.value = this.link(this.moves.checked);
     this.message.classList.remove("bad");
     setText(this.message, "");
+  }
+
+  #save() {
+    const wanted = { format: "html", ...(this.frames.checked ? {} : { recorded: "off" }) };
+    download(() => exportScene(this.scene(), wanted), this.message);
   }
 
   async #copy() {

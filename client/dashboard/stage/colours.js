@@ -1,7 +1,7 @@
-// The false colours of depth and confidence: those of the service's pictures. Depth is bright where it is near,
+// The false colours of depth, confidence and error: those of the service's pictures. Depth is bright where it is near,
 // confidence where it is high.
 
-import { COLOUR_TABLE } from "../base/wire.js";
+import { COLOUR_TABLE, ERROR_COLOURS } from "../base/wire.js";
 
 const STOPS = 32;
 
@@ -17,3 +17,6 @@ export function colourOf(share) {
 /** @param {string} direction of CSS, such as "to right" @returns {string} a CSS gradient from dark to bright */
 export const gradient = (direction) =>
   `linear-gradient(${direction}, ${Array.from({ length: STOPS + 1 }, (_, i) => colourOf(i / STOPS)).join(", ")})`;
+
+/** @returns {string} a CSS gradient from where the model is darker than the recording to where it is brighter */
+export const errorGradient = () => `linear-gradient(to right, ${ERROR_COLOURS.join(", ")})`;

@@ -8,18 +8,16 @@ import { comparisonOf } from "../base/spelling.js";
 import { nameOf } from "../library/card.js";
 import { reasonsIn } from "../library/report.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
-import { Hatch } from "./hatch.js";
 import { OtherScene } from "./otherscene.js";
 import { Pictures, warningsOf } from "./pictures.js";
 import { RecordedFrames } from "./recordedframes.js";
+import { RecordedPicture } from "./recordedpicture.js";
+import { MIDDLE, Seam } from "./seam.js";
 
 /** @typedef {import("../base/wire.js").Report} Report */
 /** @typedef {import("../base/wire.js").JobView} Job */
 /** @typedef {"off"|"wipe"|"side"} Mode wipe: the other picture left of a seam, the model right; side: both whole */
 
-const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDown: -10, PageUp: 10 };
-const ENDS = { Home: 0, End: 100 };
-const MIDDLE = 50;
 const TOLD_MS = 10_000;
 
 export class Compare {
@@ -38,10 +36,10 @@ export class Compare {
     /** @type {Job[]} */
     this.offered = [];
     viewer.awaits = () => this.other?.isExpected === true;
-    this.hatch = new Hatch();
+    this.recorded = new RecordedPicture(parts.canvas);
+    this.seam = new Seam(parts.seam, parts.box);
     /** @type {Mode} */
     this.mode = "off";
-    this.seam = MIDDLE;
     this.open(null);
     viewer.addEventListener("shown", ({ detail }) => this.#follow(detail));
     viewer.addEventListener("gone", () => this.#end(""));
@@ -49,12 +47,11 @@ export class Compare {
       this.#fill();
       this.labelled = "";
       this.#label();
-      this.#moveSeam(this.seam);
+      this.seam.move(this.seam.percent);
     });
     parts.mode.addEventListener("change", () => this.choose(parts.mode.value));
     parts.beside.addEventListener("change", () => this.choose(this.mode === "off" ? "wipe" : this.mode, parts.beside.value));
     parts.tools.addEventListener("change", () => this.#draw());
-    this.#listenToSeam();
   }
 
   /** @param {string | null} scene that comes into view; what it keeps is not known yet */
@@ -184,7 +181,7 @@ export class Compare {
     this.#say("");
     this.parts.stage.dataset.compare = mode;
     this.parts.box.hidden = false;
-    this.#moveSeam(MIDDLE);
+    this.seam.move(MIDDLE);
     this.#draw();
     this.onChange();
   }
@@ -262,13 +259,7 @@ export class Compare {
     if (this.t === null) return this.#label();
     const found = this.frames.seek(this.t);
     if (found) {
-      const { canvas, tools } = this.parts;
-      const { width, height } = found.picture;
-      if (canvas.width !== width) canvas.width = width;
-      if (canvas.height !== height) canvas.height = height;
-      const context = canvas.getContext("2d");
-      context.drawImage(found.picture, 0, 0);
-      if (found.mask && !tools.checked) context.drawImage(this.hatch.over(found.mask), 0, 0);
+      this.recorded.draw(found, this.parts.tools.checked);
       this.drawn = found.frame;
     }
     this.#label();
@@ -321,40 +312,6 @@ export class Compare {
     fillLabel(parts.ofModel, right, this.report);
     parts.ofRecorded.title = warnings.join(" ");
     parts.canvas.setAttribute("aria-label", left.join(", "));
-  }
-
-  #listenToSeam() {
-    const { seam, box } = this.parts;
-    const follow = ({ clientX }) => {
-      const { left, width } = box.getBoundingClientRect();
-      this.#moveSeam(((clientX - left) / width) * 100);
-    };
-    seam.addEventListener("pointerdown", (event) => {
-      event.stopPropagation(); // the stage would turn the model
-      seam.setPointerCapture(event.pointerId);
-    });
-    seam.addEventListener("pointermove", (event) => {
-      event.stopPropagation();
-      if (seam.hasPointerCapture(event.pointerId)) follow(event);
-    });
-    seam.addEventListener("dblclick", (event) => event.stopPropagation());
-    seam.addEventListener("keydown", (event) => {
-      const { key } = event;
-      if (key in STEPS) this.#moveSeam(this.seam + STEPS[key]);
-      else if (key in ENDS) this.#moveSeam(ENDS[key]);
-      else return;
-      event.preventDefault();
-      event.stopPropagation();
-    });
-  }
-
-  /** @param {number} percent of the stage that shows the recorded frame */
-  #moveSeam(percent) {
-    this.seam = Math.min(100, Math.max(0, percent));
-    const { seam, box } = this.parts;
-    box.style.setProperty("--seam", `${this.seam}%`);
-    seam.setAttribute("aria-valuenow", String(Math.round(this.seam)));
-    seam.setAttribute("aria-valuetext", words("compare.seam_at", { percent: Math.round(this.seam) }));
   }
 }
 

@@ -3,7 +3,7 @@
 import { setText } from "../base/element.js";
 import { figure, languageEvents, words } from "../base/messages.js";
 import { BRIGHTEST_ERROR } from "../base/wire.js";
-import { gradient } from "./colours.js";
+import { errorGradient, gradient } from "./colours.js";
 
 export class Legend {
   /**
@@ -43,14 +43,19 @@ export class Legend {
     this.#say(".what", words(`legend.${shown.layer}`));
     this.#say(".low", legend.low);
     this.#say(".high", legend.high);
-    this.box.querySelector(".colours").style.backgroundImage = gradient(shown.layer === "depth" ? "to left" : "to right");
+    const isError = shown.layer === "error";
+    const colours = isError ? errorGradient() : gradient(shown.layer === "depth" ? "to left" : "to right");
+    this.box.querySelector(".colours").style.backgroundImage = colours;
     if (shown.layer === "depth") this.#fill(false);
   }
 
   /** @returns {{low: string, high: string} | null} what its ends mean; null: the picture has no false colours */
   #legendOf({ layer, depthRangeMm }) {
     if (layer === "confidence") return { low: words("legend.unsure"), high: words("legend.sure") };
-    if (layer === "error") return { low: words("legend.levels", { levels: 0 }), high: words("legend.levels_most", { levels: BRIGHTEST_ERROR }) };
+    if (layer === "error") {
+      const most = { levels: BRIGHTEST_ERROR };
+      return { low: words("legend.darker", most), high: words("legend.brighter", most) };
+    }
     if (layer !== "depth" || !depthRangeMm) return null;
     const [near, far] = depthRangeMm.map((each) => ({ mm: figure(each) }));
     return { low: words("legend.nearest", near), high: words("legend.farthest", far) }; // what lies beyond has the colours of the ends

@@ -2,6 +2,7 @@
 
 import { request } from "../base/api.js";
 import { pause } from "../base/pause.js";
+import { nearestPlace } from "./recordedpicture.js";
 
 const AT_ONCE = 3;
 /** Frames that are decoded; a second of a film of 25 a second would take 40 MB of an eye of 640 x 512. */
@@ -47,23 +48,17 @@ export class RecordedFrames {
 
   /** The number of the kept frame nearest to t. @param {number} t */
   frameAt(t) {
-    return this.kept.frames[this.#placeAt(t)];
+    return this.kept.frames[nearestPlace(this.kept.frames, this.frameCount, t)];
   }
 
   /** @param {number} t @returns {Frame | null} the frame nearest to t; null: onReady is told when it is there */
   seek(t) {
-    this.place = this.#placeAt(t);
+    this.place = nearestPlace(this.kept.frames, this.frameCount, t);
     for (const place of [...this.files.keys()]) if (this.#ahead(place) >= this.reach) this.files.delete(place);
     for (const place of [...this.frames.keys()]) if (this.#ahead(place) >= DECODED) this.#forget(place);
     this.#decodeAhead();
     while (this.underWay.size < AT_ONCE && this.#loadNext());
     return this.frames.get(this.place) ?? null;
-  }
-
-  #placeAt(t) {
-    const wanted = Math.min(t, 1) * this.frameCount;
-    const { frames } = this.kept;
-    return frames.reduce((best, each, i) => (Math.abs(each - wanted) < Math.abs(frames[best] - wanted) ? i : best), 0);
   }
 
   /** How many frames after the one in view, in a loop. */

@@ -92,7 +92,7 @@ export class Snapshot {
     const context = made.getContext("2d");
     context.drawImage(canvas, isBeside ? width : 0, 0, width, height);
     const isCompared = stage.dataset.compare !== undefined && !recorded.hidden;
-    const shownTo = isBeside ? width : (this.compare.seam / 100) * width;
+    const shownTo = isBeside ? width : (this.compare.seam.percent / 100) * width;
     if (isCompared) {
       context.save();
       context.beginPath();
