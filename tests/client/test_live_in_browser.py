@@ -173,6 +173,17 @@ def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePa
     after = age_of(page, "model")
     assert after is not None
     assert after["ms"] == held["ms"]
+    painter.has_model = False  # as while another width begins
+    page.until(lambda: age_of(page, "model") is None)
+    painter.has_model, painter.is_coarse = True, True
+    page.until(lambda: (age_of(page, "model") or {"ms": None})["ms"] == held["ms"])
+    asked = len(painter.renders)
+    page.until(lambda: len(painter.renders) > asked + 1)
+    painter.is_coarse = False  # there is time: from now on no picture of a frozen moment is asked for
+    time.sleep(2)
+    asked = len(painter.renders)
+    time.sleep(2)
+    assert len(painter.renders) == asked
     assert word(page).startswith("FROZEN")
     assert page.text("#live-word") == say("live.word_live")
     frame = "return getComputedStyle(document.body, '::after')"
