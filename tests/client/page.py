@@ -105,7 +105,8 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
 
 def first_report_of_the_page() -> Report:
     """Before the scores are known."""
-    figures = [name for name in Report.model_fields if name.startswith(("psnr", "baseline", "detail", "depth_agreement"))]
+    scores = ("psnr", "baseline", "detail", "depth_agreement")
+    figures = [name for name in Report.model_fields if name.startswith(scores)]
     return REPORT_OF_THE_PAGE.model_copy(update={**dict.fromkeys(figures), "scored": False})
 
 
