@@ -219,6 +219,7 @@ def test_the_tape_goes_back_and_plays_on_from_there(site: Site, page: LivePage, 
     assert word(page) == "LOOKING BACK 12 s"
     page.script(PRESS, "ArrowLeft")
     page.until_text("#word", "LOOKING BACK 13 s")
+    assert page.text("#tape-ticks").split("\n") == ["−2 min", "−1:30 min", "−1 min", "−0:30 min", "now"]
     page.script(DRAG_TAPE, -PAST_S - 20)
     page.until(lambda: page.text("#model-message") != "")
     page.click("#live")
