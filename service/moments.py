@@ -11,7 +11,7 @@ from intrasplat.errors import InputError
 from intrasplat.live.times import LIVE, REMEDY, FeedTime
 
 MAX_T = 1e6
-SCENE_T_REMEDY = f"Give a number in [0, {MAX_T:g}]: 0 is the first frame, 1 the end of the clip."
+SCENE_T_REMEDY = "Give a number: 0 is the first frame, 1 the end of the clip."
 ABOUT_T = (
     "of a scene a number: 0 is the first frame, 1 the end of the clip (default: 0). Of a live feed live (the default), "
     "seconds before that (-12.5), seconds of the source (31.4), or a time of RFC 3339 with its zone"

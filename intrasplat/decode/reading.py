@@ -124,7 +124,7 @@ def _stereo_frames(clip: StereoClip, reports: Reports) -> Iterator[tuple[str, ND
 
 def _calibration(path: Path | str | None, clip: StereoClip) -> dict[str, Any]:
     if path is None:
-        problem = f"a stereo clip of {clip.width} x {clip.height} px an eye came without one."
+        problem = f"a stereo clip of {clip.width} x {clip.height} px an eye needs one, and none was given."
         remedy = "Give a calibration: our JSON (docs/conventions.md), OpenCV YAML or XML, or StereoMIS ini."
         raise InputError("calibration", problem, remedy)
     calibration = load_calibration(path, eye_width=clip.width, eye_height=clip.height, pixel_aspect=clip.pixel_aspect)

@@ -44,6 +44,8 @@ FAR_DEG = 20.0
 that the clip never saw."""
 MAX_ENLARGEMENT = 4.0
 """A frame warns when it is nearer to the surface than the clip by more than this factor."""
+MOST_DEG, MOST_ENLARGED = 60.0, 100.0
+"""Beyond these, warnings name no figure: rays run along the plane that stands for the surface."""
 LOW_TRUST, MAX_LOW_SHARE = 0.1, 0.1
 """A frame warns when more than MAX_LOW_SHARE of its pixels show Gaussians of less trust than LOW_TRUST."""
 HARDLY_SEEN = "More than a tenth of this view was hardly seen in the clip; see layer=confidence."
@@ -319,10 +321,12 @@ def clamped_to_clip(scene: TrainedScene, t: float) -> tuple[float, tuple[Notice,
 def _warnings_of_pose(view: ViewRequest, trust: NDArray[np.float32], unseen: NDArray[np.bool_]) -> Iterator[Notice]:
     angle_deg, enlargement = aside(view.scene, view.pose, view.lenses.drawn)
     if angle_deg > FAR_DEG:
-        text = f"This view looks from {angle_deg:.0f} degrees beside the endoscope: most of it is a guess."
+        said = f"{angle_deg:.0f}" if angle_deg <= MOST_DEG else f"more than {MOST_DEG:.0f}"
+        text = f"This view looks from {said} degrees beside the endoscope: most of it is a guess."
         yield Notice.warning(NoticeCode.POSE_FAR, text)
     if enlargement > MAX_ENLARGEMENT:
-        text = f"This view is enlarged {enlargement:.1f} times: it holds no finer detail than the clip."
+        said = f"{enlargement:.1f}" if enlargement <= MOST_ENLARGED else f"more than {MOST_ENLARGED:.0f}"
+        text = f"This view is enlarged {said} times: it holds no finer detail than the clip."
         yield Notice.warning(NoticeCode.ENLARGED, text)
     if (share := _share(unseen)) > MAX_UNSEEN_SHARE:
         text = f"No frame saw {share:.0%} of this view. unseen=mark hatches it, unseen=guess shows a guess."

@@ -20,7 +20,7 @@ from contract.wire.rendering import MeasureRequest, RecordedRequest, RenderReque
 from intrasplat.errors import InputError
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.live.times import LIVE, FeedTimeKind
-from intrasplat.notices import NoticeCode
+from intrasplat.notices import Notice, NoticeCode
 from tests.client.local_service import CLIP
 from tests.client.page import CAMERA, Page, Site
 from tests.measurements import measurement_reply
@@ -79,6 +79,7 @@ class LivePainter(FeedWorker):
         self.recording: FeedReason | None = None
         self.model_lag_s = MODEL_LAG_S
         self.has_model = True
+        self.is_coarse = False
         self.answer_after_s = 0.0
         self.renders: list[RenderRequest] = []
         self.measured: list[MeasureRequest] = []
@@ -149,6 +150,8 @@ class LivePainter(FeedWorker):
         picture = cv2.imencode(".jpg", painted(at_s, 190))[1].tobytes()
         yaw_deg = abs(getattr(request.pose, "yaw_deg", 0.0))
         warnings = (a_warning("far", NoticeCode.POSE_FAR),) if yaw_deg > FAR_DEG else ()
+        if self.is_coarse:
+            warnings += (Notice.info(NoticeCode.COARSE, "coarse"),)
         camera = CAMERA.model_copy(update={"width": 400, "height": 320, "fx": 400, "fy": 400, "cx": 200, "cy": 160})
         return Reply(picture, "image/jpeg", 0.0, warnings, camera=camera, feed=shown)
 

@@ -46,7 +46,7 @@ from intrasplat.names import CURVE, MANIFEST, REPORT, Eye, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, Layer, Unseen
 from intrasplat.pose import OrbitPose
-from intrasplat.report import LightChanges, Report
+from intrasplat.report import DetailScores, LightChanges, Report
 from intrasplat.scene.checkpoint import save_scene
 from intrasplat.scene.scene import TrainedScene
 from service.app import create_app
@@ -89,6 +89,7 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
         "baseline_warp_db": 28.6,
         "psnr_clear_db": 33.0,
         "psnr_right_clear_db": 30.1,
+        "detail": DetailScores(psnr_tissue_db=32.4, psnr_right_db=29.6, ssim=0.95),
         "coverage": 0.97,
         "depth_agreement_mm": 0.8,
         "gaussians": 31000,
@@ -104,7 +105,8 @@ REPORT_OF_THE_PAGE = REPORT_OF_A_SCENE.model_copy(
 
 def first_report_of_the_page() -> Report:
     """Before the scores are known."""
-    figures = [name for name in Report.model_fields if name.startswith(("psnr", "baseline", "depth_agreement"))]
+    scores = ("psnr", "baseline", "detail", "depth_agreement")
+    figures = [name for name in Report.model_fields if name.startswith(scores)]
     return REPORT_OF_THE_PAGE.model_copy(update={**dict.fromkeys(figures), "scored": False})
 
 

@@ -173,6 +173,17 @@ def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePa
     after = age_of(page, "model")
     assert after is not None
     assert after["ms"] == held["ms"]
+    painter.has_model = False  # as while another width begins
+    page.until(lambda: age_of(page, "model") is None)
+    painter.has_model, painter.is_coarse = True, True
+    page.until(lambda: (age_of(page, "model") or {"ms": None})["ms"] == held["ms"])
+    asked = len(painter.renders)
+    page.until(lambda: len(painter.renders) > asked + 1)
+    painter.is_coarse = False  # there is time: from now on no picture of a frozen moment is asked for
+    time.sleep(2)
+    asked = len(painter.renders)
+    time.sleep(2)
+    assert len(painter.renders) == asked
     assert word(page).startswith("FROZEN")
     assert page.text("#live-word") == say("live.word_live")
     frame = "return getComputedStyle(document.body, '::after')"
@@ -208,6 +219,7 @@ def test_the_tape_goes_back_and_plays_on_from_there(site: Site, page: LivePage, 
     assert word(page) == "LOOKING BACK 12 s"
     page.script(PRESS, "ArrowLeft")
     page.until_text("#word", "LOOKING BACK 13 s")
+    assert page.text("#tape-ticks").split("\n") == ["−2 min", "−1:30 min", "−1 min", "−0:30 min", "now"]
     page.script(DRAG_TAPE, -PAST_S - 20)
     page.until(lambda: page.text("#model-message") != "")
     page.click("#live")

@@ -26,22 +26,28 @@ export function baselinesOf(report) {
   return baselines.filter(({ db }) => Number.isFinite(db));
 }
 
-/** @param {Report} report */
-function likeness(report) {
-  const db = number(report.psnr_tissue_db, 2, "dB");
-  if (db === null) return words(isPending(report) ? "figure.pending" : "figure.not_measured");
+/** Of views with detail from recorded frames, which the page shows, and of the model alone. @param {Report} report */
+function likeness({ psnr_tissue_db: alone, detail, ...report }) {
+  if (!Number.isFinite(alone)) return words(isPending(report) ? "figure.pending" : "figure.not_measured");
+  const db = number(detail?.psnr_tissue_db ?? alone, 2, "dB");
   const best = Math.max(...baselinesOf(report).map((each) => each.db));
-  if (!Number.isFinite(best)) return words("figure.likeness", { db });
-  return words("figure.likeness_beside_copies", { db, best: number(best, 2, "dB") });
+  return joined([
+    Number.isFinite(best)
+      ? words("figure.likeness_beside_copies", { db, best: number(best, 2, "dB") })
+      : words("figure.likeness", { db }),
+    detail && words("figure.without_detail", { db: number(alone, 2, "dB") }),
+  ]);
 }
 
 /** Likeness from beside: the right eye of a stereo clip. @param {Report} report */
-function rightEye({ psnr_right_db: right, baseline_warp_db: warped, psnr_clear_db: left, psnr_right_clear_db: clear }) {
+function rightEye({ psnr_right_db: right, detail, baseline_warp_db: warped, ...report }) {
   if (!Number.isFinite(right)) return null;
+  const { psnr_clear_db: left, psnr_right_clear_db: clear } = report;
   const db = (value) => number(value, 2, "dB");
   return joined([
-    words("figure.right_eye", { db: db(right) }),
+    words("figure.right_eye", { db: db(detail?.psnr_right_db ?? right) }),
     Number.isFinite(warped) && words("figure.right_eye_warped", { db: db(warped) }),
+    Number.isFinite(detail?.psnr_right_db) && words("figure.without_detail", { db: db(right) }),
     Number.isFinite(clear) && Number.isFinite(left) && words("figure.right_eye_clear", { db: db(clear), left: db(left) }),
   ]);
 }

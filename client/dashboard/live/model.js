@@ -6,6 +6,7 @@ import { Problem, wrongKeyWords } from "../base/problem.js";
 import { unpack } from "../stage/stream.js";
 
 /** @typedef {{scene: string, t: string, pose?: string, follow?: true}} Wish of a view */
+/** @typedef {{id: number, wish: Wish, atMs: number, isAnswered: boolean, isRefused: boolean}} Asked */
 /**
  * What came. image: of the view. capturedAtS: the moment of the feed. asked: the wish that it answers.
  * @typedef {{asked: Wish, capturedAtS: number, camera: import("../stage/stream.js").Camera | null, unseen: number,
@@ -18,6 +19,8 @@ const AGAIN_MS = 1000;
 const SILENCE_MS = 5000;
 const BUSY = [429, 503];
 const QUALITY = 85;
+/** The notice of a picture that will be sharper once there is time. */
+const COARSE = "coarse";
 
 /** Tells "shown", "answered" when the service has said anything, and "refused" with a Problem. */
 export class ModelPicture extends EventTarget {
@@ -27,7 +30,7 @@ export class ModelPicture extends EventTarget {
     Object.assign(this, { canvas, clock, number: 0, drawn: 0, socket: null });
     /** @type {Wish | null} */
     this.wish = null;
-    /** @type {{id: number, wish: Wish, atMs: number, isAnswered: boolean} | null} what was asked for last */
+    /** @type {Asked | null} what was asked for last */
     this.asked = null;
     /** @type {ModelShown | null} */
     this.shown = null;
@@ -74,13 +77,25 @@ export class ModelPicture extends EventTarget {
     const { socket, wish, asked } = this;
     if (wish === null || socket?.readyState !== WebSocket.OPEN) return;
     if (asked && (!asked.isAnswered || JSON.stringify(asked.wish) === JSON.stringify(wish))) return;
-    this.asked = { id: ++this.number, wish, atMs: performance.now(), isAnswered: false };
+    this.asked = { id: ++this.number, wish, atMs: performance.now(), isAnswered: false, isRefused: false };
     socket.send(JSON.stringify({ format: "jpeg", quality: QUALITY, ...wish, id: this.number }));
   }
 
   #watch() {
     const { asked, socket } = this;
     if (asked && !asked.isAnswered && performance.now() - asked.atMs > SILENCE_MS) socket?.close();
+    if (asked && this.#isUnfinished(asked)) this.#sendAgain();
+  }
+
+  /** Whether a view that rests has lost its picture, or has a coarse one. @param {Asked} asked */
+  #isUnfinished({ wish, isAnswered, isRefused }) {
+    if (!isAnswered || isRefused || wish.follow) return false;
+    return this.shown === null || this.shown.warnings.some(({ code }) => code === COARSE);
+  }
+
+  #sendAgain() {
+    this.asked = null;
+    this.#send();
   }
 
   #take(data, key) {
@@ -103,15 +118,11 @@ export class ModelPicture extends EventTarget {
     if (problem.status === 401 && key === currentKey()) askForKey(key ? wrongKeyWords(problem) : problem.message);
     const { asked } = this;
     if (!asked || document.id !== asked.id) return;
-    asked.isAnswered = true;
+    asked.isAnswered = asked.isRefused = true;
     this.dispatchEvent(new CustomEvent("refused", { detail: problem }));
     if (JSON.stringify(asked.wish) !== JSON.stringify(this.wish)) this.#send();
     else if (BUSY.includes(problem.status) && !asked.wish.follow) {
-      setTimeout(() => {
-        if (this.asked !== asked) return;
-        this.asked = null;
-        this.#send();
-      }, Math.max(AGAIN_MS, 1000 * problem.turnInS));
+      setTimeout(() => this.asked === asked && this.#sendAgain(), Math.max(AGAIN_MS, 1000 * problem.turnInS));
     }
   }
 

@@ -85,10 +85,11 @@ export class Tape {
     const key = texts.join() + words("live.tape_now");
     if (this.drawn === key) return;
     this.drawn = key;
+    const isMinutes = this.spanS >= 120;
+    const minutes = (s) => [Math.floor(s / 60), ...(s % 60 ? [String(Math.round(s % 60)).padStart(2, "0")] : [])].join(":");
     for (const [i, each] of [...this.ticks.children].entries()) {
-      const isMinutes = texts[i] >= 120;
       const text = isMinutes
-        ? words("live.minutes_ago", { min: figure(texts[i] / 60, texts[i] % 60 ? 1 : 0) })
+        ? words("live.minutes_ago", { min: minutes(texts[i]) })
         : words("live.seconds_ago", { s: figure(texts[i], texts[i] % 1 ? 1 : 0) });
       setText(each, texts[i] === 0 ? words("live.tape_now") : text);
     }

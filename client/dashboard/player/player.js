@@ -11,6 +11,9 @@ import { readTable } from "./table.js";
 /** Of intrasplat/view/render.py. */
 const FAR_DEG = 20;
 const MAX_ENLARGEMENT = 4;
+/** Beyond these, warnings name no figure. */
+const MOST_DEG = 60;
+const MOST_ENLARGED = 100;
 const MAX_UNSEEN_SHARE = 0.05;
 const MAX_LOW_SHARE = 0.1;
 const ROUNDING = 1e-6;
@@ -231,10 +234,12 @@ export class Player {
     }
     const { angleDeg, enlargement } = this.aside.of(view.pose);
     if (angleDeg > FAR_DEG) {
-      tell("pose_far", `This view looks from ${angleDeg.toFixed(0)} degrees beside the endoscope: most of it is a guess.`);
+      const said = angleDeg <= MOST_DEG ? angleDeg.toFixed(0) : `more than ${MOST_DEG}`;
+      tell("pose_far", `This view looks from ${said} degrees beside the endoscope: most of it is a guess.`);
     }
     if (enlargement > MAX_ENLARGEMENT) {
-      tell("enlarged", `This view is enlarged ${enlargement.toFixed(1)} times: it holds no finer detail than the clip.`);
+      const said = enlargement <= MOST_ENLARGED ? enlargement.toFixed(1) : `more than ${MOST_ENLARGED}`;
+      tell("enlarged", `This view is enlarged ${said} times: it holds no finer detail than the clip.`);
     }
     if (unseen > MAX_UNSEEN_SHARE) {
       const text = `No frame saw ${Math.round(unseen * 100)}% of this view.`;

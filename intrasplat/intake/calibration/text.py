@@ -51,7 +51,8 @@ def checked_calibration(value: dict[str, Any]) -> StereoCalibration:
     except ValidationError as error:
         first = error.errors()[0]
         if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
-            problem = f"model is {str(value.get('model'))[:80]}, not rectified or raw."
+            said = f"is {str(value['model'])[:80]}, not" if "model" in value else "is not said:"
+            problem = f"model {said} rectified or raw."
             raise InputError(FIELD, problem, FORMATS_REMEDY) from None
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise InputError(

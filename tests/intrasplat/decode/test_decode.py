@@ -178,7 +178,7 @@ def test_a_calibration_inside_the_clips_zip_is_found(studio: Studio) -> None:
 
 
 def test_a_stereo_clip_without_a_calibration_says_that_it_needs_one(studio: Studio) -> None:
-    with pytest.raises(InputError, match="came without one") as caught:
+    with pytest.raises(InputError, match="none was given") as caught:
         decode_clip(side_by_side(studio))
     assert caught.value.field == "calibration"
 

@@ -51,11 +51,11 @@ def test_words_and_comments_are_no_numbers(name: str, text: str) -> None:
     check_calibration_file(text, "calibration", name)
 
 
-@pytest.mark.parametrize(("text", "given"), [("{}", "None"), ('{"model": "fisheye"}', "fisheye")])
-def test_a_calibration_of_no_known_model_is_refused_in_plain_words(text: str, given: str) -> None:
+@pytest.mark.parametrize(("text", "said"), [("{}", "is not said:"), ('{"model": "fisheye"}', "is fisheye, not")])
+def test_a_calibration_of_no_known_model_is_refused_in_plain_words(text: str, said: str) -> None:
     with pytest.raises(InputError) as refused:
         read_calibration(text)
-    assert refused.value.problem == f"model is {given}, not rectified or raw."
+    assert refused.value.problem == f"model {said} rectified or raw."
 
 
 HANGS_AFTER_S = 60.0

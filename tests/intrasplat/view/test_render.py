@@ -235,6 +235,12 @@ def test_a_view_from_far_beside_the_endoscope_warns(scene: TrainedScene, orbit: 
     assert (NoticeCode.POSE_FAR in codes_from(scene, f"orbit:{orbit}")) is is_far
 
 
+def test_a_view_along_the_surface_names_no_figure(scene: TrainedScene) -> None:
+    texts = [each.text for each in render_frame(scene, 0.5, pose_of(scene, parse_pose("orbit:90,0,1"))).warnings]
+    assert texts[0].startswith("This view looks from more than 60 degrees beside the endoscope")
+    assert all("more than 100 times" in text for text in texts if "enlarged" in text)
+
+
 def test_a_view_shifted_aside_warns_at_the_angle_of_an_orbit(scene: TrainedScene) -> None:
     depth_mm = 60 / scene.units_per_mm
     for share, is_far in ((0.3, False), (0.45, True)):
