@@ -4,10 +4,10 @@
 
 Headless Chromium opens a page with one finished scene: visits without and with a cache, with milliseconds to the
 first paint and until the first picture was noticed, requests and bytes; visits without a cache by a shared link, with
-milliseconds until its first picture and until it plays and rocks; then requests and bytes at rest; then pictures a
-second while the clip plays over a line of 400 kbit/s and 400 ms. A stand-in for a worker sends pictures
-that are as hard to code as tissue, so that no figure depends on a renderer. Bytes are of answers with their heads,
-without what comes over the WebSocket.
+milliseconds until its first picture and until it plays and rocks; then requests, messages over the WebSocket and
+bytes at rest; then pictures a second while the clip plays over a line of 400 kbit/s and 400 ms. A stand-in for a worker
+sends pictures that are as hard to code as tissue, so that no figure depends on a renderer. Bytes of requests are of
+answers with their heads.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from tests.client.slow_line import slow_line
 from tests.client.tissue import BIT_PER_S, LATENCY_S, WATCH, TissuePainter
 from tests.client.words import say
 
+SETTLED_S = 3.0
 COUNT = """
 const paint = performance.getEntriesByName("first-contentful-paint")[0]?.startTime ?? -1;
 const sent = ["navigation", "resource"].slice(arguments[0] ? 0 : 1)
@@ -35,8 +36,9 @@ return [paint, performance.now(), sent.length, sent.reduce((sum, each) => sum + 
 """Milliseconds to the first paint, -1 without one, and until now; requests to the service, without that for the page if
 the argument is false, and bytes of their answers."""
 
-MOVES = """
+NOTES = """
 window.firstMs = window.movesMs = 0;
+window.came = [];
 setInterval(() => {
   const get = (id) => document.getElementById(id);
   const [first, picture] = [get("first"), get("picture")];
@@ -44,8 +46,16 @@ setInterval(() => {
   const isRocking = picture?.ariaLabel.includes(ROCKING);
   if (!movesMs && isRocking && get("play").ariaPressed === "true") movesMs = performance.now();
 }, 5);
+const Plain = WebSocket;
+window.WebSocket = class extends Plain {
+  constructor(...given) {
+    super(...given);
+    this.addEventListener("message", ({ data }) => came.push(data.byteLength ?? data.length));
+  }
+};
 """
-"""Notes when the first picture is there, and when the page plays and shows one from where ROCKING says."""
+"""Notes when the first picture is there, when the page plays and shows one from where ROCKING says, and the bytes of
+messages over a WebSocket."""
 
 
 def main() -> None:
@@ -72,9 +82,9 @@ def main() -> None:
                 f"{picture_ms:.0f} ms, {requests:.0f} requests, {sent_bytes / 1e3:.1f} kB",
                 flush=True,
             )
+        source = NOTES.replace("ROCKING", json.dumps(say("live.rocking")))
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
         _shared(site, page, scene, options.visits)
-        page.open()
-        page.until_state("live")
         _rest(site, page, options.rest_s)
         _slow(site, page, options.moving_s)
         driver.get("about:blank")  # or its connections keep the service from ending
@@ -93,8 +103,6 @@ def _visit(site: Site, page: Page, *, is_cold: bool = False) -> tuple[float, flo
 
 
 def _shared(site: Site, page: Page, scene: str, visits: int) -> None:
-    source = MOVES.replace("ROCKING", json.dumps(say("live.rocking")))
-    noting = page.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
     seen = []
     for _ in range(visits):
         site.announce()
@@ -103,18 +111,25 @@ def _shared(site: Site, page: Page, scene: str, visits: int) -> None:
         page.driver.get(f"{site.url}/#/scene/{scene}?play=1&rock=1")
         page.until(lambda: page.script("return movesMs"))
         seen.append(page.script("return [firstMs, movesMs]"))
-    page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", noting)
-    page.driver.get("about:blank")
     first_ms, moves_ms = (median(each) for each in zip(*seen, strict=True))
     most = max(each[1] for each in seen)
     print(f"shared link: picture {first_ms:.0f} ms, plays and rocks {moves_ms:.0f} ms (at most {most:.0f})", flush=True)
 
 
 def _rest(site: Site, page: Page, rest_s: float) -> None:
-    page.script("performance.setResourceTimingBufferSize(10000); performance.clearResourceTimings()")
+    page.driver.get("about:blank")
+    page.open()
+    page.until_state("live")
+    _wait(site, SETTLED_S)
+    page.script("performance.setResourceTimingBufferSize(10000); performance.clearResourceTimings(); came.length = 0")
     _wait(site, rest_s)
     requests, sent_bytes = page.script(COUNT, False)[2:]
-    print(f"at rest, {rest_s:g} s: {requests} requests, {sent_bytes / 1e3:.1f} kB", flush=True)
+    messages = page.script("return came")
+    print(
+        f"at rest, {rest_s:g} s: {requests} requests, {sent_bytes / 1e3:.2f} kB; {len(messages)} messages, "
+        f"{sum(messages) / 1e3:.2f} kB",
+        flush=True,
+    )
 
 
 def _slow(site: Site, page: Page, moving_s: float) -> None:
