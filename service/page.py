@@ -1,13 +1,14 @@
 """The files of the web page. They may stay in browsers' caches for good: their address has a hash of all of them.
 
-Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`, which their own relative imports keep. The
-same files are there without a hash, too, and are cached nowhere. An HTML file has its words in the browser's language,
-and names all modules: on a slow line the words are there at the first paint, and no module waits for the one that
-imports it.
+Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`. There its script is one module with all that
+it imports, so that a first visit does not wait for a hundred requests. The same files are there without a hash, too, as
+they were written, and are cached nowhere. An HTML file has its words in the browser's language: on a slow line they are
+there at the first paint.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import html
 import json
@@ -22,6 +23,8 @@ from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Scope
 
+from intrasplat.scene.inline import joined
+
 INDEX = "index.html"
 VERSIONED = "v"
 """First part of the paths of versioned files; the second is the hash."""
@@ -32,7 +35,6 @@ REFERENCE = re.compile(r'((?:href|src)=")(\w[^":#]*")')
 """A file of the page, named relative to an HTML file beside the index; links begin with a dot."""
 MIN_COMPRESSED_BYTES = 1000
 SCRIPT = re.compile(r'<script type="module" src="([^"]+)"')
-IMPORT = re.compile(r'^import [^"]*"(\.[^"]+)";$', re.MULTILINE)
 PLACE = re.compile(r'(<(?:\w+)[^>]*\bdata-words="(\w+)\.(\w+)"[^>]*>)[^<]*')
 MESSAGES = {language: f"base/messages.{language}.js" for language in ("en", "de")}
 """Tables of words; the first is of whoever asks for no other."""
@@ -40,6 +42,7 @@ MESSAGES = {language: f"base/messages.{language}.js" for language in ("en", "de"
 
 def page_files(folder: Path) -> ASGIApp:
     """The application that serves the page in a folder, compressed for whoever takes gzip."""
+    _scripts(folder, _version(folder))  # not while others wait
     return GZipMiddleware(_Files(folder), minimum_size=MIN_COMPRESSED_BYTES)
 
 
@@ -57,6 +60,9 @@ class _Files(StaticFiles):
             return await super().get_response(path, scope)
         version, _, file = rest.partition("/")
         response = await super().get_response(file, scope)
+        script = _scripts(self._folder, _version(self._folder)).get(self._folder.resolve() / file)
+        if script is not None and response.status_code == 200:
+            response = _script(script, is_compressed="gzip" in Headers(scope=scope).get("Accept-Encoding", ""))
         if version == _version(self._folder):  # another one is of a page that is older or newer than this service
             response.headers["Cache-Control"] = FOREVER
         return response
@@ -65,9 +71,7 @@ class _Files(StaticFiles):
 @lru_cache(maxsize=4)
 def _text(folder: Path, name: str, version: str, language: str) -> str:
     text = (folder / name).read_text(encoding="utf-8")
-    if (script := SCRIPT.search(text)) and (folder / MESSAGES[language]).is_file():
-        links = "".join(f'  <link rel="modulepreload" href="{each}">\n' for each in _modules(folder, script[1]))
-        text = text.replace("</head>", f"{links}</head>", 1)
+    if (folder / MESSAGES[language]).is_file():
         text = text.replace('<html lang="en">', f'<html lang="{language}">', 1)
         text = PLACE.sub(_filled(_words(folder / MESSAGES[language])), text)
     return REFERENCE.sub(rf"\g<1>{VERSIONED}/{version}/\g<2>", text)
@@ -78,17 +82,20 @@ def _html(folder: Path, name: str, version: str, language: str) -> Response:
     return HTMLResponse(_text(folder, name, version, language), headers=headers)
 
 
-def _modules(folder: Path, script: str) -> list[str]:
-    """All that a script imports, by itself or by way of others."""
-    found, waiting = {}, [folder.resolve() / script]
-    while waiting:
-        module = waiting.pop(0)
-        for name in IMPORT.findall(module.read_text(encoding="utf-8")):
-            path = (module.parent / name).resolve()
-            if path not in found:
-                found[path] = path.relative_to(folder.resolve()).as_posix()
-                waiting.append(path)
-    return list(found.values())
+def _script(compressed: bytes, *, is_compressed: bool) -> Response:
+    headers = {"Vary": "Accept-Encoding"} | ({"Content-Encoding": "gzip"} if is_compressed else {})
+    body = compressed if is_compressed else gzip.decompress(compressed)
+    return Response(body, media_type="text/javascript", headers=headers)
+
+
+@lru_cache(maxsize=2)
+def _scripts(folder: Path, version: str) -> Mapping[Path, bytes]:
+    """The modules of the HTML files' scripts, joined, as gzip."""
+    scripts: dict[Path, str] = {}
+    for page in folder.glob("*.html"):
+        for entry in SCRIPT.findall(page.read_text(encoding="utf-8")):
+            scripts |= joined(folder / entry)
+    return {path: gzip.compress(text.encode()) for path, text in scripts.items()}
 
 
 def _words(table: Path) -> Mapping[str, Mapping[str, str]]:

@@ -6,6 +6,8 @@ is a JSON text: the problem document of HTTP with the `id`. The connection then 
 allowed (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
 headers, is {"authorize": KEY}.
 
+A request with `confirm` is answered by a JSON text, {"id", "state"}: the scene is there. Nothing is rendered.
+
 Of a live feed, a request with `follow` is answered once, and then with a new view whenever the feed has a newer moment,
 until the next request comes. While the feed's worker is away, each second brings the problem.
 
@@ -60,6 +62,7 @@ class StreamMessage(RenderQuery):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: str | int | None = Field(default=None, description="comes back with the answer")
+    confirm: bool = Field(default=False, description="answer only that the scene is there")
     follow: bool = Field(default=False, description="of t=live of a feed: send every newer moment, too")
 
 
@@ -157,6 +160,9 @@ class _Viewer:
             if isinstance(document, Problem):
                 raise document
             message = message_of(document)
+            if message.confirm:
+                await self._confirm(message)
+                return None
             shown, answer = await self._view(message)
         except Exception as error:
             message_id = document.get("id") if isinstance(document, dict) else None
@@ -165,6 +171,13 @@ class _Viewer:
             return (message_of(document), -math.inf) if does_follow and isinstance(document, dict) else None
         await self._entrance.send(packed(message, shown, answer, (time.perf_counter() - start) * 1e3))
         return (message, answer.head.feed.source_s) if message.follow and answer.head.feed is not None else None
+
+    async def _confirm(self, message: StreamMessage) -> None:
+        """Send that the scene is there. Raises Problem: it is not, or the caller may not see it."""
+        caller = self._entrance.caller()
+        self._services.limiter.admit(caller.key_id or caller.address)
+        shown = await find_shown(self._services, caller, message.scene)
+        await self._entrance.send(json.dumps({"id": message.id, "state": shown.state}))
 
     async def _view(self, message: StreamMessage, newer_than_s: float | None = None) -> tuple[Shown, Answer]:
         """The worker's answer.

@@ -308,7 +308,8 @@ const list = new JobList(
   },
 );
 const isWatched = () => drawers.isOpen === "library" || viewer.screen.trouble !== "" || viewer.isKeptWaiting;
-export const jobs = new Jobs(showJobs, showConnection, isWatched);
+const isHeard = () => viewer.shown?.state === "done" && viewer.pictures.stream.isOpen && viewer.screen.trouble === "";
+export const jobs = new Jobs(showJobs, showConnection, isWatched, isHeard);
 listOpenFeeds(get("open-feeds"), () => drawers.isOpen === "library");
 const shelf = new Shelf({ search: get("search"), more: get("more-jobs"), message: get("jobs-message") }, jobs, showJobs);
 const momentOf = (id) => {

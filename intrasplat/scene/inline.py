@@ -1,22 +1,30 @@
-"""Join ES modules of the page into one classic script, for a file that opens without a server.
+"""Join ES modules of the page: into one classic script for a file that opens without a server, or one module a page.
 
 It understands these forms, which our modules use, and refuses all others:
 
     import { a, b as c } from "./x.js";             export function, export class, export const NAME
     new Worker(new URL("./x.js", import.meta.url), { type: "module" })
+
+and in pages also
+
+    await import("./x.js")                          new URL("x", import.meta.url)
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
+from abc import ABC, abstractmethod
 from pathlib import Path
 
+_COMMENT = re.compile(r"^[ \t]*(?:/\*\*.*?\*/|//[^\n]*)[ \t]*\n?", re.MULTILINE | re.DOTALL)
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.{1,2}/[^"]+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export ((?:async )?function|class|const) (\w+)", re.MULTILINE)
 _WORKER = re.compile(r'new Worker\(new URL\("(\./[^"]+)", import\.meta\.url\), \{ type: "module" \}\)')
-_COMMENT = re.compile(r"^\s*/\*\*.*?\*/", re.MULTILINE | re.DOTALL)
-_OTHER = re.compile(r"^\s*(?:import|export)\b(?!:).*|\bimport(?:\(|\.meta).*", re.MULTILINE)
+_URL = re.compile(r'new URL\("([^"]+)", import\.meta\.url\)')
+_LATER = re.compile(r'\bawait import\("(\.{1,2}/[^"]+)"\)')
+_OTHER = re.compile(r"^\s*(?:import|export)\b(?!:).*|(?<!\{)\bimport(?:\(|\.meta).*", re.MULTILINE)
 _ENDS_SCRIPT = re.compile(r"</script|<!--", re.IGNORECASE)
 
 START_WORKER = """\
@@ -36,52 +44,136 @@ def inlined(entry: Path) -> str:
         CannotInlineError: a form is not understood, or modules import each other in a circle.
         OSError: a module is missing.
     """
-    script = f'"use strict";\n{START_WORKER}{_Bundle().of(entry)}'
+    script = f'"use strict";\n{START_WORKER}{_Inlined(entry).text()}'
     if found := _ENDS_SCRIPT.search(script):
         raise CannotInlineError(f"{entry.name} or a module of its holds {found.group()}, which would end the script")
     return script
 
 
-class _Bundle:
+def joined(entry: Path) -> dict[Path, str]:
+    """The modules to serve in place of files, by these: a page's script with all that it imports, its workers likewise,
+    and what it imports later with what only that needs.
+
+    Raises: as inlined.
+    """
+    return _scripts(_Joined(entry))
+
+
+def _scripts(bundle: _Joined) -> dict[Path, str]:
+    scripts = {bundle.entry: bundle.text()}
+    for worker in bundle.workers:
+        scripts |= joined(worker)
+    for later in bundle.later:
+        scripts |= _scripts(_Joined(later, bundle))
+    return scripts
+
+
+class _Bundle(ABC):
     """The modules of one script. Each is a function that is called once and returns its exports."""
 
-    def __init__(self) -> None:
-        self._names: dict[Path, str] = {}
+    DECLARES = "const"
+    FORMS: tuple[re.Pattern[str], ...] = ()
+    """What names another file, besides import statements."""
+
+    def __init__(self, entry: Path) -> None:
+        self.entry = entry.resolve()
+        self.names: dict[Path, str] = {}
+        """The variables with the exports of modules."""
         self._open: list[Path] = []
         self._text: list[str] = []
 
-    def of(self, entry: Path) -> str:
-        self._add(entry.resolve())
+    def text(self) -> str:
+        """The script."""
+        self._add(self.entry)
         return "".join(self._text)
+
+    @abstractmethod
+    def _bound(self, source: str, folder: Path) -> str:
+        """The source of a module in a folder, in which FORMS are such that the script finds what they name."""
 
     def _add(self, path: Path) -> str:
         """Add a module after those that it imports; return the name of the variable with its exports."""
         if path in self._open:
             raise CannotInlineError(f"{path.name} imports itself, by way of others")
-        if path not in self._names:
+        if path not in self.names:
             self._open.append(path)
-            text = self._inlined(path)
+            text = self._written(path)
             self._open.remove(path)
-            self._names[path] = f"module{len(self._names)}"
-            self._text.append(f"const {self._names[path]} = (() => {{\n{text}}})();\n")
-        return self._names[path]
+            self.names[path] = self._name(path)
+            self._text.append(f"{self.DECLARES} {self.names[path]} = (() => {{\n{text}}})();\n")
+        return self.names[path]
 
-    def _inlined(self, path: Path) -> str:
-        source = path.read_text(encoding="utf-8")
+    def _name(self, path: Path) -> str:
+        """Of its folder and itself: what is imported later may be of a newer version than what imports it."""
+        name = re.sub(r"\W", "_", f"module_{path.parent.name}_{path.stem}")
+        return name + "_" * sum(each.rstrip("_") == name for each in self.names.values())
+
+    def _written(self, path: Path) -> str:
+        source = _COMMENT.sub("", path.read_text(encoding="utf-8"))
 
         def imported(found: re.Match[str]) -> str:
             names = re.sub(r"\s+as\s+", ": ", found.group(1))
             return f"const {{{names}}} = {self._add((path.parent / found.group(2)).resolve())};"
 
-        def worker(found: re.Match[str]) -> str:
-            script = f'"use strict";\n{_Bundle().of(path.parent / found.group(1))}'
-            return f"startWorker({json.dumps(script)})"
-
-        exports = [found.group(2) for found in _EXPORT.finditer(source)]
-        text = _EXPORT.sub(r"\1 \2", _WORKER.sub(worker, _IMPORT.sub(imported, source)))
         rest = source
-        for known in (_COMMENT, _IMPORT, _EXPORT, _WORKER):  # types in comments are imported, too
-            rest = known.sub("", rest)
+        for form in (*self.FORMS, _IMPORT, _EXPORT):
+            rest = form.sub("", rest)
         if other := _OTHER.search(rest):
             raise CannotInlineError(f"{path.name} has a form that is not understood: {other.group().strip()[:80]}")
-        return f"{text.rstrip()}\nreturn {{ {', '.join(exports)} }};\n"
+        text = _EXPORT.sub(r"\1 \2", self._bound(_IMPORT.sub(imported, source), path.parent))
+        return f"{text.rstrip()}\nreturn {{ {', '.join(_exports(source))} }};\n"
+
+
+class _Inlined(_Bundle):
+    """A classic script; workers are texts in it."""
+
+    FORMS = (_WORKER,)
+
+    def _bound(self, source: str, folder: Path) -> str:
+        def worker(found: re.Match[str]) -> str:
+            script = f'"use strict";\n{_Inlined(folder / found.group(1)).text()}'
+            return f"startWorker({json.dumps(script)})"
+
+        return _WORKER.sub(worker, source)
+
+
+class _Joined(_Bundle):
+    """A module that stands in place of its entry. whole: of the script that imports it later, which has run by then."""
+
+    DECLARES = "export const"
+    FORMS = (_URL, _LATER)
+
+    def __init__(self, entry: Path, whole: _Joined | None = None) -> None:
+        super().__init__(entry)
+        self._whole = whole
+        self.names |= {} if whole is None else whole.names
+        self.workers: list[Path] = []
+        self.later: list[Path] = []
+
+    def text(self) -> str:
+        text, entry = super().text(), self.names[self.entry]
+        if names := _exports(self.entry.read_text(encoding="utf-8")):
+            text += f"export const {{ {', '.join(names)} }} = {entry};\n"
+        if self._whole is None:
+            return text
+        used = [name for name in self._whole.names.values() if re.search(rf"\b{name}\b", text)]
+        return f'import {{ {", ".join(used)} }} from "{self._address(self._whole.entry)}";\n{text}'
+
+    def _address(self, path: Path) -> str:
+        return f"./{Path(os.path.relpath(path, self.entry.parent)).as_posix()}"
+
+    def _bound(self, source: str, folder: Path) -> str:
+        def later(found: re.Match[str]) -> str:
+            path = (folder / found.group(1)).resolve()
+            self.later.append(path)
+            return f'await import("{self._address(path)}")'
+
+        self.workers += [(folder / name).resolve() for name in _WORKER.findall(source)]
+        source = _URL.sub(
+            lambda found: f'new URL("{self._address((folder / found.group(1)).resolve())}", import.meta.url)', source
+        )
+        return _LATER.sub(later, source)
+
+
+def _exports(source: str) -> list[str]:
+    return [found.group(2) for found in _EXPORT.finditer(source)]

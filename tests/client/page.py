@@ -384,6 +384,14 @@ class Page:
         if self.script("return document.getElementById(arguments[0]).hidden", drawer):
             self.click(f"#tools [data-drawer={drawer}]")
 
+    def speak(self, language: str) -> None:
+        """Choose the language in the help."""
+        self.script(
+            "const choice = document.querySelector('[data-language]'); choice.value = arguments[0];"
+            "choice.dispatchEvent(new Event('change'))",
+            language,
+        )
+
     def choose(self, name: str, *paths: Path) -> None:
         """Files in one of the form's pickers."""
         self.show("drawer")

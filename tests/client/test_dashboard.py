@@ -128,9 +128,7 @@ def test_the_server_package_has_every_file_of_the_page() -> None:
 
 
 @pytest.mark.parametrize(("accepted", "language"), [("de-CH,de;q=0.9,en;q=0.8", "de"), ("fr, en", "en"), ("", "en")])
-def test_the_page_comes_with_its_words_and_the_names_of_all_its_modules(
-    tmp_path: Path, accepted: str, language: str
-) -> None:
+def test_the_page_comes_with_its_words_and_one_script(tmp_path: Path, accepted: str, language: str) -> None:
     for service in running_service(tmp_path, dashboard_dir=DASHBOARD):
         answer = service.http.get("/", headers={"Accept-Language": accepted})
         text, words = answer.text, table(language)
@@ -139,10 +137,19 @@ def test_the_page_comes_with_its_words_and_the_names_of_all_its_modules(
         places = re.findall(r'data-words="(\w+)\.(\w+)"[^>]*>([^<]*)', text)
         assert len(places) > 50
         assert [html.unescape(shown) for *_, shown in places] == [words[section][code] for section, code, _ in places]
-        named = re.findall(r'rel="modulepreload" href="([^"]+)"', text)
-        assert any(each.endswith("/player/draw.js") for each in named)  # which only others import
-        assert {service.http.get("/" + each).status_code for each in named} == {200}
-        assert len(set(named)) == len(named)
-        live = service.http.get("/live.html").text
-        assert "/stage/orbit.js" in live
-        assert "/stage/compare.js" not in live
+        (script,) = re.findall(r'<script type="module" src="([^"]+)"', text)
+        joined = service.http.get("/" + script)
+        assert "immutable" in joined.headers["Cache-Control"]
+        assert "import {" not in joined.text
+        assert "export const { viewer, jobs } =" in joined.text
+        assert "class Drawing" in joined.text  # which only others import
+        assert "class Brush " not in joined.text  # which is loaded when it is wanted
+        later = service.http.get("/" + script.replace("main.js", "masks/brush.js")).text
+        assert re.match(r'import \{ [\w, ]+ \} from "\./\.\./main.js";\n', later)
+        assert service.http.get("/" + script, headers={"Accept-Encoding": "identity"}).text == joined.text
+        assert "import {" in service.http.get("/main.js").text
+        live = service.http.get(
+            "/" + re.findall(r'<script type="module" src="([^"]+)"', service.http.get("/live.html").text)[0]
+        )
+        assert "class Orbit " in live.text
+        assert "class Compare " not in live.text

@@ -63,12 +63,7 @@ def test_the_strip_and_the_report_say_in_words_what_light_and_smoke_did(site: Si
     page.script("localStorage.setItem('intrasplat-language', 'en')")
     page.open()
     view(site, page, LIGHT)
-    page.driver.execute_async_script(
-        "const [code, done] = arguments;"
-        "import(new URL('base/messages.js', document.scripts[0].src))"
-        ".then(({ setLanguage }) => { setLanguage(code); done() })",
-        language,
-    )
+    page.speak(language)
     point = "." if language == "en" else ","
     low, high = f"-1{point}5", f"{STOPS[-1]:.1f}".replace(".", point)
     stops = say("strip.stops", language, low=low, high=high, frame=8)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import http.server
 import re
+import threading
 import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -25,7 +28,7 @@ from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, SceneError, UnavailableError
 from intrasplat.names import DETAIL, RECORDED
 from intrasplat.scene.checkpoint import load_scene
-from intrasplat.scene.inline import CannotInlineError, inlined
+from intrasplat.scene.inline import CannotInlineError, inlined, joined
 from intrasplat.scene.recorded_file import name_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
@@ -351,3 +354,38 @@ def test_modules_keep_their_names_apart_and_are_made_once(driver: webdriver.Chro
     page.write_text(f"<!doctype html><script>{inlined(tmp_path / 'a.js')}</script>")
     driver.get(page.as_uri())
     WebDriverWait(driver, OPENS_WITHIN_S).until(lambda _: driver.title == "1,1,2,3,function,41")
+
+
+def test_a_page_has_one_module_its_workers_and_what_it_imports_later_shares_its_modules(
+    driver: webdriver.Chrome, tmp_path: Path
+) -> None:
+    sources = {
+        "parts/b.js": "/**\n * @returns {Promise<import('./c.js').C>}\n */\nexport const made = [];\nmade.push('b');\n",
+        "parts/w.worker.js": 'import { made } from "./b.js";\npostMessage(made.length + 40);\n',
+        "later/l.js": 'import { made } from "../parts/b.js";\nimport { own } from "./own.js";\n'
+        'const href = new URL("x.css", import.meta.url).href;\n'
+        'export const said = () => [...made, own, href.split("/").slice(-2)].join();\n',
+        "later/own.js": "export const own = 'l';\n",
+        "parts/start.js": 'import { made } from "./b.js";\nmade.push("start");\nexport const load = async () => {\n'
+        '  const { said } = await import("../later/l.js");\n  return said();\n};\n'
+        'export const work = () => new Worker(new URL("./w.worker.js", import.meta.url), { type: "module" });\n',
+        "main.js": 'import { load, work } from "./parts/start.js";\nexport const main = "main";\n'
+        "work().onmessage = async ({ data }) => (document.title = `${await load()},${data}`);\n",
+        "index.html": '<!doctype html><script type="module" src="main.js"></script>',
+    }
+    for name, source in sources.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(source)
+    scripts = joined(tmp_path / "main.js")
+    names = {path.relative_to(tmp_path.resolve()).as_posix() for path in scripts}
+    assert names == {"main.js", "parts/w.worker.js", "later/l.js"}
+    for path, script in scripts.items():
+        path.write_text(script)
+    for name in ("parts/b.js", "parts/start.js", "later/own.js"):
+        (tmp_path / name).unlink()
+    files = partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), files) as server:
+        threading.Thread(target=server.serve_forever).start()
+        driver.get(f"http://127.0.0.1:{server.server_port}/")
+        WebDriverWait(driver, OPENS_WITHIN_S).until(lambda _: driver.title == "b,start,l,later,x.css,41")
+        server.shutdown()

@@ -124,11 +124,7 @@ def test_the_choice_is_kept_and_can_be_taken_back_in_two_languages(site: Site, p
     page.choose_way("never")
     page.until_way("service", "never")
     page.until(lambda: page.shown.get("way") == "stream")
-    page.driver.execute_async_script(
-        "const done = arguments[0]; "
-        "import(new URL('base/messages.js', document.scripts[0].src))"
-        ".then(({ setLanguage }) => { setLanguage('de'); done() })"
-    )
+    page.speak("de")
     page.until_text("#way", say("way.why_never", "de"))
     page.until_text("#badge", say("screen.current", "de"))
 

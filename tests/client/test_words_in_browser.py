@@ -161,9 +161,7 @@ def test_a_change_of_language_changes_what_is_said_of_the_picture_at_rest_and_of
     page.press(site.scene(), "View")
     page.until_text("#status-text", say("view.endoscope"))
     page.until_text("#connection", say("page.ready"))
-    page.script(
-        "import(new URL('base/messages.js', document.scripts[0].src)).then(({ setLanguage }) => setLanguage('de'))"
-    )
+    page.speak("de")
     page.until_text("#status-text", say("view.endoscope", "de"))
     page.until_text("#connection", say("page.ready", "de"))
     page.script("localStorage.clear()")

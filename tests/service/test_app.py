@@ -182,18 +182,19 @@ def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_ch
     (folder / "index.html").write_text('<script type="module" src="parts/main.js"></script><a href="./live.html">')
     (folder / "live.html").write_text('<script type="module" src="parts/main.js"></script><a href="./index.html">')
     script = folder / "parts" / "main.js"
-    script.write_text("// first" + " " * 2000)
+    script.write_text("first();" + " " * 2000)
     for service in running_service(tmp_path / "data", dashboard_dir=folder):
         address = script_of_page(service)
         assert script_of_page(service, "/live.html") == script_of_page(service, "/index.html") == address
         answer = service.http.get(address)
-        assert answer.text == script.read_text()
+        assert "first();" in answer.text
         assert "immutable" in answer.headers["Cache-Control"]
         assert answer.headers["Content-Encoding"] == "gzip"
-        script.write_text("// second")
+        script.write_text("second();")
         assert script_of_page(service) != address
         late = service.http.get(address)  # of a page that was loaded before
-        assert (late.text, late.headers["Cache-Control"]) == ("// second", "no-store")
+        assert "second();" in late.text
+        assert late.headers["Cache-Control"] == "no-store"
         assert service.http.get("/parts/main.js").headers["Cache-Control"] == "no-store"
         assert 'href="./live.html"' in service.http.get("/").text
         assert_problem(service.http.get("/v/0/../../data"), 404)

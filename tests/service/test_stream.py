@@ -121,6 +121,20 @@ def test_one_connection_shows_a_finished_scene_and_a_running_job(service: LiveSe
         assert (head["id"], head["scene"], head["state"], head["iteration"]) == (2, job_id, "running", 7)
 
 
+def test_that_a_scene_is_there_is_told_without_a_view_of_it(service: LiveService, painter: Painter) -> None:
+    scene = service.finished_scene()
+    job_id = service.running_job().job_id
+    with viewing(service) as viewer:
+        for each, state in ((scene, "done"), (job_id, "running")):
+            ask(viewer, scene=each, confirm=True, id=3)
+            assert json.loads(viewer.recv(timeout=TIMEOUT_S)) == {"id": 3, "state": state}
+        service.store.purge(scene)
+        ask(viewer, scene=scene, confirm=True, id=4)
+        document = problem(viewer)
+        assert (document["status"], document["id"]) == (404, 4)
+    assert painter.asked == []
+
+
 def test_a_stream_asks_for_views_with_and_without_highlights(service: LiveService, painter: Painter) -> None:
     scene = service.finished_scene()
     with viewing(service) as viewer:

@@ -22,7 +22,8 @@ import { nameIn } from "./save.js";
  */
 
 const NOT_MODIFIED = 304;
-const SILENCE_MS = 5000;
+/** A service that says nothing for so long is not there. */
+export const SILENCE_MS = 5000;
 
 /**
  * Ask the service, with the key if there is one.

@@ -1,5 +1,5 @@
-// The jobs as the page knows them: the newest, asked for every other second, the one in view, and those of other pages of
-// the list. Their events tell the moment they change.
+// The jobs as the page knows them: the newest, asked for every other second while somebody waits for news, the one in view,
+// and those of other pages of the list. Their events tell the moment they change.
 
 import { getJob, listJobs, trouble } from "../base/api.js";
 import { JobEvents } from "../base/events.js";
@@ -11,6 +11,8 @@ import { words } from "../base/messages.js";
 const POLL_MS = 2000;
 /** While nobody looks at the list and nothing is under way, every so manieth time is enough. */
 const IDLE_POLLS = 4;
+/** The same while the service is heard otherwise. */
+const HEARD_POLLS = 20;
 /** Jobs in a page of the list. */
 export const PAGE_SIZE = 30;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
@@ -45,9 +47,11 @@ export class Jobs {
    * @param {() => void} onChange after any change of the jobs
    * @param {(text: string, kind: "good"|"starting"|"bad") => void} onConnection how the service is
    * @param {() => boolean} isWatched whether somebody looks at the list, or waits for the service
+   * @param {() => boolean} isHeard whether the service tells otherwise that it is there
    */
-  constructor(onChange, onConnection, isWatched) {
+  constructor(onChange, onConnection, isWatched, isHeard = () => false) {
     this.isWatched = isWatched;
+    this.isHeard = isHeard;
     this.onChange = onChange;
     this.onConnection = onConnection;
     /** @type {Map<string, Job>} */
@@ -71,7 +75,7 @@ export class Jobs {
     this.told = new Map(); // when the last event of a job came
     this.round = 0;
     keyEvents.addEventListener("changed", () => this.#startAnew());
-    this.ticks = 0;
+    this.polledAt = 0;
     /** Whether the service has listed its jobs. */
     this.isKnown = false;
     this.isWell = true;
@@ -79,12 +83,19 @@ export class Jobs {
     /** @type {number | null} when it was first missed */
     this.missedMs = null;
     setInterval(() => this.#tick(), POLL_MS);
+    addEventListener("focus", () => this.#look());
+    document.addEventListener("visibilitychange", () => this.#look());
     this.poll();
   }
 
   #tick() {
     const isBusy = this.isWatched() || !this.isWell || [...this.byId.values()].some(isActive);
-    if (isBusy || ++this.ticks % IDLE_POLLS === 0) this.poll();
+    if (isBusy || ++this.ticks >= (this.isHeard() ? HEARD_POLLS : IDLE_POLLS)) this.poll();
+  }
+
+  /** Somebody comes back to the page. */
+  #look() {
+    if (!document.hidden && performance.now() - this.polledAt > POLL_MS) this.poll();
   }
 
   /** @param {string} id the points of its curve so far */
@@ -118,7 +129,8 @@ export class Jobs {
   /** Ask for all jobs now. */
   async poll() {
     const round = ++this.round;
-    const askedAt = performance.now();
+    const askedAt = (this.polledAt = performance.now());
+    this.ticks = 0;
     try {
       const { jobs, next } = await listJobs({ limit: PAGE_SIZE });
       if (round !== this.round) return; // a newer answer is there, or comes

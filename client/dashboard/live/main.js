@@ -48,10 +48,10 @@ const ICONS = {
 
 const get = (id) => document.getElementById(id);
 
-const clock = new FeedClock();
-const picture = new LivePicture(get("live-picture"), clock);
-const model = new ModelPicture(get("model-picture"), clock);
-const look = new Look(model, clock);
+export const clock = new FeedClock();
+export const picture = new LivePicture(get("live-picture"), clock);
+export const model = new ModelPicture(get("model-picture"), clock);
+export const look = new Look(model, clock);
 const tape = new Tape({ slider: get("tape"), svg: get("tape-drawing"), ticks: get("tape-ticks") }, look, clock);
 const health = new Health({ summary: get("health-summary"), list: get("health-list"), why: get("why") });
 const scopes = new Scopes(() => allow());
@@ -60,7 +60,7 @@ const keeping = new Keeping({ button: get("keep"), line: get("kept") }, clock, (
   tape.mark({ atS: toS, fromS, kind: "kept" });
 });
 const over = { stage: get("model-stage"), canvas: get("model-picture"), over: get("model-over") };
-const measuring = new LiveMeasure({ ...over, told: get("measured"), button: get("measure") }, look, model);
+export const measuring = new LiveMeasure({ ...over, told: get("measured"), button: get("measure") }, look, model);
 
 /** @type {import("./feeds.js").Feed | null} as it was reported last */
 let feed = null;
@@ -349,4 +349,3 @@ function follow() {
 addEventListener("hashchange", follow);
 addEventListener("pagehide", () => push?.end());
 follow();
-export { clock, look, measuring, model, picture };

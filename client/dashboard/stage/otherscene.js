@@ -1,7 +1,7 @@
 // Another scene of the library, seen from the place and at the moment of the scene in view: a picture of it follows each
 // picture that is shown. At home it is its own endoscope's view; elsewhere the place in mm holds in each scene's own world.
 
-import { getCameras, getJob, getReport, stillThere } from "../base/api.js";
+import { getCameras, getJob, getReport } from "../base/api.js";
 import { pause } from "../base/pause.js";
 import { isPending } from "../library/trustlight.js";
 import { Cameras } from "../player/camera.js";
@@ -163,7 +163,7 @@ export class OtherScene {
   /** Throws the error, unless only recorded frames are lacking. */
   async #lack(error, { shown: { layer } }) {
     if (!OF_FRAMES.includes(layer) || !LACKING.includes(error.status)) throw error;
-    await stillThere(this.scene);
+    await this.pictures.confirm(this.scene);
     if (this.isClosed) return;
     this.#take(null);
     this.lacksFrames = true;
@@ -186,10 +186,10 @@ export class OtherScene {
   async #confirm() {
     if (this.isAsking || performance.now() - this.confirmedAt < CONFIRM_MS) return;
     try {
-      await stillThere(this.scene);
+      await this.pictures.confirm(this.scene);
       this.#hear();
     } catch (error) {
-      await this.#trouble(error);
+      if (!error.isOvertaken) await this.#trouble(error);
     }
   }
 

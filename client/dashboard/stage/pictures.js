@@ -1,6 +1,6 @@
 // Where pictures come from: the stream, and one by one from GET /render while there is no stream.
 
-import { bodyOf, request } from "../base/api.js";
+import { bodyOf, request, SILENCE_MS, stillThere } from "../base/api.js";
 import { keyEvents } from "../base/key.js";
 import { noticeWords, words } from "../base/messages.js";
 import { Line } from "./line.js";
@@ -123,11 +123,21 @@ export class Pictures {
     const level = isFull || view.layer === RECORDED ? 0 : line.level;
     const wanted = { ...view, ...line.reduction(level, width) };
     const began = performance.now();
-    const picture = this.#isStreamed(view) ? await this.#fromStream(wanted) : await this.#fromPath(pathOf(wanted));
+    const picture = this.#isStreamed(view) ? await this.#inTime(this.stream.ask(wanted), ANSWER_MS) : await this.#fromPath(pathOf(wanted));
     if (picture.scene !== view.scene) throw new Error(words("page.other_scene"));
     if (view.layer !== RECORDED) line.note(picture.blob.size, performance.now() - began, picture.totalMs || 0, level);
     picture.isReduced = level > 0;
     return picture;
+  }
+
+  /**
+   * Return if a finished scene is still there; throws as a picture of it would. Over the stream that costs the line least.
+   * @param {string} scene
+   */
+  async confirm(scene) {
+    this.#keepOpen();
+    if (!this.stream.isOpen || this.stream.isBusy) return stillThere(scene);
+    return this.#inTime(this.stream.confirm(scene), SILENCE_MS);
   }
 
   /** @param {View} view */
@@ -154,10 +164,11 @@ export class Pictures {
     return askOnce(path, AbortSignal.any([this.controller.signal, AbortSignal.timeout(ANSWER_MS)]));
   }
 
-  async #fromStream(view) {
-    const timer = setTimeout(() => this.stream.close(), ANSWER_MS); // a connection that is silent for this long is dead
+  /** The stream's answer; a connection that is silent for this long is dead. */
+  async #inTime(answer, ms) {
+    const timer = setTimeout(() => this.stream.close(), ms);
     try {
-      return await this.stream.ask(view);
+      return await answer;
     } finally {
       clearTimeout(timer);
     }

@@ -47,6 +47,10 @@ export class Stream {
     return this.socket?.readyState === WebSocket.OPEN;
   }
 
+  get isBusy() {
+    return this.pending.size > 0;
+  }
+
   get isConnecting() {
     return this.socket?.readyState === WebSocket.CONNECTING;
   }
@@ -86,9 +90,19 @@ export class Stream {
     });
   }
 
+  /**
+   * Ask whether a scene is there; answered as a view is.
+   * @param {string} scene
+   * @returns {Promise<void>}
+   */
+  confirm(scene) {
+    return this.ask({ scene, confirm: true });
+  }
+
   #take(data, key) {
     if (typeof data === "string") {
       const document = JSON.parse(data);
+      if (document.status === undefined) return this.#answered(document.id)?.resolve(); // it is there
       const problem = new Problem(document.status, document, document.retry_after_s);
       if (problem.status === 401 && key === currentKey()) askForKey(key ? wrongKeyWords(problem) : problem.message);
       if (document.id === undefined || document.id === null) this.#fail(problem);

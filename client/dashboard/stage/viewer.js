@@ -2,7 +2,6 @@
 // once it has the scene. Now and then the service is asked: for the newest picture of a job that trains, else only whether
 // the scene is still there, which notices a purge and keeps the status true.
 
-import { stillThere } from "../base/api.js";
 import { figure, languageEvents, words } from "../base/messages.js";
 import { pause } from "../base/pause.js";
 import { Clip } from "./clip.js";
@@ -224,10 +223,10 @@ export class Viewer extends EventTarget {
     const { scene, visit } = this;
     this.isConfirming = true;
     try {
-      await stillThere(scene);
+      await this.pictures.confirm(scene);
       if (visit === this.visit) this.screen.confirm();
     } catch (error) {
-      if (visit === this.visit) this.#fail(error);
+      if (visit === this.visit && !error.isOvertaken) this.#fail(error);
     }
     this.isConfirming = false;
   }
