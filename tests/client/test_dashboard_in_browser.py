@@ -328,10 +328,12 @@ def test_a_deleted_scene_leaves_a_receipt_and_no_picture(site: Site, page: Page)
     scene = site.scene()
     page.press(scene, "View")
     page.until_state("live")
+    page.script("sessionStorage.setItem(arguments[0], '[1]')", f"intrasplat-strokes-{scene}")
     page.press(scene, "Delete")
     page.until(lambda: page.find("#confirm").is_displayed())
     page.click("#confirm [value=yes]")
     page.until_text("#jobs-message", "are deleted for good")
+    assert page.script("return sessionStorage.getItem(arguments[0])", f"intrasplat-strokes-{scene}") is None
     assert "nothing is left" in page.text("#jobs-message")
     page.until_state("none")
     assert page.shade == -1

@@ -2,6 +2,7 @@
 // and those of other pages of the list. Their events tell the moment they change.
 
 import { getJob, listJobs, trouble } from "../base/api.js";
+import { storeStrokes } from "../base/drafts.js";
 import { JobEvents } from "../base/events.js";
 import { keyEvents } from "../base/key.js";
 import { words } from "../base/messages.js";
@@ -117,13 +118,19 @@ export class Jobs {
 
   /** @param {string} id of a job that was purged */
   forget(id) {
-    this.gone.add(id);
-    this.byId.delete(id);
+    this.#lose(id);
     this.kept.delete(id);
     this.newest = this.newest.filter((each) => each !== id);
     this.scores.delete(id);
     this.told.delete(id);
     this.onChange();
+  }
+
+  /** It is no more, and what was painted for it goes with it. */
+  #lose(id) {
+    this.gone.add(id);
+    this.byId.delete(id);
+    storeStrokes(id, []);
   }
 
   /** Ask for all jobs now. */
@@ -237,8 +244,7 @@ export class Jobs {
       if (this.byId.has(id) || id === this.viewed || this.awaited.includes(id)) this.byId.set(id, job);
     } catch (error) {
       if (error.status !== 404) throw error;
-      this.byId.delete(id);
-      this.gone.add(id);
+      this.#lose(id);
     }
     this.onChange();
   }
