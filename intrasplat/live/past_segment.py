@@ -30,8 +30,6 @@ from intrasplat.scene.recorded_file import EYES, MASK, name_of
 from intrasplat.scene.recorded_video import encoded
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.training_pictures import TrainingPictures, coded
-from intrasplat.splat.deformation import SharedBasis
-from intrasplat.splat.layout import MEAN
 from intrasplat.view.recorded import mask_png
 
 NAME = re.compile(r"(\d{8})-(-?\d{1,18})-(-?\d{1,18})-(\d{1,18})-(\d{1,18})", re.ASCII)
@@ -94,7 +92,7 @@ class PastSegment:
         """
         target, draft = folder / self.name, folder / f"{WRITING}{self.name}"
         try:
-            save_scene(draft, _anchored(_drawn(scene)), _recorded(scene.pictures), halved=HALVED)
+            save_scene(draft, _drawn(scene), _recorded(scene.pictures), halved=HALVED)
             move_folder(draft, target)
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)
@@ -131,17 +129,6 @@ def _drawn(scene: TrainedScene) -> TrainedScene:
     return replace(
         scene, gaussians=gaussians, deformation=scene.deformation.select(rows), seen=scene.seen[rows].contiguous()
     )
-
-
-def _anchored(scene: TrainedScene) -> TrainedScene:
-    """The same scene with the mean of the weights of its motion in the centres at rest: float16 has small weights."""
-    motion = scene.deformation
-    assert isinstance(motion, SharedBasis)
-    weight = motion.weight.clone()
-    anchor = weight[:, MEAN].mean(-1)
-    weight[:, MEAN] -= anchor[..., None]
-    gaussians = replace(scene.gaussians, mean=scene.gaussians.mean + anchor)
-    return replace(scene, gaussians=gaussians, deformation=replace(motion, weight=weight))
 
 
 def _in_memory(pictures: TrainingPictures | None) -> int:

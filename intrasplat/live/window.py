@@ -25,9 +25,10 @@ from intrasplat.poses.rigid import inverse
 from intrasplat.scene.recorded_video import RecordedEye
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.backend import CPU, Device, make_model
+from intrasplat.splat.constants import SH_C0
 from intrasplat.splat.deformation import SharedBasis
 from intrasplat.splat.gaussians import Gaussians
-from intrasplat.splat.layout import ROWS
+from intrasplat.splat.layout import COLOUR, LOG_SCALE, ROWS
 from intrasplat.splat.model import FIRST_MOMENTS
 from intrasplat.splat.step import Target, TrainingFrame
 from intrasplat.train.targets import TrainingFrames, solid_depth_mm
@@ -46,6 +47,11 @@ MOTION_EVERY = 3
 BETWEEN = 1 / 128
 """The squared error half-way between two frames, as a share of that at a frame that is left out: 1 / 16 for smooth
 motion without noise; phantoms show less."""
+USUAL_PULL = 0.02
+"""Share of its distance from the usual size that a Gaussian's log-scale loses with each frame. Without it Gaussians
+become ever thinner: Adam's steps are as large for what no picture determines."""
+MAX_COLOUR = 0.6 / SH_C0
+"""Largest constant harmonic: a colour 0.1 beyond black and white."""
 SIDES = (-0.5, 0.5)
 """Camera.side of the left and the right eye, for the gloss."""
 
@@ -117,6 +123,7 @@ class Window:
         self.model = make_model(gaussians, motion, camera.width, camera.height, device)
         self.scale, self.segment_frames = first.scale, segment_frames
         self.moments = [first.at(0)]
+        self._usual_size = float(gaussians.log_scale.median())
 
     @property
     def slot(self) -> int:
@@ -137,10 +144,17 @@ class Window:
         return self.model.parameters()[WEIGHT]
 
     def give_up(self) -> None:
-        """Forget the first segment. The motion's weights and Adam's moments of the others move to its slots."""
+        """Forget the first segment. The motion's weights and Adam's moments of the others move to its slots.
+
+        The mean of their weights becomes part of the canonical state, or float16 could not store weights after hours.
+        """
         count, arrays = self.segment_frames, self.model.arrays()
         for name in (WEIGHT, FIRST_MOMENTS, SECOND_MOMENTS, STEPS):
             arrays[name][:count].copy_(arrays[name][count:].clone())
+        mean = arrays[WEIGHT][:count].mean(0)
+        arrays[WEIGHT][:count] -= mean
+        arrays["canonical"] += mean
+        self._usual_size = float(arrays["canonical"][LOG_SCALE].median())
         self.moments = [moment.at(slot) for slot, moment in enumerate(self.moments[count:])]
 
     def append(self, moment: Moment, moved: Sequence[tuple[slice, NDArray[np.float32]]] = ()) -> None:
@@ -151,7 +165,15 @@ class Window:
         weight = arrays[WEIGHT][last + 1]
         for channels, change in moved:
             weight[channels] += torch.from_numpy(change).to(weight.device)
+        self._restrain(arrays["canonical"], weight)
         self.moments.append(moment.at(last + 1))
+
+    def _restrain(self, canonical: torch.Tensor, weight: torch.Tensor) -> None:
+        """Restrain sizes and colours of a frame, by the canonical state [C, N]. weight: [C, N] the frame's."""
+        size = canonical[LOG_SCALE] + weight[LOG_SCALE]
+        canonical[LOG_SCALE] -= USUAL_PULL * (size - self._usual_size)
+        colour = canonical[COLOUR] + weight[COLOUR]
+        canonical[COLOUR] += colour.clamp(-MAX_COLOUR, MAX_COLOUR) - colour
 
     def shown(self) -> DepthClip:
         """The newest frame's left eye as the model shows it, with the recorded one where the model has nothing."""

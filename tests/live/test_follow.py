@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from intrasplat.clip.types import RgbFrame
@@ -17,10 +18,10 @@ from intrasplat.live.eyes import EyesSettings
 from intrasplat.live.follow import Added, Follower, FollowSettings
 from intrasplat.live.pair import FeedPair
 from intrasplat.live.past_segment import PastSegment
+from intrasplat.live.window import MAX_COLOUR
 from intrasplat.names import SCENE
 from intrasplat.scene.scene import TrainedScene, check
-from intrasplat.splat.deformation import SharedBasis
-from intrasplat.splat.layout import MEAN
+from intrasplat.splat.layout import COLOUR, LOG_SCALE, MEAN
 from intrasplat.splat.metrics import psnr_tissue
 from intrasplat.view.render import render_frame
 from lab.phantom import CameraPath, Motion, Phantom, PhantomSettings, make_phantom
@@ -96,7 +97,7 @@ def test_a_stored_segment_has_half_the_bytes_and_the_same_views(tmp_path: Path) 
     follower = Follower(phantom.settings.calibration, SETTINGS, on_segment=segments.append)
     for number in range(7):
         follower.add(_pair(phantom, number))
-    stored = PastSegment.of(0, segments[0]).written(tmp_path, _far_from_rest(segments[0]))
+    stored = PastSegment.of(0, segments[0]).written(tmp_path, segments[0])
     assert stored.path is not None
     assert (stored.path / SCENE).stat().st_size < 0.6 * segments[0].byte_count
     for number in range(3):
@@ -111,14 +112,33 @@ def test_a_stored_segment_has_half_the_bytes_and_the_same_views(tmp_path: Path) 
         assert abs(next(shown) - next(shown)) < 0.05
 
 
-def _far_from_rest(scene: TrainedScene) -> TrainedScene:
-    """The same scene, as after hours of motion: it moves 1000 units away from where its centres are at rest."""
-    motion = scene.deformation
-    assert isinstance(motion, SharedBasis)
-    weight = motion.weight.clone()
-    weight[:, MEAN] += 1000.0
-    gaussians = replace(scene.gaussians, mean=scene.gaussians.mean - 1000.0)
-    return replace(scene, gaussians=gaussians, deformation=replace(motion, weight=weight))
+def test_what_a_segment_gives_up_changes_no_other_frame_and_leaves_small_weights() -> None:
+    window = _following(_phantom("pull"), 6)._window
+    assert window is not None
+    assert window.is_full
+    window.weights()[:, MEAN] += 100.0  # as after long motion
+    window.model.parameters()["canonical"][MEAN] -= 100.0
+    before = [np.array(window.model.deformed_mean(slot)) for slot in range(3, 6)]
+    window.give_up()
+    for slot, mean in enumerate(before):
+        assert np.allclose(window.model.deformed_mean(slot), mean, atol=2e-3)
+    assert float(window.weights()[:3].mean(0).abs().max()) < 1e-3
+
+
+def test_sizes_and_colours_do_not_run_away() -> None:
+    window = _following(_phantom("still"), 2)._window
+    assert window is not None
+    canonical = window.model.parameters()["canonical"]
+    usual = float(canonical[LOG_SCALE].median())
+    canonical[LOG_SCALE][0, ::4] -= 6.0
+    canonical[COLOUR, :9] = torch.tensor([9.0, -9.0, 1.0]).repeat(3)
+    for _ in range(150):
+        if window.is_full:
+            window.give_up()
+        window.append(window.newest)
+    state = canonical + window.weights()[window.slot]
+    assert float((state[LOG_SCALE] - usual).abs().max()) < 0.5
+    assert torch.allclose(state[COLOUR, :9], torch.tensor([MAX_COLOUR, -MAX_COLOUR, 1.0]).repeat(3), atol=0.2)
 
 
 def test_a_segment_does_not_change_and_can_be_stored() -> None:
