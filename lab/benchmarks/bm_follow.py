@@ -1,10 +1,13 @@
 """How well, how soon and how steadily a follower follows a feed: a clip is played to and fro, each pair at its time.
 
     python -m lab.benchmarks.bm_follow [--clips d4d_stereo phantom:breathing:72frames:stereo ...] [--width 320]
-        [--seconds 10] [--fps 30] [--pace real | --pace 6 --steps 12] [--views-hz 5] [--no-offline]
+        [--seconds 10] [--fps 30] [--pace real | --pace 6 --steps 12] [--views-hz 5] [--cover-s 0] [--no-offline]
 
 --pace real: by the clock; the newest pair is taken whenever the follower is free, beside a thread that asks for a view
 views-hz times a second. --pace K: every K-th pair is used and gets --steps steps, whatever the machine can do.
+
+--cover-s: seconds from the middle of the run for which the lens is covered: its pairs are black. Printed is how long
+after it the first pair was followed in the same world.
 
 Scores are psnr_tissue in dB, of the left and the right eye, and causal: `now` is a pair before it trains, as the model
 shows the newest moment; `copy` beside it the last used pair as it is, whose left picture is warped for the right eye;
@@ -66,6 +69,8 @@ class Played:
     calibration: RectifiedCalibration | RawCalibration
     fps: float
     path_mm: NDArray[np.float64] | None = None
+    covered: range = range(0)
+    """Pairs of the feed that are black."""
 
     def place(self, number: int) -> int:
         """The clip's frame that a pair of the feed shows."""
@@ -74,7 +79,10 @@ class Played:
         return min(place, 2 * last - place)
 
     def pair(self, number: int, arrived_at: float) -> FeedPair:
-        return FeedPair(*self.pairs[self.place(number)], number / self.fps, arrived_at, number)
+        left, right = self.pairs[self.place(number)]
+        if number in self.covered:
+            left, right = np.zeros_like(left), np.zeros_like(right)
+        return FeedPair(left, right, number / self.fps, arrived_at, number)
 
 
 @dataclass(eq=False)
@@ -109,13 +117,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             settings = replace(settings, steps=options.steps)
         reader = Follower(played.calibration, settings)
         truth = [reader.read(played.pair(number, 0.0)) for number in range(len(played.pairs))]
+        middle = round(options.seconds * options.fps / 2)
+        played = replace(played, covered=range(middle, middle + round(options.cover_s * options.fps)))
         if options.pace == "real":
             found, follower = in_real_time(played, settings, options.seconds, options.views_hz, options.budget_s)
             score_past(follower, truth, played, found)
         else:
             found, follower = by_steps(played, settings, options.seconds, int(options.pace), truth)
         offline = None if options.no_offline else offline_scores(truth, played, found, options.iterations)
-        _print(name, found, _recorded(truth, played, found), offline)
+        _print(name, played, found, _recorded(truth, played, found), offline)
 
 
 def played_of(source: Source, fps: float) -> Played:
@@ -309,7 +319,9 @@ def _mean(scores: Sequence[Score]) -> Score:
     return left, right
 
 
-def _print(name: str, found: Found, recorded: Sequence[DepthClip], offline: tuple[Score, float] | None) -> None:
+def _print(
+    name: str, played: Played, found: Found, recorded: Sequence[DepthClip], offline: tuple[Score, float] | None
+) -> None:
     def texts() -> Iterator[str]:
         yield name
         yield f"used {len(found.used) / found.seconds:.2f}/s, {found.steps / len(found.used):.1f} steps each"
@@ -324,6 +336,9 @@ def _print(name: str, found: Found, recorded: Sequence[DepthClip], offline: tupl
         yield f"of the recording {flicker([clip.rgb[0] for clip in recorded], recorded):.2f}"
         if any(found.path_mm):
             yield f"path off by {np.mean(found.path_mm):.2f} mm, at most {max(found.path_mm):.2f}"
+        if played.covered:
+            again = [number for number in found.used if number >= played.covered.stop]
+            yield f"followed {(again[0] - played.covered.stop) / played.fps:.2f} s after the cover" if again else "lost"
         yield f"not used {found.lost}"
         yield f"rss {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
 
@@ -341,6 +356,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--set", nargs="*", default=[], type=lambda text: text.split("="), help="FIELD=NUMBER ...")
     parser.add_argument("--budget-s", type=float, default=0.18)
     parser.add_argument("--views-hz", type=float, default=5.0)
+    parser.add_argument("--cover-s", type=float, default=0.0)
     parser.add_argument("--iterations", type=int, default=300)
     parser.add_argument("--camera", choices=("fixed", "moving"), default="fixed")
     parser.add_argument("--no-offline", action="store_true")
