@@ -27,7 +27,7 @@ from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.wire.feeds import FeedRecord
 from intrasplat.errors import UnavailableError
-from intrasplat.live.spec import PICTURE_HEADER
+from intrasplat.live.spec import PICTURE_HEADER, STREAM_HEAD_BYTES, stream_format
 from service.access import Caller, key_missing
 from service.bodies import VIDEO_BODY
 from service.deps import AnyCaller, Deps, EarlyCaller, Services, address_of, owned_feed
@@ -42,6 +42,7 @@ KEY_PERIOD_S = 2.0
 MAX_PICTURE_BYTES = 8 * 2**20
 GOING_AWAY = 1001
 FRAMING_REMEDY = "Send for each picture its time (float64), its length (uint32), both little-endian, and its bytes."
+VIDEO_REMEDY = "Send fragmented mp4, MPEG-TS or Matroska."
 
 
 class Pushed(BaseModel):
@@ -54,7 +55,7 @@ class Pushed(BaseModel):
 async def push_video(feed_id: str, request: Request, services: Services, caller: AnyCaller) -> Pushed:
     """Push the video of a feed without a source, as it comes: fragmented mp4, MPEG-TS or Matroska.
 
-    One connection at a time pushes a feed; a new one takes the place of the one before. Bytes are read as fast as the
+    422: the first bytes are of none of them.     One connection at a time pushes a feed; a new one takes the place of the one before. Bytes are read as fast as the
     feed takes them.
     """
     await run_in_threadpool(_begin, services, caller, feed_id)
@@ -67,10 +68,31 @@ async def push_video(feed_id: str, request: Request, services: Services, caller:
                 still.check()
                 await push.send(piece)
 
-            await hand_on(services.intake.body(request), take)
+            await hand_on(_of_video(services.intake.body(request)), take)
     except ClientDisconnect:
         raise Problem(400, "The connection was closed.", field="body", remedy="Connect again.") from None
     return Pushed(bytes=push.bytes)
+
+
+async def _of_video(pieces: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:
+    """The pieces, once the first bytes tell a format that is read. Raises Problem 422 if they tell none."""
+    head = b""
+    async for piece in pieces:
+        head += piece
+        if stream_format(head) is not None:
+            yield head
+            break
+        if len(head) >= STREAM_HEAD_BYTES:
+            raise _no_video()
+    else:
+        if head:
+            raise _no_video()
+    async for piece in pieces:
+        yield piece
+
+
+def _no_video() -> Problem:
+    return Problem(422, "The first bytes are not those of a video stream.", field="body", remedy=VIDEO_REMEDY)
 
 
 @router.websocket("/{feed_id}/pictures")
