@@ -17,7 +17,15 @@ from contract.wire.rendering import RenderRequest, ReplyError
 from intrasplat.errors import ErrorCode
 from intrasplat.names import Detail, Eye, Light, Smoke
 from intrasplat.notices import NoticeCode
-from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+from intrasplat.picture import (
+    MEDIA_TYPES,
+    Highlights,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    Unseen,
+    check_depth_ends,
+)
 from intrasplat.pose import Pose, parse_pose
 from intrasplat.version import version
 from service.access import Caller
@@ -184,7 +192,8 @@ class RenderQuery(ViewQuery):
     near_mm: DepthEnd = Field(default=None, description="of layer=depth in false colours: the depth of the brightest")
     far_mm: DepthEnd = Field(
         default=None,
-        description="of layer=depth in false colours: the depth of the darkest. Without them the range is the clip's",
+        description="of layer=depth in false colours: the depth of the darkest, beyond near_mm. Without them the range "
+        "is the clip's. Elsewhere both change nothing",
     )
 
 
@@ -268,8 +277,9 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
     """The request to the worker.
 
     Raises:
-        InputError: time or pose is not valid.
+        InputError: time, pose, or the ends of the depths are not valid.
     """
+    check_depth_ends(query.near_mm, query.far_mm)
     return RenderRequest(
         scene_id=shown.scene_id,
         attempt=shown.attempt,

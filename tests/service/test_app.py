@@ -258,3 +258,4 @@ def test_depth_in_false_colours_tells_between_which_depths(
     assert service.http.get("/render", params=chosen).status_code == 200
     assert (service.painter.requests[1].near_mm, service.painter.requests[1].far_mm) == (50, 90)
     assert_problem(service.http.get("/render", params={**chosen, "near_mm": 0}), 422, "near_mm")
+    assert_problem(service.http.get("/render", params={**chosen, "near_mm": 90}), 422, "far_mm")

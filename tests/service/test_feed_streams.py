@@ -123,8 +123,8 @@ def test_a_push_ends_with_its_reason(service: LiveService, worker: FeedWorker) -
 
 def test_what_is_no_video_is_refused_and_ends_no_other_push(service: LiveService, worker: FeedWorker) -> None:
     url = f"{service.url}/feeds/{opened(service)}/video"
-    for content in (b"hello", b"this is not a video", [b"this ", b"is not", b" a video"]):
-        response = httpx.put(url, content=content, timeout=TIMEOUT_S)
+    for pieces in ([b"hello"], [b"this is not a video"], [b"this ", b"is not", b" a video"]):
+        response = httpx.put(url, content=pieces, timeout=TIMEOUT_S)
         assert (response.status_code, response.json()["field"]) == (422, "body")
     assert not worker.asked
     assert httpx.put(url, content=[MP4[:5], MP4[5:] + b"moov"], timeout=TIMEOUT_S).json() == {"bytes": 12}
