@@ -33,6 +33,7 @@ from service.bodies import VIDEO_BODY
 from service.deps import AnyCaller, Deps, EarlyCaller, Services, address_of, owned_feed
 from service.problems import Problem, problem_of
 from service.pushing import Push, SilentError, hand_on
+from service.query import check_query
 from service.sockets import FAULT, GONE, MALFORMED, NOT_ALLOWED, NOT_TEXT, Entrance, HangUpError, document_of
 
 router = APIRouter(prefix="/feeds", tags=["feeds"])
@@ -98,6 +99,7 @@ def _no_video() -> Problem:
 @router.websocket("/{feed_id}/pictures")
 async def push_pictures(feed_id: str, websocket: WebSocket, services: Services, caller: EarlyCaller) -> None:
     """Pictures of both eyes, one after the other; see the head of this file."""
+    check_query(websocket)
     if caller is not None:
         await run_in_threadpool(_pushed_feed, services, caller, feed_id)  # refused before the handshake
     with contextlib.ExitStack() as lobby:

@@ -30,6 +30,7 @@ RETRY_AFTER_S = 2
 """Default Retry-After of 423, 429 and 503."""
 RETRY_REMEDY = "Send the request again after the seconds in Retry-After."
 API_REMEDY = "The API is described at /openapi.json."
+MESSAGE_REMEDY = "Messages are described in docs/stream.md, and in short at /openapi.json."
 SPACE_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"
 LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."

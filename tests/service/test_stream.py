@@ -189,6 +189,7 @@ def test_what_cannot_be_shown_is_told_with_its_id_and_the_connection_goes_on(ser
             told = problem(viewer)
             assert (told["status"], told["field"], told["id"]) == (status, field, "x")
             assert told["detail"]
+            assert ("Did you mean" in told["remedy"] or "There are" in told["remedy"]) == (field == "zoom")
         ask(viewer, scene=scene, t=600)
         told = problem(viewer)
         assert told["status"] == 500
@@ -229,6 +230,15 @@ def test_a_purged_scene_is_shown_no_more(service: LiveService) -> None:
         service.store.purge(scene)
         ask(viewer, scene=scene)
         assert problem(viewer)["status"] == 404
+
+
+@pytest.mark.parametrize("path", ["/stream", f"/feeds/{'0' * 32}/pictures"])
+def test_parameters_in_the_address_are_refused_before_the_handshake(service: LiveService, path: str) -> None:
+    with pytest.raises(InvalidStatus) as refused, connect(f"ws://127.0.0.1:{service.port}{path}?scene=x"):
+        pass
+    told = json.loads(refused.value.response.body)
+    assert (told["status"], told["field"]) == (422, "scene")
+    assert "docs/stream.md" in told["remedy"]
 
 
 @pytest.mark.parametrize(("message", "code"), [(b"\x00", 1003), ("x" * 20_000, 1009), ("x" * 200_000, 1009)])
