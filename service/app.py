@@ -37,6 +37,7 @@ from service.deps import Deps
 from service.guard import Guard
 from service.head import HeadAsGet
 from service.metrics import Measure
+from service.missing import install_missing_handler
 from service.openapi import DescribedApp
 from service.page import page_files
 from service.problems import install_handlers
@@ -88,6 +89,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(RequestLog)
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
+    install_missing_handler(app)
     install_refusal_handler(app, deps.audit)
     scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
     for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, feed_cut, feed_push, system):

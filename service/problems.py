@@ -107,10 +107,10 @@ class Problem(Exception):
 def install_handlers(app: FastAPI) -> None:
     """Answer every exception that leaves a route with a problem document; an unexpected one remains a fault (500)."""
     for kind in (Problem, InputError, SceneError, UnavailableError, RequestValidationError, HTTPException, OSError):
-        app.add_exception_handler(kind, _answer)
+        app.add_exception_handler(kind, answer)
 
 
-async def _answer(connection: Any, error: Exception) -> Any:
+async def answer(connection: Any, error: Exception) -> Any:
     """The problem as a response to a Request. A WebSocket is refused, or closed after a last message."""
     problem = problem_of(error)
     if problem is None:
