@@ -19,7 +19,7 @@ from intrasplat.errors import TrainingDiverged
 from intrasplat.names import Eyes
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.baselines import CopyBaselines
-from intrasplat.quality.right_eye import RightScores
+from intrasplat.quality.right_eye import RightScores, too_few_steps
 from intrasplat.report import DetailScores, FrameScore, LightChanges, Report
 from intrasplat.splat.metrics import (
     clear_of_highlights,
@@ -31,7 +31,6 @@ from intrasplat.splat.metrics import (
     relit,
     ssim,
 )
-from intrasplat.train.schedule import MIN_CYCLE_EPOCHS, MIN_CYCLE_ITERATIONS
 from intrasplat.train.scoring import FrameRenderer, Mapping
 
 MIN_COVERAGE = 0.98
@@ -206,7 +205,8 @@ def scored_report(
     shown_db = None if detail is None else detail.psnr_tissue_db
     flickers = any(each.code is NoticeCode.LIGHT_FLICKERS for each in known)
     found = score_warnings(held_out, trained, baselines, shown_db, flickers=flickers)
-    found += [*right_eye_warnings(held_out, right), *_too_few_steps(first, right)]
+    found += right_eye_warnings(held_out, right)
+    found += too_few_steps(first, _mean(right.psnr_db), _mean(right.warp_db))
     scores = {
         "psnr_tissue_db": _mean(held_out.psnr_tissue_db),
         "psnr_clear_db": _mean(held_out.psnr_clear_db),
@@ -310,21 +310,6 @@ def right_eye_warnings(held_out: Scores, right: RightScores) -> list[Notice]:
             "the left eye: views from other places are less true than the endoscope's own.",
         )
     ]
-
-
-def _too_few_steps(first: Report, right: RightScores) -> list[Notice]:
-    """Warn if a model of both eyes is worse than the warped left eye after fewer steps than a cycle of training has."""
-    right_db, warp_db = _mean(right.psnr_db), _mean(right.warp_db)
-    is_worse = first.eyes == "both" and right_db is not None and warp_db is not None and right_db < warp_db
-    seen = first.iterations if first.frames_seen is None else first.frames_seen
-    is_short = first.iterations < MIN_CYCLE_ITERATIONS or seen < MIN_CYCLE_EPOCHS * first.train_count
-    if not (is_worse and is_short) or any(each.code is NoticeCode.TIME_TOO_SHORT for each in first.warnings):
-        return []
-    text = (
-        f"The model has made {first.iterations} steps and scores {right_db:.1f} dB from the right eye, where a copy of the "
-        f"left eye's picture, warped by its depth, scores {warp_db:.1f} dB: it needs more. Give a larger budget_s."
-    )
-    return [Notice.warning(NoticeCode.TIME_TOO_SHORT, text)]
 
 
 def _missing(held_out: Scores, model_db: float | None) -> list[Notice]:
