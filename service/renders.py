@@ -74,7 +74,8 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "schema": {"type": "string"},
             },
             "X-Intrasplat-Depth-Unit": {
-                "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have no unit",
+                "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have none, nor have "
+                "other layers: `format` says their levels",
                 "schema": {"type": "string", "enum": ["0.01 mm", "mm"]},
             },
             "X-Intrasplat-Depth-Range-Mm": {
@@ -162,7 +163,8 @@ class RenderQuery(ViewQuery):
     format: ImageFormat = Field(
         default=ImageFormat.PNG,
         description="png and npy are exact (depth: 16-bit png in 0.01 mm, npy in mm, 0 invalid); jpeg and webp are for "
-        "eyes, layers but rgb in false colour. error is NaN in npy, 0 in png where nothing is compared",
+        "eyes, layers but rgb in false colour. confidence and smoke: png is 8 bit, 255 is 1. error: png is 8 bit, a "
+        "value of 1 is one level of 255; where nothing is compared npy is NaN, png 0",
     )
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
     unseen: Unseen = Field(

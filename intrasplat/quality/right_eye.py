@@ -101,7 +101,7 @@ def too_few_steps(first: Report, right_db: float | None, warp_db: float | None) 
     if any(each.code is NoticeCode.TIME_TOO_SHORT for each in first.warnings):
         return []
     text = (
-        f"After {first.iterations} steps the model scores {right_db:.1f} dB from the right eye, where a copy of the left "
-        f"eye's picture, warped by its depth, scores {warp_db:.1f} dB: it needs more steps. Give a larger budget_s."
+        f"After {first.iterations} steps the model scores {right_db:.1f} dB from the right eye, where the left eye's "
+        f"picture, warped by its depth, scores {warp_db:.1f} dB: it needs more steps. Give a larger budget_s."
     )
     return [Notice.warning(NoticeCode.TIME_TOO_SHORT, text)]
