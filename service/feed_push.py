@@ -56,8 +56,8 @@ class Pushed(BaseModel):
 async def push_video(feed_id: str, request: Request, services: Services, caller: AnyCaller) -> Pushed:
     """Push the video of a feed without a source, as it comes: fragmented mp4, MPEG-TS or Matroska.
 
-    422: the first bytes are of none of them.     One connection at a time pushes a feed; a new one takes the place of the one before. Bytes are read as fast as the
-    feed takes them.
+    422: the first bytes are of none of them. One connection at a time pushes a feed; a new one takes the place of the
+    one before. Bytes are read as fast as the feed takes them.
     """
     await run_in_threadpool(_begin, services, caller, feed_id)
     address = address_of(request)

@@ -24,7 +24,7 @@ async def _answer(connection: Any, error: Any) -> Any:
 
 
 def _missing(request: Request) -> Problem | None:
-    """405 with Allow if the path has other methods, else 404. None: it is not the API's, as those of the page's files."""
+    """405 with Allow if the path has other methods, else 404. None: it is not the API's, such as one of a file."""
     paths: Mapping[str, Mapping[str, Any]] = request.app.openapi()["paths"]
     parts = request.scope["path"].split("/")
     path, there = _nearest(paths, parts)

@@ -189,7 +189,7 @@ class JobView(BaseModel):
     psnr_right_db: float | None = Field(default=None, description="the same of the right eye; None without one")
     seconds_left: float | None = Field(default=None, description="of training, as it reports them; only while it runs")
     position: int | None = Field(
-        default=None, description="jobs that will be claimed before this one; while queued, and null in the list of jobs"
+        default=None, description="jobs that will be claimed before this one; while queued; null in the list of jobs"
     )
     eta_s: float | None = Field(
         default=None, description="estimated seconds until it is done; null if unknown, and in the list of jobs"

@@ -228,7 +228,7 @@ def _rest(parts: SplitResult) -> str:
 
 
 def stream_format(head: bytes) -> str | None:
-    """FFmpeg's demuxer of a stream with these first STREAM_HEAD_BYTES; None: it is neither MPEG-TS, mp4 nor Matroska."""
+    """FFmpeg's demuxer of a stream with these first STREAM_HEAD_BYTES; None: not MPEG-TS, mp4 or Matroska."""
     if head[:1] == bytes([TS_SYNC]):
         return "mpegts"
     if head.startswith(EBML):

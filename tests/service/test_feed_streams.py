@@ -92,9 +92,7 @@ def test_pushed_video_comes_in_order_and_while_it_is_sent(service: LiveService, 
 def test_a_push_waits_for_the_feeds_process(service: LiveService) -> None:
     feed_id, answers = opened(service), list[httpx.Response]()
     push = threading.Thread(
-        target=lambda: answers.append(
-            httpx.put(f"{service.url}/feeds/{feed_id}/video", content=MP4, timeout=TIMEOUT_S)
-        )
+        target=lambda: answers.append(httpx.put(f"{service.url}/feeds/{feed_id}/video", content=MP4, timeout=TIMEOUT_S))
     )
     push.start()
     time.sleep(0.3)
