@@ -355,3 +355,13 @@ def test_what_a_viewer_sees_is_in_the_audit(guarded: LiveService) -> None:
         ask(viewer, scene=own)
         view(viewer)
     assert f'"job_id":"{own}"' in (guarded.store.data_dir / "audit.jsonl").read_text().replace(" ", "")
+
+
+def test_the_example_of_the_document_shows_views(
+    service: LiveService, painter: Painter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[2] / "docs/stream.md").read_text(encoding="utf-8")
+    example = page.split("```python\n")[1].split("```")[0]
+    exec(example.replace("8765", str(service.port)).replace("JOB", service.finished_scene()), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [f"{yaw} image/jpeg {painter.bytes} bytes" for yaw in range(-10, 11)]
