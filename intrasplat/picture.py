@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from intrasplat.errors import InputError
+
 MAX_RENDER_PIXELS = 8192 * 8192
 """Largest picture that the library and the command line draw; a service has a limit of its own."""
 MAX_JUDGED_PIXELS = 1 << 21
@@ -87,6 +89,13 @@ class IntrinsicsOverride(BaseModel):
         if self.height is not None:
             return max(1, round(self.height * width / height)), self.height
         return width, height
+
+
+def check_depth_ends(near_mm: float | None, far_mm: float | None) -> None:
+    """Return if the false colours of depth can end there; None: not known. Raises InputError, also for other layers."""
+    if near_mm is not None and far_mm is not None and far_mm <= near_mm:
+        problem = f"{far_mm:g} mm is not beyond {near_mm:g} mm, the near end."
+        raise InputError("far_mm", problem, "Give a far end beyond the near one.")
 
 
 class RecordedMasks(StrEnum):

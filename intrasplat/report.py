@@ -22,7 +22,7 @@ class FrameScore(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    frame: int = Field(ge=0)
+    frame: int = Field(ge=0, description="counted from 0; the page counts from 1")
     scored: bool = Field(
         default=True, description="False: the scores, and what they warn of, are still being measured; ask again"
     )
@@ -321,7 +321,7 @@ class Report(BaseModel):
     height: int = Field(gt=0)
     frame_count: int = Field(gt=0)
     train_count: int = Field(ge=0)
-    held_out: tuple[int, ...]
+    held_out: tuple[int, ...] = Field(description="frames, counted from 0; the page counts from 1")
     repeated: tuple[int, ...] = Field(
         description="frames in neither set: blurred held-out ones, repeats of one, nothing new, or no time for them"
     )

@@ -37,6 +37,7 @@ from service.deps import Deps
 from service.guard import Guard
 from service.head import HeadAsGet
 from service.metrics import Measure
+from service.missing import install_missing_handler
 from service.openapi import DescribedApp
 from service.page import page_files
 from service.problems import install_handlers
@@ -45,7 +46,11 @@ from service.request_log import RequestLog
 
 DESCRIPTION = (
     "A stereo endoscope clip goes in, a dynamic model of the tissue answers renders at any time and pose. "
-    "Research use only; not a medical device."
+    "Research use only; not a medical device.\n\n"
+    "The WebSocket /stream shows many views over one connection. Send the parameters of /render as a JSON text, with "
+    "an `id` of your choice. A view is one binary message: 4 bytes, big-endian, with the length of the head, the head "
+    "(JSON), the image. A JSON text with `status` is an error. docs/stream.md of the source has the messages, keys, "
+    "close codes and an example."
 )
 
 BACKGROUND_PAUSE_S = 10.0
@@ -84,6 +89,7 @@ def create_app(settings: Settings, queue: Queue, store: Store, renderer: Rendere
     app.add_middleware(RequestLog)
     app.add_middleware(Measure, metrics=deps.metrics)
     install_handlers(app)
+    install_missing_handler(app)
     install_refusal_handler(app, deps.audit)
     scene_parts = (scenes, scene_files, recorded, thumbnails, measure, exports, imports)
     for part in (reconstruct, check, tus, jobs, renders, stream, *scene_parts, feeds, feed_cut, feed_push, system):

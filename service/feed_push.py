@@ -27,12 +27,13 @@ from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
 from contract.wire.feeds import FeedRecord
 from intrasplat.errors import UnavailableError
-from intrasplat.live.spec import PICTURE_HEADER
+from intrasplat.live.spec import PICTURE_HEADER, STREAM_HEAD_BYTES, stream_format
 from service.access import Caller, key_missing
 from service.bodies import VIDEO_BODY
 from service.deps import AnyCaller, Deps, EarlyCaller, Services, address_of, owned_feed
 from service.problems import Problem, problem_of
 from service.pushing import Push, SilentError, hand_on
+from service.query import check_query
 from service.sockets import FAULT, GONE, MALFORMED, NOT_ALLOWED, NOT_TEXT, Entrance, HangUpError, document_of
 
 router = APIRouter(prefix="/feeds", tags=["feeds"])
@@ -42,6 +43,7 @@ KEY_PERIOD_S = 2.0
 MAX_PICTURE_BYTES = 8 * 2**20
 GOING_AWAY = 1001
 FRAMING_REMEDY = "Send for each picture its time (float64), its length (uint32), both little-endian, and its bytes."
+VIDEO_REMEDY = "Send fragmented mp4, MPEG-TS or Matroska."
 
 
 class Pushed(BaseModel):
@@ -54,8 +56,8 @@ class Pushed(BaseModel):
 async def push_video(feed_id: str, request: Request, services: Services, caller: AnyCaller) -> Pushed:
     """Push the video of a feed without a source, as it comes: fragmented mp4, MPEG-TS or Matroska.
 
-    One connection at a time pushes a feed; a new one takes the place of the one before. Bytes are read as fast as the
-    feed takes them.
+    422: the first bytes are of none of them. One connection at a time pushes a feed; a new one takes the place of the
+    one before. Bytes are read as fast as the feed takes them.
     """
     await run_in_threadpool(_begin, services, caller, feed_id)
     address = address_of(request)
@@ -67,15 +69,37 @@ async def push_video(feed_id: str, request: Request, services: Services, caller:
                 still.check()
                 await push.send(piece)
 
-            await hand_on(services.intake.body(request), take)
+            await hand_on(_of_video(services.intake.body(request)), take)
     except ClientDisconnect:
         raise Problem(400, "The connection was closed.", field="body", remedy="Connect again.") from None
     return Pushed(bytes=push.bytes)
 
 
+async def _of_video(pieces: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:
+    """The pieces, once the first bytes tell a format that is read. Raises Problem 422 if they tell none."""
+    head = b""
+    async for piece in pieces:
+        head += piece
+        if stream_format(head) is not None:
+            yield head
+            break
+        if len(head) >= STREAM_HEAD_BYTES:
+            raise _no_video()
+    else:
+        if head:
+            raise _no_video()
+    async for piece in pieces:
+        yield piece
+
+
+def _no_video() -> Problem:
+    return Problem(422, "The first bytes are not those of a video stream.", field="body", remedy=VIDEO_REMEDY)
+
+
 @router.websocket("/{feed_id}/pictures")
 async def push_pictures(feed_id: str, websocket: WebSocket, services: Services, caller: EarlyCaller) -> None:
     """Pictures of both eyes, one after the other; see the head of this file."""
+    check_query(websocket)
     if caller is not None:
         await run_in_threadpool(_pushed_feed, services, caller, feed_id)  # refused before the handshake
     with contextlib.ExitStack() as lobby:

@@ -43,7 +43,7 @@ def list_jobs(
     search: JobQuery,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> list[JobView] | Response:
-    """The jobs, newest first, a page at a time. Only GET /jobs/{job_id} gives the position in the queue."""
+    """The jobs, newest first, a page at a time. `position` and `eta_s` are null here: ask GET /jobs/{job_id}."""
     caller.require(KeyScope.VIEW)
     find = functools.partial(services.queue.records, caller.tenant)
     page = find_page(search, caller.tenant, find, search.state)

@@ -30,6 +30,7 @@ RETRY_AFTER_S = 2
 """Default Retry-After of 423, 429 and 503."""
 RETRY_REMEDY = "Send the request again after the seconds in Retry-After."
 API_REMEDY = "The API is described at /openapi.json."
+MESSAGE_REMEDY = "Messages are described in docs/stream.md, and in short at /openapi.json."
 SPACE_REMEDY = "Delete scenes (DELETE /scenes/{id}) or give it more room."
 MIN_FREE = "INTRASPLAT_MIN_FREE_BYTES"
 LENGTH_REMEDY = "Send Content-Length once, as a number, or chunks without it."
@@ -106,10 +107,10 @@ class Problem(Exception):
 def install_handlers(app: FastAPI) -> None:
     """Answer every exception that leaves a route with a problem document; an unexpected one remains a fault (500)."""
     for kind in (Problem, InputError, SceneError, UnavailableError, RequestValidationError, HTTPException, OSError):
-        app.add_exception_handler(kind, _answer)
+        app.add_exception_handler(kind, answer)
 
 
-async def _answer(connection: Any, error: Exception) -> Any:
+async def answer(connection: Any, error: Exception) -> Any:
     """The problem as a response to a Request. A WebSocket is refused, or closed after a last message."""
     problem = problem_of(error)
     if problem is None:

@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from contract.wire.rendering import MAX_PUSH_BYTES, PUSH_REPLACED, PushRequest, ReplyError
 from intrasplat.errors import UnavailableError
+from intrasplat.live.spec import TS_SYNC
 from service.deps import Deps
 from service.problems import Problem
 from service.renders import problem_of_reply
@@ -22,8 +23,6 @@ PATIENCE_S = 60.0
 """How long a push waits for a process that follows the feed: when it begins, and when another takes its place."""
 RETRY_S = 0.2
 END_TIMEOUT_S = 2.0
-MPEG_TS = 0x47
-"""The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
 
 
 class SilentError(Exception):
@@ -67,6 +66,7 @@ class Push:
         self._services = services
         self._request = PushRequest(scene_id=feed_id, push_id=uuid.uuid4().hex, pictures=pictures)
         self._can_be_joined = pictures
+        self._has_begun = False
 
     async def __aenter__(self) -> Push:
         self._services.metrics.pushes.inc()
@@ -76,7 +76,7 @@ class Push:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._services.metrics.pushes.dec()
-        if isinstance(error, Problem) and error.field == PUSH_REPLACED:
+        if not self._has_begun or (isinstance(error, Problem) and error.field == PUSH_REPLACED):
             return
         last = self._request.model_copy(update={"is_last": True})
         with contextlib.suppress(UnavailableError, TimeoutError):  # a feed without a process has nothing to end
@@ -90,7 +90,8 @@ class Push:
             Problem: 404: the feed has ended. 409: another push has taken the place of this one. 422: it cannot be used.
             UnavailableError: nobody follows the feed, or another process does that cannot join this stream.
         """
-        if not self.bytes and piece[:1] == bytes([MPEG_TS]):
+        self._has_begun = True
+        if not self.bytes and piece[:1] == bytes([TS_SYNC]):
             self._can_be_joined = True
         start, until_s = 0, time.monotonic() + PATIENCE_S
         while start < len(piece):

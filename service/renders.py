@@ -17,7 +17,15 @@ from contract.wire.rendering import RenderRequest, ReplyError
 from intrasplat.errors import ErrorCode
 from intrasplat.names import Detail, Eye, Light, Smoke
 from intrasplat.notices import NoticeCode
-from intrasplat.picture import MEDIA_TYPES, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+from intrasplat.picture import (
+    MEDIA_TYPES,
+    Highlights,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    Unseen,
+    check_depth_ends,
+)
 from intrasplat.pose import Pose, parse_pose
 from intrasplat.version import version
 from service.access import Caller
@@ -66,7 +74,8 @@ IMAGE_RESPONSES: dict[int | str, dict[str, object]] = {
                 "schema": {"type": "string"},
             },
             "X-Intrasplat-Depth-Unit": {
-                "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have no unit",
+                "description": "of layer=depth, what a value of 1 is; 0 is invalid. False colours have none, nor have "
+                "other layers: `format` says their levels",
                 "schema": {"type": "string", "enum": ["0.01 mm", "mm"]},
             },
             "X-Intrasplat-Depth-Range-Mm": {
@@ -154,7 +163,8 @@ class RenderQuery(ViewQuery):
     format: ImageFormat = Field(
         default=ImageFormat.PNG,
         description="png and npy are exact (depth: 16-bit png in 0.01 mm, npy in mm, 0 invalid); jpeg and webp are for "
-        "eyes, layers but rgb in false colour. error is NaN in npy, 0 in png where nothing is compared",
+        "eyes, layers but rgb in false colour. confidence and smoke: png is 8 bit, 255 is 1. error: png is 8 bit, a "
+        "value of 1 is one level of 255; where nothing is compared npy is NaN, png 0",
     )
     quality: int = Field(default=90, ge=1, le=100, description="quality of a jpeg or webp image")
     unseen: Unseen = Field(
@@ -184,7 +194,8 @@ class RenderQuery(ViewQuery):
     near_mm: DepthEnd = Field(default=None, description="of layer=depth in false colours: the depth of the brightest")
     far_mm: DepthEnd = Field(
         default=None,
-        description="of layer=depth in false colours: the depth of the darkest. Without them the range is the clip's",
+        description="of layer=depth in false colours: the depth of the darkest, beyond near_mm. Without them the range "
+        "is the clip's. Elsewhere both change nothing",
     )
 
 
@@ -268,8 +279,9 @@ def request_of(query: RenderQuery, shown: Shown, settings: Settings) -> RenderRe
     """The request to the worker.
 
     Raises:
-        InputError: time or pose is not valid.
+        InputError: time, pose, or the ends of the depths are not valid.
     """
+    check_depth_ends(query.near_mm, query.far_mm)
     return RenderRequest(
         scene_id=shown.scene_id,
         attempt=shown.attempt,

@@ -15,7 +15,7 @@ from starlette.types import Message
 from contract.access.keys import KeyScope
 from service.access import AccessRefusal, Caller, key_missing
 from service.deps import Deps, address_of
-from service.problems import API_REMEDY, Problem
+from service.problems import MESSAGE_REMEDY, Problem
 
 AUTHORIZE_TIMEOUT_S = 5.0
 """A client that connects without a key must send it within this time."""
@@ -139,5 +139,5 @@ def document_of(text: str) -> dict[str, Any] | Problem:
     except ValueError:
         document = None
     if not isinstance(document, dict):
-        return Problem(400, "The message is not a JSON object.", remedy=API_REMEDY)
+        return Problem(400, "The message is not a JSON object.", remedy=MESSAGE_REMEDY)
     return document

@@ -1,15 +1,6 @@
-"""WS /stream: many views over one connection, each for the newest request.
+"""WS /stream: many views over one connection, each for the newest request. docs/stream.md describes the messages.
 
-The client sends JSON texts: the query of /render, and an `id` of its choice that is repeated in the answer. An answer
-is one binary message: the length of its head (4 bytes, big-endian), the head (JSON, StreamHead), the image. An error
-is a JSON text: the problem document of HTTP with the `id`. The connection then stays open, unless the caller is not
-allowed (1008) or a message was not a request (1003, 1009). With keys, the first message of a browser, which cannot send
-headers, is {"authorize": KEY}.
-
-A request with `confirm` is answered by a JSON text, {"id", "state"}: the scene is there. Nothing is rendered.
-
-Of a live feed, a request with `follow` is answered once, and then with a new view whenever the feed has a newer moment,
-until the next request comes. While the feed's worker is away, each second brings the problem.
+While a feed's worker is away, a request with `follow` brings the problem each second.
 
 While a view is rendered and sent, only the newest incoming message is kept. So a viewer that sends requests faster than
 they are answered skips views, and a viewer that does not read gets one view and then none.
@@ -40,7 +31,8 @@ from service.access import AccessRefusal
 from service.connection import Answer
 from service.deps import Deps, EarlyCaller, Services
 from service.moments import moment_text
-from service.problems import API_REMEDY, Problem, fault, problem_of
+from service.problems import MESSAGE_REMEDY, Problem, fault, problem_of
+from service.query import check_query, no_such_parameter
 from service.renders import RenderQuery, answer_to, problem_of_reply, request_of
 from service.shown import Shown, find_shown
 from service.sockets import GONE, NOT_ALLOWED, NOT_TEXT, TOO_LARGE, Entrance, HangUpError, document_of
@@ -90,7 +82,8 @@ class StreamHead(BaseModel):
 
 @router.websocket("/stream")
 async def stream(websocket: WebSocket, services: Services, caller: EarlyCaller) -> None:
-    """Views one after the other; see the head of this file."""
+    """Views one after the other; see docs/stream.md."""
+    check_query(websocket)
     if caller is not None:
         caller.require(KeyScope.VIEW)  # refused before the handshake
     with contextlib.ExitStack() as lobby:
@@ -133,10 +126,10 @@ class _Viewer:
                 return
             text = message.get("text")
             if text is None:
-                raise HangUpError(NOT_TEXT, Problem(422, "A binary message is not a request.", remedy=API_REMEDY))
+                raise HangUpError(NOT_TEXT, Problem(422, "A binary message is not a request.", remedy=MESSAGE_REMEDY))
             if len(text) > MAX_MESSAGE:
                 detail = f"The message has {len(text)} characters, more than {MAX_MESSAGE}."
-                raise HangUpError(TOO_LARGE, Problem(413, detail, remedy=API_REMEDY))
+                raise HangUpError(TOO_LARGE, Problem(413, detail, remedy=MESSAGE_REMEDY))
             document = document_of(text)
             if self._entrance.is_key(document):
                 self._entrance.authorize(document)
@@ -259,8 +252,10 @@ def message_of(document: dict[str, Any]) -> StreamMessage:
         return StreamMessage.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] == "extra_forbidden":
+            raise no_such_parameter(str(first["loc"][0]), StreamMessage.model_fields) from None
         detail = f"{first['msg']} (given: {str(first['input'])[:80]!r})."
-        raise Problem(422, detail, field=str(first["loc"][0]), remedy=API_REMEDY) from None
+        raise Problem(422, detail, field=str(first["loc"][0]), remedy=MESSAGE_REMEDY) from None
 
 
 def packed(message: StreamMessage, shown: Shown, answer: Answer, total_ms: float) -> bytes:

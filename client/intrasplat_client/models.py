@@ -406,13 +406,13 @@ class FeedView(Model):
     since_s: float
     """when the state began"""
     recording: Annotated[FeedReason | str, Field(union_mode="left_to_right")] | None = None
-    """why nothing is recorded at the moment; null: it is recorded"""
+    """why nothing is recorded at the moment; null, the good case: it is being recorded"""
     received_fps: float = 0.0
     """pairs that came in a second, over the last seconds"""
     used_fps: float = 0.0
     """pairs that the model learnt a second, over the last seconds"""
     dropped: int = 0
-    """whole pairs that came in and that the model did not learn, in all"""
+    """whole pairs that came in and that the model did not learn, in all; no loss of the recording"""
     model_age_s: float | None = None
     """from the arrival of the newest pair that the model knows until now"""
     decode_lag_s: float | None = None
@@ -464,6 +464,7 @@ class FrameScore(Model):
     """One held-out frame: the model's scores and those of copying its neighbours. None: no tissue to judge."""
 
     frame: int
+    """counted from 0; the page counts from 1"""
     scored: bool = True
     """False: the scores, and what they warn of, are still being measured; ask again"""
     psnr_tissue_db: float | None
@@ -559,10 +560,11 @@ class JobView(Model):
     psnr_right_db: float | None = None
     """the same of the right eye; None without one"""
     seconds_left: float | None = None
+    """of training, as it reports them; only while it runs"""
     position: int | None = None
-    """jobs that will be claimed before this one; while queued"""
+    """jobs that will be claimed before this one; while queued; null in the list of jobs"""
     eta_s: float | None = None
-    """estimated seconds until it is done; None if unknown"""
+    """estimated seconds until it is done; null if unknown, and in the list of jobs"""
     error: JobError | None = None
     cancel_requested: bool = False
     attempt: int = 0
@@ -846,6 +848,7 @@ class Report(Model):
     frame_count: int
     train_count: int
     held_out: tuple[int, ...]
+    """frames, counted from 0; the page counts from 1"""
     repeated: tuple[int, ...]
     """frames in neither set: blurred held-out ones, repeats of one, nothing new, or no time for them"""
     frame_times_s: tuple[float, ...]

@@ -71,11 +71,14 @@ class FeedReport(BaseModel):
     text: str = Field(default="", description="the same for people; its words may change")
     since_s: float = Field(description="when the state began")
     recording: Annotated[FeedReason, known_code(FeedReason)] | None = Field(
-        default=None, description="why nothing is recorded at the moment; null: it is recorded"
+        default=None, description="why nothing is recorded at the moment; null, the good case: it is being recorded"
     )
     received_fps: float = Field(default=0.0, description="pairs that came in a second, over the last seconds")
     used_fps: float = Field(default=0.0, description="pairs that the model learnt a second, over the last seconds")
-    dropped: int = Field(default=0, description="whole pairs that came in and that the model did not learn, in all")
+    dropped: int = Field(
+        default=0,
+        description="whole pairs that came in and that the model did not learn, in all; no loss of the recording",
+    )
     model_age_s: float | None = Field(
         default=None, description="from the arrival of the newest pair that the model knows until this report"
     )

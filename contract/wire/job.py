@@ -187,9 +187,13 @@ class JobView(BaseModel):
     iterations: int | None = None
     psnr_db: float | None = Field(default=None, description="last score on held-out frames of the left eye")
     psnr_right_db: float | None = Field(default=None, description="the same of the right eye; None without one")
-    seconds_left: float | None = None
-    position: int | None = Field(default=None, description="jobs that will be claimed before this one; while queued")
-    eta_s: float | None = Field(default=None, description="estimated seconds until it is done; None if unknown")
+    seconds_left: float | None = Field(default=None, description="of training, as it reports them; only while it runs")
+    position: int | None = Field(
+        default=None, description="jobs that will be claimed before this one; while queued; null in the list of jobs"
+    )
+    eta_s: float | None = Field(
+        default=None, description="estimated seconds until it is done; null if unknown, and in the list of jobs"
+    )
     error: JobError | None = None
     cancel_requested: bool = False
     attempt: int = 0
@@ -215,6 +219,8 @@ class JobView(BaseModel):
         if record.state is JobState.DONE:
             links["scene"] = f"/scenes/{record.job_id}"
         progress = record.progress.model_dump() if record.progress else {}
+        if record.state is not JobState.RUNNING:
+            progress |= {"seconds_left": None}
         shared = record.model_dump(
             include={"state", "error", "cancel_requested", "attempt", "options", "input_bytes", "clip_of"}
             | {"created_at_s", "started_at_s", "finished_at_s"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -16,14 +17,18 @@ from intrasplat.commands.exits import ExitCode, flag_of
 from intrasplat.errors import InputError
 from intrasplat.names import Detail, Light, Smoke
 from intrasplat.notices import Notice, NoticeCode, Severity
-from intrasplat.picture import MAX_RENDER_PIXELS, Highlights, ImageFormat, IntrinsicsOverride, Layer, Unseen
+from intrasplat.picture import (
+    MAX_RENDER_PIXELS,
+    Highlights,
+    ImageFormat,
+    IntrinsicsOverride,
+    Layer,
+    Unseen,
+    check_depth_ends,
+)
 
 if TYPE_CHECKING:  # imported when needed, as it imports torch
-    import numpy as np
-    from numpy.typing import NDArray
-
     from intrasplat.scene.scene import TrainedScene
-    from intrasplat.view.depth_range import DepthRange
 
 SUFFIX_FORMATS = {
     ".png": ImageFormat.PNG,
@@ -132,6 +137,8 @@ def run_cli(options: argparse.Namespace) -> int:
     from intrasplat.view.renderer import renderer_of
 
     device = choose_device(options.device)
+    with _naming_option():
+        check_depth_ends(options.near_mm, options.far_mm)
     check_is_scene(options.scene, "SCENE")
     scene = load_scene(options.scene)
     layer = Layer(options.layer)
@@ -157,7 +164,8 @@ def run_cli(options: argparse.Namespace) -> int:
         )  # fmt: skip
         range_mm = None
         if layer is Layer.DEPTH and image_format in FOR_EYES:
-            range_mm = _depth_range(renderer_of(scene, device).depth_range, pose, options)
+            with _naming_option():
+                range_mm = renderer_of(scene, device).depth_range.chosen(pose, options.near_mm, options.far_mm)
         path.parent.mkdir(parents=True, exist_ok=True)
         error = None if recorded is None else error_levels(frame.rgb, recorded, frame.unseen)
         unseen = Unseen(options.unseen)
@@ -174,12 +182,11 @@ def run_cli(options: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def _depth_range(
-    found: DepthRange, pose: NDArray[np.float64] | None, options: argparse.Namespace
-) -> tuple[float, float]:
-    """Nearest and farthest depth of the false colours, mm. Raises InputError, which names the option."""
+@contextmanager
+def _naming_option() -> Iterator[None]:
+    """Name the option in an InputError about the parameter of a view."""
     try:
-        return found.chosen(pose, options.near_mm, options.far_mm)
+        yield
     except InputError as error:
         raise InputError(flag_of(error.field), error.problem, error.remedy) from error
 

@@ -18,8 +18,8 @@ import av
 import av.container
 import av.error
 
-from intrasplat.intake.video_header import CODECS, EBML, is_video
-from intrasplat.live.spec import PICTURE_HEADER
+from intrasplat.intake.video_header import CODECS
+from intrasplat.live.spec import PICTURE_HEADER, STREAM_HEAD_BYTES, stream_format
 from intrasplat.live.state import FeedReason
 
 PICTURE_CODECS = {b"\xff\xd8\xff": "mjpeg", b"RIFF": "webp"}
@@ -32,7 +32,6 @@ PROBE = {"probesize": str(1 << 20), "analyzeduration": "500000", "fpsprobesize":
 MAX_ERRORS = 100
 """This many damaged packets in a row end the connection."""
 MAX_STREAMS = 2
-TS_SYNC = 0x47
 
 
 class SourceEnd(Exception):
@@ -147,9 +146,9 @@ class PacketSource:
             if self._bytes is None:
                 path = Path(self._request["file"])
                 with path.open("rb") as file:
-                    form = _format(file.read(12))
+                    form = _format(file.read(STREAM_HEAD_BYTES))
                 return av.open(str(path), "r", format=form, options=options | {"protocol_whitelist": "file"})
-            form = _format(self._bytes.head(12))
+            form = _format(self._bytes.head(STREAM_HEAD_BYTES))
             return av.open(self._bytes, "r", format=form, options=options | PROBE | {"protocol_whitelist": "none"})
         except (av.error.FFmpegError, OSError, ValueError) as error:
             if isinstance(error, (EOFError, ConnectionError)):
@@ -214,13 +213,11 @@ def _format(head: bytes) -> str:
     """FFmpeg's demuxer of a stream that begins so."""
     if not head:
         raise SourceEnd(FeedReason.CLOSED, "the source closed the connection before a picture came")
-    if head[0] == TS_SYNC:
-        return "mpegts"
-    if head.startswith(EBML):
-        return "matroska"
-    if is_video(head) or head[4:8] in (b"styp", b"moof"):
-        return "mov"
-    raise SourceEnd(FeedReason.UNDECODABLE, "the source sends neither an MPEG transport stream, nor mp4 nor Matroska")
+    form = stream_format(head)
+    if form is None:
+        text = "the source sends neither an MPEG transport stream, nor mp4 nor Matroska"
+        raise SourceEnd(FeedReason.UNDECODABLE, text)
+    return form
 
 
 def _answer(connected: int, http: dict[str, Any]) -> HTTPResponse:

@@ -15,6 +15,7 @@ from urllib.parse import SplitResult, quote, unquote, urlsplit
 from intrasplat.errors import InputError, NotListedError
 from intrasplat.intake.addresses import is_permitted
 from intrasplat.intake.limits import ClipLimits
+from intrasplat.intake.video_header import EBML, is_video
 
 FIELD = "source"
 MAX_URL_CHARACTERS = 2000
@@ -25,6 +26,11 @@ FeedLayout = Literal["auto", "sbs", "tb", "two"]
 
 PICTURE_HEADER = struct.Struct("<dI")
 """Before each pushed picture: the sender's time, s, or NaN; bytes."""
+
+TS_SYNC = 0x47
+"""The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
+STREAM_HEAD_BYTES = 8
+"""So many first bytes of a stream tell its format."""
 
 _URL_TEXT = re.compile(r"[!-~]+", re.ASCII)
 _PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "tcp": None, "udp": None}
@@ -219,3 +225,12 @@ def bracketed(host: str) -> str:
 def _rest(parts: SplitResult) -> str:
     path = quote(parts.path, safe="/%:;=@!$&'()*+,~") or "/"
     return f"{path}?{parts.query}" if parts.query else path
+
+
+def stream_format(head: bytes) -> str | None:
+    """FFmpeg's demuxer of a stream with these first STREAM_HEAD_BYTES; None: not MPEG-TS, mp4 or Matroska."""
+    if head[:1] == bytes([TS_SYNC]):
+        return "mpegts"
+    if head.startswith(EBML):
+        return "matroska"
+    return "mov" if is_video(head) or head[4:8] in (b"styp", b"moof") else None

@@ -19,7 +19,7 @@ from intrasplat.errors import TrainingDiverged
 from intrasplat.names import Eyes
 from intrasplat.notices import Notice, NoticeCode
 from intrasplat.quality.baselines import CopyBaselines
-from intrasplat.quality.right_eye import RightScores
+from intrasplat.quality.right_eye import RightScores, too_few_steps
 from intrasplat.report import DetailScores, FrameScore, LightChanges, Report
 from intrasplat.splat.metrics import (
     clear_of_highlights,
@@ -206,6 +206,7 @@ def scored_report(
     flickers = any(each.code is NoticeCode.LIGHT_FLICKERS for each in known)
     found = score_warnings(held_out, trained, baselines, shown_db, flickers=flickers)
     found += right_eye_warnings(held_out, right)
+    found += too_few_steps(first, _mean(right.psnr_db), _mean(right.warp_db))
     scores = {
         "psnr_tissue_db": _mean(held_out.psnr_tissue_db),
         "psnr_clear_db": _mean(held_out.psnr_clear_db),

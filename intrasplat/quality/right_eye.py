@@ -17,8 +17,11 @@ from numpy.typing import NDArray
 
 from intrasplat.clip import DepthClip
 from intrasplat.errors import TrainingDiverged
+from intrasplat.notices import Notice, NoticeCode
+from intrasplat.report import Report
 from intrasplat.splat.metrics import Image, clear_of_highlights, psnr_tissue
 from intrasplat.stereo.right_eye import nearest_known
+from intrasplat.train.schedule import MIN_CYCLE_EPOCHS, MIN_CYCLE_ITERATIONS
 from intrasplat.train.scoring import FrameRenderer, Mapping, judged_pixels
 
 FAR_MM = 1e6
@@ -84,3 +87,21 @@ def warped_left(clip: DepthClip, index: int) -> NDArray[np.uint8]:
 def _scores(image: Image, truth: NDArray[np.uint8], judged: NDArray[np.bool_]) -> tuple[float, float]:
     """psnr_tissue in dB over the judged pixels, and over those without highlights."""
     return psnr_tissue(image, truth, judged), psnr_tissue(image, truth, judged & clear_of_highlights(image, truth))
+
+
+def too_few_steps(first: Report, right_db: float | None, warp_db: float | None) -> list[Notice]:
+    """Warn if a model of both eyes is worse than the warped left eye after fewer steps than a cycle of training has.
+
+    right_db, warp_db: mean psnr_db and warp_db of its RightScores; None: not known.
+    """
+    seen = first.iterations if first.frames_seen is None else first.frames_seen
+    is_short = first.iterations < MIN_CYCLE_ITERATIONS or seen < MIN_CYCLE_EPOCHS * first.train_count
+    if first.eyes != "both" or right_db is None or warp_db is None or right_db >= warp_db or not is_short:
+        return []
+    if any(each.code is NoticeCode.TIME_TOO_SHORT for each in first.warnings):
+        return []
+    text = (
+        f"After {first.iterations} steps the model scores {right_db:.1f} dB from the right eye, where the left eye's "
+        f"picture, warped by its depth, scores {warp_db:.1f} dB: it needs more steps. Give a larger budget_s."
+    )
+    return [Notice.warning(NoticeCode.TIME_TOO_SHORT, text)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from intrasplat.camera import to_camera
 from intrasplat.clip import spread
-from intrasplat.errors import InputError
+from intrasplat.picture import check_depth_ends
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.splat.model import Model
 from intrasplat.train.targets import MEDIAN_DEPTH_UNITS
@@ -66,7 +66,5 @@ class DepthRange:
         """
         own_near_mm, own_far_mm = self.before(world_from_camera)
         near_mm, far_mm = own_near_mm if near_mm is None else near_mm, own_far_mm if far_mm is None else far_mm
-        if far_mm <= near_mm:
-            problem = f"{far_mm:g} mm is not beyond {near_mm:g} mm, the near end."
-            raise InputError("far_mm", problem, "Give a far end beyond the near one.")
+        check_depth_ends(near_mm, far_mm)
         return near_mm, far_mm

@@ -133,7 +133,10 @@ def test_render_colours_depth_between_the_ends_that_are_given(
     assert main(["render", str(scene), *ends, *depth, str(tmp_path / "no.webp")]) == ExitCode.BAD_INPUT
     assert "--far-mm" in capsys.readouterr().err
     assert not (tmp_path / "no.webp").exists()
-    assert main(["render", str(scene), "--t", "0", *ends, "--out", str(tmp_path / "colour.png")]) == ExitCode.OK
+    colour = ["--t", "0", "--out", str(tmp_path / "colour.png")]
+    assert main(["render", str(scene), *ends, *colour]) == ExitCode.BAD_INPUT
+    assert "--far-mm" in capsys.readouterr().err
+    assert main(["render", str(scene), "--near-mm", "50", "--far-mm", "90", *colour]) == ExitCode.OK
     assert "--far-mm change nothing" in capsys.readouterr().err
 
 

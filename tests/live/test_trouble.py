@@ -276,6 +276,12 @@ def test_without_a_sender_a_push_waits_for_nothing(opened: Open) -> None:
     with suppress(UnavailableError):
         source.write(b"\x00garbage" * 1000)
     until_state(source, FeedState.STALLED, FeedReason.UNDECODABLE)
+    for text in (b"this is not a video", b"Good morning, feed"):
+        source = opened()
+        source.write(text)
+        source.end_push()
+        until_state(source, FeedState.STALLED)
+        assert source.status.reason is not None
 
 
 def test_a_process_that_hangs_is_replaced(opened: Open) -> None:

@@ -13,9 +13,25 @@ from intrasplat.errors import UnavailableError
 from tests.service.under_test import ServiceUnderTest, assert_problem, bearer, running_service
 
 
-@pytest.mark.parametrize(("method", "path", "status"), [("GET", "/nothing", 404), ("PUT", "/jobs", 405)])
-def test_what_does_not_exist_is_a_problem_too(service: ServiceUnderTest, method: str, path: str, status: int) -> None:
-    assert_problem(service.http.request(method, path), status)
+@pytest.mark.parametrize("has_page", [False, True])
+def test_what_does_not_exist_is_a_problem_that_names_what_does(tmp_path: Path, has_page: bool) -> None:
+    page = tmp_path / "page"
+    page.mkdir()
+    (page / "index.html").write_text("<!doctype html><title>intrasplat</title>")
+    for service in running_service(tmp_path / "data", dashboard_dir=page if has_page else None):
+        assert_problem(service.http.get("/nothing"), 404)
+        job = f"/jobs/{service.upload().json()['id']}"
+        for method, path, allowed, named in (
+            ("PUT", "/jobs", "GET, HEAD", "GET /jobs (list_jobs)"),
+            ("GET", "/reconstruct", "POST", "POST /reconstruct (reconstruct)"),
+            ("POST", job, "DELETE, GET, HEAD, PATCH", "DELETE /jobs/{job_id} (cancel_job)"),
+        ):
+            response = service.http.request(method, path)
+            assert named in assert_problem(response, 405)["remedy"]
+            assert response.headers["allow"] == allowed
+        remedy = assert_problem(service.http.post(f"{job}/cancel"), 404)["remedy"]
+        assert remedy.startswith("There is DELETE /jobs/{job_id} (cancel_job).")
+        assert "GET /jobs/{job_id} (get_job)" in assert_problem(service.http.get(f"{job}/nothing"), 404)["remedy"]
 
 
 @pytest.mark.parametrize(
@@ -258,3 +274,4 @@ def test_depth_in_false_colours_tells_between_which_depths(
     assert service.http.get("/render", params=chosen).status_code == 200
     assert (service.painter.requests[1].near_mm, service.painter.requests[1].far_mm) == (50, 90)
     assert_problem(service.http.get("/render", params={**chosen, "near_mm": 0}), 422, "near_mm")
+    assert_problem(service.http.get("/render", params={**chosen, "near_mm": 90}), 422, "far_mm")

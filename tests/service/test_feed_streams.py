@@ -26,6 +26,7 @@ from tests.service.test_feeds import MAY_ALL, RECTIFIED
 from tests.service.test_stream import ask, problem, view
 
 TIMEOUT_S = 10.0
+MP4 = b"\0\0\0\x08ftyp"
 
 
 @pytest.fixture
@@ -91,15 +92,13 @@ def test_pushed_video_comes_in_order_and_while_it_is_sent(service: LiveService, 
 def test_a_push_waits_for_the_feeds_process(service: LiveService) -> None:
     feed_id, answers = opened(service), list[httpx.Response]()
     push = threading.Thread(
-        target=lambda: answers.append(
-            httpx.put(f"{service.url}/feeds/{feed_id}/video", content=b"ftyp", timeout=TIMEOUT_S)
-        )
+        target=lambda: answers.append(httpx.put(f"{service.url}/feeds/{feed_id}/video", content=MP4, timeout=TIMEOUT_S))
     )
     push.start()
     time.sleep(0.3)
     with following(service.queue, service.store.run_dir) as worker:
         push.join()
-        assert pushed(worker) == b"ftyp"
+        assert pushed(worker) == MP4
     assert answers[0].status_code == 200
 
 
@@ -109,7 +108,7 @@ def test_a_push_ends_with_its_reason(service: LiveService, worker: FeedWorker) -
     feed_id = opened(service)
 
     def body() -> Iterator[bytes]:
-        yield b"ftyp"
+        yield MP4
         wait_until(lambda: worker.pushed)
         worker.replaced.update(worker.pushed)
         for _ in range(100):
@@ -118,6 +117,16 @@ def test_a_push_ends_with_its_reason(service: LiveService, worker: FeedWorker) -
 
     response = httpx.put(f"{service.url}/feeds/{feed_id}/video", content=body(), timeout=TIMEOUT_S)
     assert (response.status_code, response.json()["field"]) == (409, "push")
+
+
+def test_what_is_no_video_is_refused_and_ends_no_other_push(service: LiveService, worker: FeedWorker) -> None:
+    url = f"{service.url}/feeds/{opened(service)}/video"
+    for pieces in ([b"hello"], [b"this is not a video"], [b"this ", b"is not", b" a video"]):
+        response = httpx.put(url, content=pieces, timeout=TIMEOUT_S)
+        assert (response.status_code, response.json()["field"]) == (422, "body")
+    assert not worker.asked
+    assert httpx.put(url, content=[MP4[:5], MP4[5:] + b"moov"], timeout=TIMEOUT_S).json() == {"bytes": 12}
+    assert pushed(worker) == MP4 + b"moov"
 
 
 def test_a_push_that_waits_for_a_worker_ends_with_its_caller(service: LiveService) -> None:
@@ -145,7 +154,7 @@ def test_a_silent_push_is_ended(tmp_path: Path) -> None:
         feed_id, go_on = opened(service), threading.Event()
 
         def body() -> Iterator[bytes]:
-            yield b"ftyp"
+            yield MP4
             go_on.wait(TIMEOUT_S)
 
         with httpx.Client() as client:

@@ -23,10 +23,11 @@ def test_a_running_job_shows_stage_decibels_and_seconds_left(service: ServiceUnd
 def test_a_failed_job_tells_code_field_and_remedy(service: ServiceUnderTest) -> None:
     job_id = service.upload().json()["id"]
     _, claim = service.claimed()
+    service.queue.beat(claim, JobProgress(stage="train", fraction=0.4, seconds_left=20.0))
     error = {"code": "input", "problem": "no depth.", "field": "calibration", "remedy": "Check the baseline."}
     service.queue.fail(claim, JobError.model_validate(error))
     job = service.http.get(f"/jobs/{job_id}").json()
-    assert job["state"] == "failed"
+    assert (job["state"], job["fraction"], job["seconds_left"]) == ("failed", 0.4, None)
     assert job["error"] == error
     assert_problem(service.http.get("/render", params={"scene": job_id}), 409, "scene")
     assert_problem(service.http.delete(f"/jobs/{job_id}"), 409, "job_id")

@@ -189,6 +189,7 @@ def test_what_cannot_be_shown_is_told_with_its_id_and_the_connection_goes_on(ser
             told = problem(viewer)
             assert (told["status"], told["field"], told["id"]) == (status, field, "x")
             assert told["detail"]
+            assert (told["detail"] == "There is no such parameter here.") == (field == "zoom")
         ask(viewer, scene=scene, t=600)
         told = problem(viewer)
         assert told["status"] == 500
@@ -229,6 +230,15 @@ def test_a_purged_scene_is_shown_no_more(service: LiveService) -> None:
         service.store.purge(scene)
         ask(viewer, scene=scene)
         assert problem(viewer)["status"] == 404
+
+
+@pytest.mark.parametrize("path", ["/stream", f"/feeds/{'0' * 32}/pictures"])
+def test_parameters_in_the_address_are_refused_before_the_handshake(service: LiveService, path: str) -> None:
+    with pytest.raises(InvalidStatus) as refused, connect(f"ws://127.0.0.1:{service.port}{path}?scene=x"):
+        pass
+    told = json.loads(refused.value.response.body)
+    assert (told["status"], told["field"]) == (422, "scene")
+    assert "docs/stream.md" in told["remedy"]
 
 
 @pytest.mark.parametrize(("message", "code"), [(b"\x00", 1003), ("x" * 20_000, 1009), ("x" * 200_000, 1009)])
@@ -345,3 +355,13 @@ def test_what_a_viewer_sees_is_in_the_audit(guarded: LiveService) -> None:
         ask(viewer, scene=own)
         view(viewer)
     assert f'"job_id":"{own}"' in (guarded.store.data_dir / "audit.jsonl").read_text().replace(" ", "")
+
+
+def test_the_example_of_the_document_shows_views(
+    service: LiveService, painter: Painter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[2] / "docs/stream.md").read_text(encoding="utf-8")
+    example = page.split("```python\n")[1].split("```")[0]
+    exec(example.replace("8765", str(service.port)).replace("JOB", service.finished_scene()), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [f"{yaw} image/jpeg {painter.bytes} bytes" for yaw in range(-10, 11)]

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -318,3 +319,20 @@ def test_what_the_clip_and_the_split_warned_of_is_repeated_once() -> None:
     first = first_report(clip, split, TRAINING)
     report = scored_report(first, held_out, RightScores(), trained, copy_baselines(clip, split.train, [1]))
     assert [each.text for each in report.warnings] == ["the sound is missing", "1 frame repeats"]
+
+
+@pytest.mark.parametrize(
+    ("eyes", "iterations", "right_db", "warned"),
+    [("both", 39, 29.0, True), ("both", 39, 31.0, False), ("both", 500, 29.0, False), ("left", 39, 29.0, False)],
+)
+def test_a_model_that_is_worse_than_the_warped_left_eye_for_lack_of_steps_is_told(
+    eyes: Literal["left", "both"], iterations: int, right_db: float, warned: bool
+) -> None:
+    clip = long_clip()
+    training = dataclasses.replace(TRAINING, eyes=eyes, iterations=iterations, frames_seen=iterations)
+    right = RightScores((right_db,) * 3, (right_db,) * 3, (30.0,) * 3, (30.0,) * 3)
+    for known in ((), (Notice.warning(NoticeCode.TIME_TOO_SHORT, "for the fewest steps"),)):
+        first = first_report(clip, split_frames(clip, "every8"), dataclasses.replace(training, warnings=known))
+        report = scored_report(first, scores(31.0), right, scores(31.0), BELOW)
+        codes = [each.code for each in report.warnings if each.code is NoticeCode.TIME_TOO_SHORT]
+        assert len(codes) == max(warned, len(known))
