@@ -1,4 +1,4 @@
-// Where the texts of measurements go: within the picture, and none over another. No elements.
+// Where the texts of measurements go: within the picture, and none over another or over a point. No elements.
 
 const BETWEEN_PX = 2;
 
@@ -8,11 +8,12 @@ const BETWEEN_PX = 2;
  * How to move each text: first into the picture, then up or down by whole lines, to the nearest free place.
  * @param {Box[]} boxes of the texts
  * @param {{left: number, top: number, right: number, bottom: number}} picture
+ * @param {Box[]} [points] that stay free
  * @returns {[number, number][]} right and down, px
  */
-export function spread(boxes, picture) {
+export function spread(boxes, picture, points = []) {
   /** @type {Box[]} */
-  const taken = [];
+  const taken = [...points];
   return boxes.map((box) => {
     const x = within(box.x, picture.left, picture.right - box.width);
     const line = box.height + BETWEEN_PX;
