@@ -49,7 +49,11 @@ def eye_of(eye: Eye, *, masks: bool) -> dict[str, Any]:
 
 
 def recorded_scene(
-    site: Site, eyes: tuple[Eye, ...] = ("left",), *, masks: bool = True, light: LightChanges | None = REPORT_OF_THE_PAGE.light
+    site: Site,
+    eyes: tuple[Eye, ...] = ("left",),
+    *,
+    masks: bool = True,
+    light: LightChanges | None = REPORT_OF_THE_PAGE.light,
 ) -> str:
     """A finished scene that keeps recorded frames."""
     scene = site.scene(MODEL_MARK)
