@@ -65,7 +65,7 @@ def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_p
     page.until_text("#no-feeds", say("live.none_open"))
     assert say("page.notice") in page.text("#opening")
     assert page.script(EXAMPLES_FAULTS) == ["", ""]
-    assert page.find("#open-feed [name=source]").get_attribute("placeholder").startswith("rtsp://")
+    assert str(page.find("#open-feed [name=source]").get_attribute("placeholder")).startswith("rtsp://")
     calibration = tmp_path / "calibration.json"
     calibration.write_text('{"model": "rectified"}')
     page.until(lambda: page.find("#open-feed [name=calibration]").is_displayed())
