@@ -381,7 +381,7 @@ const showHelp = () => toggleHelp(get("help"));
 const toggleFullScreen = prepareFullScreen(get("full-screen"));
 prepareHelp(get("help"));
 prepareLanguages(document.querySelectorAll("[data-language]"));
-prepareFive(get("five"));
+prepareFive(document);
 prepareControlSets(document.querySelectorAll("[data-switch-controls]"));
 get("show-help").addEventListener("click", showHelp);
 const share = new Share(get("sharing"), scopes, {

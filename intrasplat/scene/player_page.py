@@ -31,6 +31,8 @@ SCENE_TAG = '<script type="text/plain" id="scene">'
 VIDEO_TAG = '<script type="text/plain" id="video">'
 DRAWN = ("compact", "shared")
 """Coding and kind of motion of the scenes that the player draws."""
+REPORTED = ("scored", "psnr_tissue_db", "detail", "baseline_blend_db", "baseline_flow_db", "warnings")
+"""Of the report: what verdict and likeness are made of."""
 MAX_SCENE_BYTES = 256 << 20
 """Browsers limit a string to half a gigabyte; scenes of our presets have a few megabytes."""
 PIECE_BYTES = 3 << 18  # a multiple of 3: base64 of it ends on a whole character
@@ -86,8 +88,8 @@ def page_parts(
         "exportedAtMs": round(1000 * time.time()),
         "sceneBytes": size,
         "recorded": {"bytes": frames.size, "state": frames.state},
-        "psnrDb": report.get("psnr_tissue_db"),
-        "warnings": [{"code": each["code"], "text": each["text"]} for each in report.get("warnings", ())],
+        "report": {"warnings": ()} | {name: report[name] for name in REPORTED if name in report} if report else None,
+        "hasDetail": frames.video is not None,
     }
     contents = read_files(folder, frames.files)
     pictures = {name: base64.b64encode(content).decode() for name, content in contents.items()}

@@ -158,7 +158,8 @@ class Painter:
             if request.scene_id == self.not_recorded:
                 raise SceneError("This scene keeps no recorded frames.")
             picture = cv2.imencode(".jpg", np.full((48, 60, 3), RECORDED_SHADE, np.uint8))[1].tobytes()
-            return Reply(picture, "image/jpeg", request.t, iteration=0 if request.attempt is None else None)
+            of_frame = round(request.t * REPORT_OF_THE_PAGE.frame_count) / REPORT_OF_THE_PAGE.frame_count
+            return Reply(picture, "image/jpeg", of_frame, iteration=0 if request.attempt is None else None)
         time.sleep(self.pause_s)
         if request.layer is Layer.ERROR and self.lacks_frames:
             raise InputError("layer", "The recorded frames are damaged.", "Ask for another layer.")

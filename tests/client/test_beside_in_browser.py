@@ -31,7 +31,10 @@ def test_another_scene_follows_beside_until_it_is_deleted(site: Site, page: Page
     page.until_text("#time-value", "of 40")
     site.painter.cameras = SHORTER_CAMERAS  # of the other clip
     page.script("document.querySelector('#more').open = true")
+    first = "return document.querySelector('#beside option').textContent"
+    assert page.script(first) == say("compare.with_another")
     Select(page.find("#beside")).select_by_value(other)  # begins with a seam
+    assert page.script(first) == say("compare.with_recording")
     until_halves(page, grey_of(other), grey_of(scene))
     assert page.find("#seam").is_displayed()
     for css, name in (("#of-recorded", "fast"), ("#of-model", "quality")):

@@ -15,7 +15,7 @@ from intrasplat.camera import Intrinsics
 from intrasplat.clip import DepthClip
 from intrasplat.clip import Eye as ClipEye
 from intrasplat.names import RECORDED, Eye
-from intrasplat.report import Masks
+from intrasplat.report import LightChanges, Masks
 from intrasplat.scene.recorded_file import EYES
 from intrasplat.view.recorded import recorded_files
 from tests.client.page import REPORT_OF_THE_PAGE, WORKER, Page, Site, grey_of
@@ -48,7 +48,13 @@ def eye_of(eye: Eye, *, masks: bool) -> dict[str, Any]:
     }
 
 
-def recorded_scene(site: Site, eyes: tuple[Eye, ...] = ("left",), *, masks: bool = True) -> str:
+def recorded_scene(
+    site: Site,
+    eyes: tuple[Eye, ...] = ("left",),
+    *,
+    masks: bool = True,
+    light: LightChanges | None = REPORT_OF_THE_PAGE.light,
+) -> str:
     """A finished scene that keeps recorded frames."""
     scene = site.scene(MODEL_MARK)
     left, right = (eye_of(eye, masks=masks) for eye in EYES)
@@ -56,7 +62,8 @@ def recorded_scene(site: Site, eyes: tuple[Eye, ...] = ("left",), *, masks: bool
     files, kept = recorded_files(clip, eyes, ())
     (site.store.scene_folder(scene, 1) / RECORDED).write_bytes(files[RECORDED] or b"")
     given = Masks(source="given", share=0.5) if masks else None
-    site.store.add_scores(WORKER, scene, 1, REPORT_OF_THE_PAGE.model_copy(update={"recorded": kept, "masks": given}))
+    changes = {"recorded": kept, "masks": given, "light": light}
+    site.store.add_scores(WORKER, scene, 1, REPORT_OF_THE_PAGE.model_copy(update=changes))
     return scene
 
 
@@ -255,6 +262,19 @@ def test_the_model_is_drawn_as_the_moment_was_recorded_until_the_comparison_ends
     choose(page, "off")
     page.until(lambda: site.painter.light == ("steady", "remove"))
     page.until(lambda: say("picture.recorded_light") not in page.view)
+
+
+def test_light_that_does_not_change_is_not_spoken_of_and_a_frame_is_of_the_moment_in_view(
+    site: Site, page: Page
+) -> None:
+    view(page, recorded_scene(site, light=None))
+    choose(page, "wipe")
+    until_frame(page, 0)
+    assert site.painter.light == ("steady", "remove")
+    assert say("picture.recorded_light") not in page.view
+    page.script("import(document.scripts[0].src).then(({ viewer }) => viewer.look({ layer: 'recorded', t: 0.31 }))")
+    page.until(lambda: page.text("#status-text") not in ("", "0.00 s"))
+    page.until(lambda: page.text("#status-text") == page.text("#time-value").split(" of ")[0])
 
 
 def test_another_layer_is_compared_too(site: Site, page: Page) -> None:

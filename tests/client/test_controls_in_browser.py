@@ -41,6 +41,15 @@ import(document.scripts[0].src).then(({ viewer }) => {
   done();
 });
 """
+MEASURED = """
+const panel = document.querySelector("#measuring");
+const edge = (each, name) => each.getBoundingClientRect()[name];
+const covered = [...panel.querySelectorAll("li")]
+  .filter((each) => edge(each.querySelector(".figure"), "right") > edge(each.lastChild, "left")).length;
+const [across, below] = [panel.scrollWidth - panel.clientWidth, panel.scrollHeight - panel.clientHeight];
+return { covered, across, below };
+"""
+"""Figures under a button, and what of the panel is to be scrolled to, px."""
 PLACE = "return (async () => (await import(document.scripts[0].src)).viewer.orbit.place)()"
 IS_PLAYING = "return document.querySelector('#play').getAttribute('aria-pressed') === 'true'"
 
@@ -89,17 +98,23 @@ def test_the_theatre_has_five_large_buttons_letters_for_3_m_and_nothing_that_del
             click_at(page, x, 0.5)
             page.until(lambda: page.script("return document.querySelectorAll('.measured path').length") >= 2)
         page.until(lambda: page.text("#measuring .figure"))
+        page.click("#measuring .again")
+        for x in (0.3, 0.6):
+            click_at(page, x, 0.7)
+        page.until(lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#measuring .figure")) == 2)
+        page.until(lambda: page.script(MEASURED) == {"covered": 0, "across": 0, "below": 0})
         far = ("#picture-warning", "#scale .about", "#time-value", ".measured text", "#measuring .figure")
         assert {css: page.script(FONT, css) for css in far if page.script(FONT, css) < MIN_FAR_PX} == {}
         assert page.script(FONT, "#badge") >= BADGE_PX
-        five(page, say("tool.scenes"))
+        five(page, say("tool.scenes_more"))
         page.until(lambda: page.find("#library").is_displayed())
         assert page.script(SHOWN, "[data-action=view]") == 1
+        assert page.find("#library [data-does='#snapshot']").text == say("snapshot.take")
         assert {css: page.script(SHOWN, css) for css in HIDDEN} == dict.fromkeys(HIDDEN, 0)
         page.driver.refresh()
         page.until_state("live")
         assert page.find("#five").is_displayed()
-        five(page, say("tool.scenes"))
+        five(page, say("tool.scenes_more"))
         page.find("#library [data-switch-controls]").click()
         assert page.find("#tools").is_displayed()
         assert not page.find("#five").is_displayed()
@@ -121,7 +136,7 @@ def test_the_theatre_is_accessible_and_nothing_overlaps(
         found["measuring"] = violations(page, axe)
         assert is_on_screen(page, "#measuring .end")
         page.click("#measuring .end")
-        five(page, say("tool.scenes"))
+        five(page, say("tool.scenes_more"))
         found["library"] = violations(page, axe)
         page.script("localStorage.clear()")
     assert {state: each for state, each in found.items() if each} == {}

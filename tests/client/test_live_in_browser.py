@@ -145,6 +145,14 @@ def test_loss_of_signal_is_said_within_two_seconds_and_marks_the_last_picture(
     assert page.script("return getComputedStyle(document.getElementById('live-picture')).opacity") == "0.35"
     painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
     page.until_text("#why", say("live.reason_silent"))
+    for reason, place in ((FeedReason.PACKING_UNKNOWN, "unusable"), (FeedReason.FAULT, "fault")):
+        painter.reason = reason
+        page.until_text("#word", say(f"live.word_{place}"))
+    painter.state, painter.reason = FeedState.BEHIND, FeedReason.TOO_SLOW
+    page.until_text("#word", say("live.word_too_slow"))
+    painter.stops_s, painter.state, painter.reason = None, FeedState.STALLED, FeedReason.NO_SCENE
+    page.until_text("#word", say("live.word_no_model"))  # the cable is fine
+    page.until_text("#live-word", say("live.word_live"))
     painter.stops_s, painter.state, painter.reason = None, FeedState.LIVE, None
     page.until_text("#word", say("live.word_live"))
 
@@ -179,6 +187,7 @@ def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePa
     page.until(lambda: (age_of(page, "model") or {"ms": None})["ms"] == held["ms"])
     asked = len(painter.renders)
     page.until(lambda: len(painter.renders) > asked + 1)
+    page.until_text("#trust-why", say("notice.coarse"))
     painter.is_coarse = False  # there is time: from now on no picture of a frozen moment is asked for
     time.sleep(2)
     asked = len(painter.renders)
@@ -316,6 +325,9 @@ def test_health_says_rates_and_why_nothing_is_recorded(site: Site, page: LivePag
     page.script("document.getElementById('health').open = true")
     for part in ("30.0/s", "4.9/s", "12.3 MB", "0.06 s"):
         page.until_text("#health-list", part)
+    texts = "return ['model-age', 'health-list'].map((id) => document.getElementById(id).textContent)"
+    age, listed = page.script(texts)
+    assert f"{say('live.model_age')}{age.split()[0]} s" in listed
     painter.recording = FeedReason.DISK_FULL
     page.until_text("#health-list", say("live.reason_disk_full"))
     assert word(page) == say("live.word_live")

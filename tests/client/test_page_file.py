@@ -26,7 +26,8 @@ from client.page import DASHBOARD
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, SceneError, UnavailableError
-from intrasplat.names import DETAIL, RECORDED
+from intrasplat.names import DETAIL, RECORDED, REPORT
+from intrasplat.report import DetailScores
 from intrasplat.scene.checkpoint import load_scene
 from intrasplat.scene.inline import CannotInlineError, inlined, joined
 from intrasplat.scene.recorded_file import name_of
@@ -35,7 +36,7 @@ from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
 from intrasplat.scene.training_pictures import pictures_of
 from intrasplat.view.render import render_frame
 from intrasplat.view.unseen import hatched
-from tests.archives import ORIGIN, small_scene, stored
+from tests.archives import ORIGIN, report_of, small_scene, stored
 from tests.client.page import browser
 from tests.client.player import drawing_browser
 from tests.client.test_accessible_in_browser import RUN
@@ -147,9 +148,11 @@ def test_its_controls_move_time_and_camera_and_say_what_is_shown(driver: webdriv
     opened(driver, file, "shown")
     first, _ = shown(driver)
     assert text(driver, "#research") == TABLE["research"]
+    assert driver.find_element(By.ID, "verdict").text.endswith(say("light.care"))  # nothing is open
     facts = text(driver, "#facts")
     assert ORIGIN in facts
     assert "700" in facts
+    assert say("figure.likeness_beside_copies", db="36.20 dB", best="30.00 dB") in facts
     assert text(driver, "#warnings li small") == "<img src=x onerror=alert(1)> Smith & Sons"
     assert driver.find_elements(By.CSS_SELECTOR, "img") == []
     driver.execute_script(
@@ -205,6 +208,8 @@ def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
     folder, path = tmp_path / "scene", tmp_path / "scene.html"
     scene = scene_with_recorded_frames(folder)
     monkeypatch.setenv(DASHBOARD_VARIABLE, str(DASHBOARD))
+    report = report_of(scene, detail=DetailScores(psnr_tissue_db=38.1, psnr_right_db=None, ssim=None))
+    (folder / REPORT).write_text(report.model_dump_json())
     assert main(["export", str(folder), "--format", "html"]) == ExitCode.OK
     first = scene.trained_frames[1]
     opened(driver, path, "shown", f"#t={first / scene.frame_count}&compare=wipe")
@@ -240,6 +245,9 @@ def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
     driver.find_element(By.ID, "compare").click()
     wait.until(lambda _: driver.find_element(By.ID, "recorded").is_displayed())
     assert "tissue and the instruments" in text(driver, "#facts")
+    alone = say("figure.without_detail", db="36.20 dB")
+    of_both = say("figure.likeness_beside_copies", db="38.10 dB", best="30.00 dB")
+    assert f"{of_both} {alone}" in text(driver, "#facts")
     assert driver.get_log("browser") == []
 
     inside = (folder / DETAIL).stat().st_size
@@ -248,6 +256,7 @@ def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
     assert path.stat().st_size < size - 4 * inside / 3
     opened(driver, path, "shown", "#compare=wipe")
     assert TABLE["recorded_off"] in text(driver, "#facts")
+    assert f"{TABLE['fact_quality']}{alone}" in text(driver, "#facts")
     assert not driver.find_element(By.ID, "compare").is_displayed()
     monkeypatch.setattr("intrasplat.scene.player_page.MAX_RECORDED_BYTES", inside)
     large = b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD))

@@ -68,16 +68,23 @@ def test_the_field_of_view_is_named_as_found_or_given(
 
 
 @pytest.mark.parametrize(
-    ("source", "code"),
-    [("fixed", "camera_or_tissue"), ("fixed", "poses_unsure"), ("estimated", "camera_or_tissue")],
+    ("source", "codes"),
+    [
+        ("fixed", ["camera_or_tissue"]),
+        ("fixed", ["poses_unsure"]),
+        ("fixed", ["poses_unsure", "camera_or_tissue"]),
+        ("estimated", ["camera_or_tissue"]),
+    ],
 )
 def test_a_doubt_about_the_endoscopes_movement_and_what_was_taken_for_it_are_one_sentence(
-    site: Site, page: Page, source: Literal["fixed", "estimated"], code: str
+    site: Site, page: Page, source: Literal["fixed", "estimated"], codes: list[str]
 ) -> None:
-    poses, warning = CameraPoses(source=source, path_mm=12.3), Notice.warning(NoticeCode(code), "GET /x")
-    show(site, page, GOOD.model_copy(update={"poses": poses, "warnings": (warning,)}))
+    poses = CameraPoses(source=source, path_mm=12.3)
+    warnings = site.painter.warnings = [Notice.warning(NoticeCode(code), "GET /x") for code in codes]
+    show(site, page, GOOD.model_copy(update={"poses": poses, "warnings": tuple(warnings)}))
     assert page.script(LINES, "reasons") == [say(f"report.camera_{source}_or_tissue", mm="12")]
     assert say(f"report.camera_{source}", mm="12") not in page.script(LINES, "trusted")
+    page.until(lambda: page.text("#picture-warning") == say(f"report.camera_{source}_or_tissue", mm="12"))
 
 
 def test_only_the_worst_reasons_are_in_the_first_layer_and_all_are_in_the_second(site: Site, page: Page) -> None:

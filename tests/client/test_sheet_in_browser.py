@@ -130,6 +130,9 @@ def test_measurements_leave_the_picture_in_view_and_can_all_be_read(
         page.until(lambda: all(is_within(each, picture_box(page)) for each in boxes(page, ".measured path")))
         texts = boxes(page, ".measured text")
         assert [pair for pair in itertools.combinations(texts, 2) if not are_apart(*pair)] == []
+        points = boxes(page, ".measured path.point")
+        if size != PHONE_ACROSS:  # there is too little space
+            assert [pair for pair in itertools.product(texts, points) if not are_apart(*pair)] == []
         assert page.script(CUT_NAMES) == []
         page.until(lambda: page.script(HAS_MORE))  # and says that there is more below
         assert is_on_screen(page, "#measuring .end")

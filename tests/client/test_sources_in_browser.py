@@ -23,6 +23,10 @@ FAULTS = """
 const [texts, done] = arguments;
 import("/live/sources.js").then(({ faultOf }) => done(texts.map((text) => [text, faultOf("url", text)])));
 """
+EXAMPLES_FAULTS = """
+return import("/live/sources.js").then(
+  ({ EXAMPLES, faultOf }) => Object.entries(EXAMPLES).map(([from, text]) => faultOf(from, text)));
+"""
 GOOD_ADDRESSES = [
     "rtsp://camera.example.org/1",
     "RTSPS://me:secret@camera:322",
@@ -59,6 +63,9 @@ def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_p
     page.driver.get("about:blank")
     page.driver.get(f"{site.url}/live.html")
     page.until_text("#no-feeds", say("live.none_open"))
+    assert say("page.notice") in page.text("#opening")
+    assert page.script(EXAMPLES_FAULTS) == ["", ""]
+    assert str(page.find("#open-feed [name=source]").get_attribute("placeholder")).startswith("rtsp://")
     calibration = tmp_path / "calibration.json"
     calibration.write_text('{"model": "rectified"}')
     page.until(lambda: page.find("#open-feed [name=calibration]").is_displayed())

@@ -33,6 +33,7 @@ def test_an_empty_page_says_what_it_is_and_how_to_begin(site: Site, page: Page, 
         page.until(lambda: page.find("#empty").is_displayed())
         assert "intrasplat" in page.text("#empty")
         assert is_on_screen(page, "#empty-example")
+        assert is_on_screen(page, "#empty .to-live")
         assert is_on_screen(page, "#tools [data-drawer=drawer]")
         for css in ("#controls", "#measure", "#share", "#tools [data-drawer=report-drawer]"):
             assert not page.find(css).is_displayed(), css

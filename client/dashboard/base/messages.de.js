@@ -206,7 +206,7 @@ export const DE = {
     "scoring": "FERTIG TRAINIERT, wird gemessen",
     "training": "WIRD BESSER",
     "extrapolated": "EXTRAPOLIERT",
-    "current": "MODELL AKTUELL",
+    "current": "FERTIGES MODELL",
     "unconfirmed": "AUS DEM SPEICHER",
     "unconfirmed_why": "der Dienst hat seit {time} nicht geantwortet; die Szene kann inzwischen gelöscht sein",
     "example_clip": "BEISPIEL, noch kein Modell",
@@ -383,7 +383,7 @@ export const DE = {
     "recorded_off": "nicht in dieser Datei: Sie wurden weggelassen",
     "recorded_large": "nicht in dieser Datei: {size} MB sind zu viele",
     "recorded_none": "nicht in dieser Datei: Die Szene bewahrt keine auf",
-    "fact_quality": "Ähnlichkeit auf zurückgehaltenen Bildern"
+    "fact_quality": "Ähnlichkeit"
   },
   "report": {
     "trusted": "Worauf Verlass ist",
@@ -522,6 +522,7 @@ export const DE = {
     "failed": "Die Bilder der Aufnahme können nicht gezeigt werden. {why}",
     "with": "Womit die Szene verglichen wird",
     "with_recording": "mit der Aufnahme",
+    "with_another": "mit einer anderen Szene …",
     "names": "{other} neben {name}",
     "other": "andere Szene",
     "loading_scene": "wird geladen",
@@ -623,6 +624,10 @@ export const DE = {
     "word_frozen": "STANDBILD {time}",
     "word_back": "RÜCKSCHAU {s} s",
     "word_stalled": "SIGNAL VERLOREN",
+    "word_unusable": "SIGNAL UNBRAUCHBAR",
+    "word_too_slow": "RECHNER ZU LANGSAM",
+    "word_fault": "FEHLER IM DIENST",
+    "word_no_model": "KEIN MODELL",
     "word_service_lost": "DIENST VERLOREN",
     "word_no_picture": "KEIN BILD",
     "word_paused": "PAUSE",
@@ -714,7 +719,7 @@ export const DE = {
     "state_connecting": "verbindet",
     "state_live": "live",
     "state_behind": "hinterher",
-    "state_stalled": "kein Signal",
+    "state_stalled": "steht",
     "state_paused": "Pause",
     "state_no_tissue": "kein Gewebe im Bild",
     "state_ended": "beendet",
@@ -859,6 +864,7 @@ export const DE = {
     "tools": "Werkzeuge",
     "controls": "Zeit und Ansicht",
     "scenes": "Szenen",
+    "scenes_more": "Szenen, mehr",
     "new_clip": "Neuer Clip",
     "report": "Bericht",
     "more": "Mehr"

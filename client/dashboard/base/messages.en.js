@@ -206,7 +206,7 @@ export const EN = {
     "scoring": "TRAINED, is being measured",
     "training": "IMPROVING",
     "extrapolated": "EXTRAPOLATED",
-    "current": "LATEST MODEL",
+    "current": "FINISHED MODEL",
     "unconfirmed": "FROM MEMORY",
     "unconfirmed_why": "the service has not answered since {time}; the scene may have been deleted meanwhile",
     "example_clip": "EXAMPLE, not yet a model",
@@ -383,7 +383,7 @@ export const EN = {
     "recorded_off": "not in this file: they were left out",
     "recorded_large": "not in this file: {size} MB are too many",
     "recorded_none": "not in this file: the scene keeps none",
-    "fact_quality": "Likeness on frames that were held out"
+    "fact_quality": "Likeness"
   },
   "report": {
     "trusted": "What can be trusted",
@@ -522,6 +522,7 @@ export const EN = {
     "failed": "The recorded frames cannot be shown. {why}",
     "with": "What the scene is compared with",
     "with_recording": "with the recording",
+    "with_another": "with another scene …",
     "names": "{other} beside {name}",
     "other": "other scene",
     "loading_scene": "is loading",
@@ -623,6 +624,10 @@ export const EN = {
     "word_frozen": "FROZEN {time}",
     "word_back": "LOOKING BACK {s} s",
     "word_stalled": "SIGNAL LOST",
+    "word_unusable": "SIGNAL UNUSABLE",
+    "word_too_slow": "COMPUTER TOO SLOW",
+    "word_fault": "SERVICE FAULT",
+    "word_no_model": "NO MODEL",
     "word_service_lost": "SERVICE LOST",
     "word_no_picture": "NO PICTURE",
     "word_paused": "PAUSED",
@@ -714,7 +719,7 @@ export const EN = {
     "state_connecting": "connecting",
     "state_live": "live",
     "state_behind": "behind",
-    "state_stalled": "no signal",
+    "state_stalled": "stalled",
     "state_paused": "paused",
     "state_no_tissue": "no tissue in view",
     "state_ended": "ended",
@@ -859,6 +864,7 @@ export const EN = {
     "tools": "Tools",
     "controls": "Time and view",
     "scenes": "Scenes",
+    "scenes_more": "Scenes, more",
     "new_clip": "New clip",
     "report": "Report",
     "more": "More"

@@ -3,6 +3,8 @@
 import { dateTime, element, setText } from "../base/element.js";
 import { listenToGestures } from "../base/gestures.js";
 import { figure, noticeWords, showWords, words } from "../base/messages.js";
+import { likenessOf } from "../library/figures.js";
+import { lightMark, trustOf } from "../library/trustlight.js";
 import { Player } from "../player/player.js";
 import { graphics } from "../player/support.js";
 import { Comparison } from "./comparison.js";
@@ -179,7 +181,7 @@ function refuse(error) {
   get("message").textContent = words("file.refused", { why: error.message });
 }
 
-function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, psnrDb, warnings }, manifest) {
+function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, report, hasDetail }, manifest) {
   const { width, height } = manifest.intrinsics;
   const facts = {
     scene: sceneId ?? "–",
@@ -189,12 +191,14 @@ function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, psnrDb
     gaussians: figure(manifest.gaussians),
     size: words("file.megabytes", { size: figure(sceneBytes / 1e6, 2) }),
     recorded: words(`file.recorded_${recorded.state}`, { size: figure(recorded.bytes / 1e6, 2) }),
-    quality: psnrDb === null ? "–" : `${figure(psnrDb, 1)} dB`,
+    quality: report === null ? "–" : likenessOf(report, hasDetail),
   };
   for (const [name, text] of Object.entries(facts)) {
     get("facts").append(element("dt", { text: words(`file.fact_${name}`) }), element("dd", { text }));
   }
-  const items = warnings.map((each) => element("li", { text: `${noticeWords(each)} ` }, element("small", { text: each.text })));
+  if (report === null) return;
+  get("verdict").append(lightMark(trustOf(report).light));
+  const items = report.warnings.map((each) => element("li", { text: `${noticeWords(each)} ` }, element("small", { text: each.text })));
   get("warnings").append(...items);
 }
 

@@ -26,9 +26,14 @@ export function baselinesOf(report) {
   return baselines.filter(({ db }) => Number.isFinite(db));
 }
 
-/** Of views with detail from recorded frames, which the page shows, and of the model alone. @param {Report} report */
-function likeness({ psnr_tissue_db: alone, detail, ...report }) {
+/**
+ * Of the views that are shown, and of the model alone.
+ * @param {Pick<Report, "scored"|"psnr_tissue_db"|"detail"|"baseline_blend_db"|"baseline_flow_db">} report
+ * @param {boolean} [hasDetail] whether views are shown with detail from recorded frames, where the scene has scores of it
+ */
+export function likenessOf({ psnr_tissue_db: alone, detail, ...report }, hasDetail = true) {
   if (!Number.isFinite(alone)) return words(isPending(report) ? "figure.pending" : "figure.not_measured");
+  if (detail && !hasDetail) return words("figure.without_detail", { db: number(alone, 2, "dB") });
   const db = number(detail?.psnr_tissue_db ?? alone, 2, "dB");
   const best = Math.max(...baselinesOf(report).map((each) => each.db));
   return joined([
@@ -70,7 +75,7 @@ function clip({ frame_count: frames, train_count: trained, held_out: heldOut }) 
 /** @param {Report} report @returns {[string, string][]} */
 function rows(report) {
   return [
-    ["likeness_title", likeness(report)],
+    ["likeness_title", likenessOf(report)],
     ["right_eye_title", rightEye(report)],
     ["depth_title", number(report.depth_agreement_mm, 2, "mm")],
     ["covered_title", percent(report.coverage)],

@@ -56,7 +56,7 @@ export function reasonsIn(report, trust) {
 
 /** @param {Report} report @param {import("./trustlight.js").Trust} trust @returns {Node[]} */
 function careful(report, trust) {
-  const reasons = reasonsIn(report, trust).map(({ text }) => text);
+  const reasons = [...new Set(reasonsIn(report, trust).map(({ text }) => text))];
   const more = reasons.length - MAX_REASONS;
   const shown = reasons.length > 0 ? [listOf(reasons.slice(0, MAX_REASONS), "reasons")] : [];
   if (more > 0) shown.push(element("p", { class: "quiet", text: words("report.more_reasons", { count: more }) }));

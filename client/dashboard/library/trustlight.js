@@ -58,12 +58,11 @@ export function trustOf({ scored, psnr_tissue_db: db, warnings }) {
 /**
  * @param {Trust} trust
  * @param {(notice: import("../base/wire.js").Notice) => string} wordsOf a reason
- * @returns {{code: string, text: string}[]} why, in plain words, each sentence once
+ * @returns {{code: string, text: string}[]} why, in plain words; codes may share a sentence
  */
 export function reasonsOf({ light, reasons }, wordsOf = noticeWords) {
   if (light === "bad" && reasons.length === 0) return [{ code: "not_measured", text: words("light.not_measured") }];
-  const said = reasons.map((notice) => ({ code: notice.code, text: wordsOf(notice) }));
-  return said.filter(({ text }, place) => said.findIndex((other) => other.text === text) === place);
+  return reasons.map((notice) => ({ code: notice.code, text: wordsOf(notice) }));
 }
 
 /** @param {Light} light @returns {HTMLElement} shape and word */

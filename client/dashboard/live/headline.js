@@ -27,6 +27,16 @@ export const BEHIND_S = 2;
 /** Pictures of a source that may stay out before it is called lost. */
 const MISSED = 2.5;
 const KINDS = { connecting: "connecting", stalled: "lost", paused: "paused", no_tissue: "empty", ended: "ended" };
+/** What is said of a feed that stalls, by the code of its reason; else the signal is lost. */
+const STALLED = {
+  size_changed: "unusable", packing_changed: "unusable", packing_unknown: "unusable", picture_limit: "unusable",
+  times_jumped: "unusable", undecodable: "unusable", no_video: "unusable",
+  decoder_ended: "fault", decoder_memory: "fault", fault: "fault",
+  too_slow: "too_slow",
+  no_scene: "no_model", calibration: "no_model",
+};
+/** Reasons that may be the model's alone: the picture comes in. */
+const OF_MODEL = ["no_scene", "calibration", "fault"];
 
 const said = (kind, place, values = {}) => ({ kind, place, values });
 const seconds = (ageS) => Math.max(1, Math.round(ageS));
@@ -37,13 +47,15 @@ export function headlineOfPicture({ feed, isGone, answerAgeS, pictureAtS, pictur
   const isRefused = pictureProblem?.status === NO_ANSWER;
   if (answerAgeS > (isRefused ? LOST_AFTER_S : SILENT_AFTER_S)) return said("lost", "live.word_service_lost");
   if (feed === null) return said("connecting", "live.word_connecting");
-  if (feed.state in KINDS) return said(KINDS[feed.state], `live.word_${feed.state}`);
+  const why = STALLED[feed.reason] ?? "stalled";
+  const isSeen = feed.state === "stalled" && OF_MODEL.includes(feed.reason) && pictureAtS !== null;
+  if (feed.state in KINDS && !isSeen) return said(KINDS[feed.state], `live.word_${feed.state === "stalled" ? why : feed.state}`);
   if (pictureAtS === null) return said("connecting", "live.word_connecting");
   const missedS = feed.received_fps > 0 ? MISSED / feed.received_fps : 0;
   if (pictureAgeS <= Math.max(LOST_AFTER_S, missedS)) return said("live", "live.word_live");
   if (pictureProblem !== null && !isRefused) return said("lost", "live.word_no_picture");
   const isLate = feed.last_frame_at_s !== null && feed.last_frame_at_s > pictureAtS + LATER_S;
-  if (!isLate) return said("lost", "live.word_stalled");
+  if (!isLate) return said("lost", `live.word_${why === "no_model" ? "stalled" : why}`);
   return said("behind", "live.word_picture_behind", { s: seconds(pictureAgeS) });
 }
 
@@ -52,7 +64,9 @@ export function headlineOf(known) {
   if (known.mode === "frozen") return said("frozen", "live.word_frozen", { time: known.frozenAt });
   if (known.mode === "back") return said("back", "live.word_back", { s: seconds(known.backS) });
   const found = headlineOfPicture(known);
-  if (found.kind !== "live" || known.modelAgeS === null) return found;
+  if (found.kind !== "live") return found;
+  if (known.feed.state === "stalled") return said("behind", "live.word_no_model");
+  if (known.modelAgeS === null) return found;
   const isBehind = known.modelAgeS > BEHIND_S || (known.feed.state === "behind" && known.modelAgeS > LOST_AFTER_S);
   return isBehind ? said("behind", "live.word_behind", { s: seconds(known.modelAgeS) }) : found;
 }

@@ -27,7 +27,7 @@ function recordingOf({ state, recording }) {
  * @returns {[string, string][]} name and value
  */
 function rowsOf(feed, modelAgeS, sentRate) {
-  const seconds = (s) => (s == null || Number.isNaN(s) ? "–" : words("live.in_seconds", { s: figure(s, 2) }));
+  const seconds = (s, digits = 2) => (s == null || Number.isNaN(s) ? "–" : words("live.in_seconds", { s: figure(s, digits) }));
   const rate = (fps) => words("live.per_second", { fps: figure(fps, 1) });
   const rows = [
     [words("live.recording"), recordingOf(feed)],
@@ -35,7 +35,7 @@ function rowsOf(feed, modelAgeS, sentRate) {
     [words("live.used"), rate(feed.used_fps)],
     [words("live.dropped"), figure(feed.dropped)],
     [words("live.lag"), seconds(feed.decode_lag_s)],
-    [words("live.model_age"), seconds(modelAgeS)],
+    [words("live.model_age"), seconds(modelAgeS, 1)],
     [words("live.reconnects"), figure(feed.reconnects)],
     [words("live.stored"), words("live.megabytes", { mb: figure(feed.stored_bytes / MB, 1) })],
   ];

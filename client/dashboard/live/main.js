@@ -178,6 +178,7 @@ function refresh() {
   setText(get("live-age"), now.pictureAgeS === null ? "" : ageWords(now.pictureAgeS));
   setText(get("live-message"), picture.isBlank ? blankWords(ofPicture) : "");
   refreshModel(now);
+  health.refresh(feed, now.modelAgeS ?? NaN, push?.pace.rate ?? NaN); // the age beside the model, and no other
   const isAway = look.mode !== "live" || look.isTurned || look.rock.isOn;
   get("live").classList.toggle("wanted", isAway);
   get("freeze").setAttribute("aria-pressed", String(look.mode === "frozen"));
@@ -206,16 +207,17 @@ function refreshModel({ modelAgeS }) {
   get("model-message").classList.toggle("over-picture", shown !== null);
 }
 
-/** How far the view in sight can be trusted: of the service's warnings about it. */
+/** How far the view in sight can be trusted, with the worst reason, and what else the service notes of it. */
 function showTrust() {
   const { shown } = model;
   const target = get("trust");
   const trust = shown && trustOf({ scored: true, psnr_tissue_db: 0, warnings: shown.warnings });
-  const key = trust && JSON.stringify([language(), trust.light, trust.reasons.map(({ code }) => code)]);
+  const notices = trust ? [...trust.reasons.slice(0, 1), ...shown.warnings.filter(({ severity }) => severity === "info")] : [];
+  const key = trust && JSON.stringify([language(), trust.light, notices.map(({ code }) => code)]);
   if (target.dataset.of === key) return;
   target.dataset.of = key ?? "";
   target.replaceChildren(...(trust ? [lightMark(trust.light)] : []));
-  setText(get("trust-why"), trust?.reasons.length ? noticeWords(trust.reasons[0]) : "");
+  setText(get("trust-why"), notices.map(noticeWords).join(" "));
 }
 
 function showFault(text) {
@@ -280,7 +282,6 @@ setInterval(refresh, TICK_MS);
 setInterval(() => {
   if (feedId === null || document.hidden) return;
   tape.refresh(feed);
-  health.refresh(feed, known().modelAgeS ?? NaN, push?.pace.rate ?? NaN);
   if (model.shown === null) showTrust();
 }, TAPE_MS);
 

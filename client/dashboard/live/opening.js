@@ -6,7 +6,7 @@ import { showProblem } from "../base/problem.js";
 import { listFeeds, openFeed } from "./feeds.js";
 import { showFeeds } from "./links.js";
 import { canCapture, openCapture } from "./push.js";
-import { faultOf } from "./sources.js";
+import { EXAMPLES, faultOf } from "./sources.js";
 
 const LOOK_MS = 2000;
 
@@ -58,6 +58,7 @@ export class Opening {
     source.required = isTyped;
     if (isTyped) {
       setText(form.querySelector("#source-name"), words(`live.source_${from}`));
+      source.placeholder = EXAMPLES[from];
       setText(form.querySelector("#source-note"), words(`live.source_note_${from}`));
     }
     this.#judge();

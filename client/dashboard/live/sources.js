@@ -9,6 +9,8 @@ const MAX_PORT = 65535;
 const PATH = /^((file|v4l2):\/\/)?\/./i;
 const WITH_SCHEME = /^[a-z0-9]+:\/\//i;
 
+export const EXAMPLES = { url: "rtsp://192.0.2.10:554/stereo", file: "/data/stereo.mp4" };
+
 /** @typedef {"url"|"file"} From */
 
 /** @param {From} from @param {string} text @returns {string} the place of words that say what to change; empty: nothing */

@@ -39,13 +39,15 @@ export class Overlay {
     draw(this.svg, "text", { x, y: y - ARM_PX }, text);
   }
 
-  /** Once all lines are there: their texts above them, within the picture and not over each other. @param {import("../stage/stream.js").Camera} camera */
+  /** Once all lines are there: their texts above them, within the picture and over no other text or point. @param {import("../stage/stream.js").Camera} camera */
   spread(camera) {
     const texts = [...this.svg.querySelectorAll("text")];
     this.svg.append(...texts);
     const [left, top] = this.#at(camera, [0, 0]);
     const [right, bottom] = this.#at(camera, [camera.width, camera.height]);
-    const moves = spread(texts.map((text) => text.getBBox()), { left, top, right, bottom });
+    const points = [...this.svg.querySelectorAll("path.point")];
+    const [boxes, free] = [texts, points].map((all) => all.map((each) => each.getBBox()));
+    const moves = spread(boxes, { left, top, right, bottom }, free);
     texts.forEach((text, i) => {
       for (const [j, name] of ["x", "y"].entries()) text.setAttribute(name, Number(text.getAttribute(name)) + moves[i][j]);
     });

@@ -80,7 +80,8 @@ export class Compare {
     const jobs = this.offered.filter(({ id, state }) => state === "done" && id !== this.scene);
     const { job } = this.other ?? {};
     if (job && !jobs.some(({ id }) => id === job.id)) jobs.push(job);
-    const options = [["", words("compare.with_recording")], ...jobs.map((each) => [each.id, nameOf(each)])];
+    const none = words(this.mode === "off" && value === "" ? "compare.with_another" : "compare.with_recording"); // said once
+    const options = [["", none], ...jobs.map((each) => [each.id, nameOf(each)])];
     const filled = JSON.stringify(options);
     if (filled === this.filled) return; // an open list would close
     this.filled = filled;
@@ -130,6 +131,11 @@ export class Compare {
     return { scene, t: shown.picture.t, pose, eye, layer, codes: shown.picture.codes };
   }
 
+  /** In which light the model is compared with the recording: with that of the moment, where it changes. */
+  get #light() {
+    return this.report.light ? "recorded" : "steady";
+  }
+
   /** The recorded frame that belongs to the view; null: not known. */
   get #frame() {
     return this.t === null ? null : this.frames.frameAt(this.t);
@@ -171,7 +177,7 @@ export class Compare {
     this.#begin(mode);
     this.parts.tools.closest("label").hidden = !this.report.recorded.masks;
     const { orbit, parts } = this.viewer;
-    const wish = { light: "recorded", ...(parts.layer.value === "recorded" ? { layer: "rgb" } : {}) };
+    const wish = { light: this.#light, ...(parts.layer.value === "recorded" ? { layer: "rgb" } : {}) };
     this.viewer.look(orbit.isHome ? wish : { ...wish, pose: null }); // at home either eye may stay
   }
 
@@ -182,6 +188,7 @@ export class Compare {
     this.parts.stage.dataset.compare = mode;
     this.parts.box.hidden = false;
     this.seam.move(MIDDLE);
+    this.#fill();
     this.#draw();
     this.onChange();
   }
@@ -216,6 +223,7 @@ export class Compare {
     this.parts.canvas.width = this.parts.canvas.height = 0; // its pixels are gone, not only hidden
     this.#say(why);
     if (this.viewer.light === "recorded") this.viewer.look({ light: "steady" });
+    this.#fill();
     if (isNew) this.onChange();
   }
 
@@ -231,7 +239,7 @@ export class Compare {
     if (this.mode === "off" || scene !== this.scene) return;
     if (this.other) return this.#followScene(t);
     const isHome = pose === null && layer !== "recorded";
-    if (this.isComing && !(isHome && light === "recorded")) return;
+    if (this.isComing && !(isHome && light === this.#light)) return;
     if (!isHome) return this.#end(layer === "recorded" ? "" : words("compare.turned"));
     this.isComing = false;
     const { recorded, frame_count: frameCount } = this.report;

@@ -1,10 +1,11 @@
-// The five buttons of the theatre's set. Each does what a control of the desk does, and shows what that shows.
+// The buttons of the theatre's set: five, and a few in the scenes. Each does what a control of the desk does, and shows what
+// that shows.
 
 import { languageEvents, words } from "../base/messages.js";
 
 const SHOWN = ["aria-pressed", "aria-expanded", "disabled"];
 
-/** @param {HTMLElement} nav with buttons whose data-does is the selector of a control; .plays says what a press would do */
+/** @param {ParentNode} nav with buttons whose data-does is the selector of a control; .plays says what a press would do */
 export function prepareFive(nav) {
   for (const button of nav.querySelectorAll("[data-does]")) {
     const control = document.querySelector(button.dataset.does);

@@ -303,7 +303,8 @@ export class Viewer extends EventTarget {
 
   /** Put a view's picture on the screen, and say what it shows. began: when it was asked for. */
   #present(picture, image, view, name, began) {
-    this.screen.show(picture, image, name, this.timeline.momentOf(picture.t));
+    const t = [RECORDED, ERROR].includes(view.layer) ? view.t : picture.t; // a frame stands for all moments next to it
+    this.screen.show(picture, image, name, this.timeline.momentOf(t));
     this.shown = shownOf(view, picture);
     this.#allowPlay();
     this.dispatchEvent(new CustomEvent("shown", { detail: this.shown }));
