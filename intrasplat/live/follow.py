@@ -60,7 +60,7 @@ MAX_LOST_S = 1.0
 MIN_DEPTH_SHARE = 0.05
 """A pair is not used if a smaller share of its picture is tissue with depth."""
 MANY_CORES = 4
-"""With fewer cores, steps beside the reading of a pair use one."""
+"""With fewer cores, steps before a pair is ready use one. Those that learn it use all, while the next one is read."""
 LOOK_EVERY = 2
 """Used frames from one look at what is to be trusted to the next."""
 MIN_STEPS = 2
@@ -137,6 +137,7 @@ class Follower:
         self._scene: tuple[int, TrainedScene] | None = None
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="feed")
         self._ahead: tuple[FeedPair, Future[DepthClip | Added]] | None = None
+        self._range_of: DepthClip | None = None
         self._rehearsed = self._version = 0
         self._motion_error = 0.0
         self._flow: FlowStart
@@ -165,8 +166,8 @@ class Follower:
     def add(self, pair: FeedPair, budget_s: float = 0.2, coming: Callable[[], FeedPair | None] = lambda: None) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
 
-        While the pair is read, the window's frames train. While it is learnt, the one that coming() gives is read; it
-        is the next one to add, or left out.
+        The window's frames train until the pair is read and its motion is known. While it is learnt, the pair that
+        coming() gives is read ahead; the caller adds it next, or never.
 
         Raises:
             InputError: its pictures have another size than those before, or the calibration does not fit them.
@@ -265,11 +266,17 @@ class Follower:
             return clip if self._is_tissue(clip) else Added.NO_TISSUE
 
     def _prepared(self, pair: FeedPair, read: Future[DepthClip | Added]) -> _Ready | Added:
-        """What can be computed of a pair without the model, or why it is not used."""
+        """What can be computed of a pair without the model, or why it is not used.
+
+        After a segment, the disparities that it showed become the range of the pair after this one.
+        """
         clip = read.result()
         if isinstance(clip, Added):
             return clip
         with one_opencv_thread():
+            seen, self._range_of = self._range_of, None
+            if seen is not None and self._eyes is not None:
+                self._eyes.follow_range(seen)
             window = self._window
             if window is not None and self.settings.camera == "moving":
                 placed = self._placer.placed(clip)
@@ -320,7 +327,7 @@ class Follower:
         self._keep(self._scene_of(window, count + 1))  # one more frame: no gap is between them
         with self._lock:
             window.give_up()
-        self._reader.submit(self._eyes.follow_range, window.newest.clip)
+        self._range_of = window.newest.clip
 
     def _keep(self, segment: TrainedScene) -> None:
         """Add a segment, and forget those before keep_s."""

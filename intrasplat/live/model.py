@@ -278,6 +278,7 @@ class FeedModel:
             follower.close()
 
     def _fail(self, error: Exception) -> None:
+        self._coming = None  # it will be old
         if isinstance(error, InputError):
             self._trouble = Trouble(FeedReason.CALIBRATION, str(error))
         else:

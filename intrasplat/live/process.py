@@ -126,8 +126,13 @@ class ReadingProcess:
 
     def newest(self, after: int, timeout_s: float) -> HandedOver | None:
         """The newest pair after sequence `after`; None if there is none in time, or the process has ended."""
-        with self._asking:
-            return self._newest(after, time.monotonic() + timeout_s)
+        deadline_s = time.monotonic() + timeout_s
+        if not self._asking.acquire(timeout=max(timeout_s, 0.0)):
+            return None
+        try:
+            return self._newest(after, deadline_s)
+        finally:
+            self._asking.release()
 
     def _newest(self, after: int, deadline_s: float) -> HandedOver | None:
         with self._answered:

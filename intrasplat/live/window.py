@@ -146,7 +146,7 @@ class Window:
     def give_up(self) -> None:
         """Forget the first segment. The motion's weights and Adam's moments of the others move to its slots.
 
-        The mean of their weights becomes part of the canonical state, or float16 could not store weights after hours.
+        The mean of their weights becomes part of the canonical state: float16 loses small differences of large weights.
         """
         count, arrays = self.segment_frames, self.model.arrays()
         for name in (WEIGHT, FIRST_MOMENTS, SECOND_MOMENTS, STEPS):

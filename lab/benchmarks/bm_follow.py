@@ -182,15 +182,24 @@ def in_real_time(
 
     viewer = threading.Thread(target=look)
     viewer.start()
-    last, cpu_s = -1, time.process_time()
-    while (now_s := time.time() - began) < seconds:
-        number = int(now_s * played.fps)
-        if number == last:
+    last, cpu_s, ahead = -1, time.process_time(), list[FeedPair]()
+
+    def newest() -> list[FeedPair]:
+        number = int((time.time() - began) * played.fps)
+        return [] if number == last else [played.pair(number, began + number / played.fps)]
+
+    def coming() -> FeedPair | None:
+        ahead[:] = newest()
+        return next(iter(ahead), None)
+
+    while time.time() - began < seconds:
+        pair = next(iter(ahead or newest()), None)
+        ahead.clear()
+        if pair is None:
             time.sleep(1 / played.fps / 4)
             continue
-        last = number
-        became = follower.add(played.pair(number, began + number / played.fps), budget_s)
-        _took(follower, became, played, found, number)
+        last = pair.sequence
+        _took(follower, follower.add(pair, budget_s, coming), played, found, last)
     found.cpu_s = time.process_time() - cpu_s
     ended.set()
     viewer.join()
