@@ -7,7 +7,6 @@ import dataclasses
 import http.server
 import re
 import threading
-import tracemalloc
 import zipfile
 from collections.abc import Iterator
 from functools import partial
@@ -26,11 +25,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 from client.page import DASHBOARD
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
-from intrasplat.errors import InputError, SceneError, UnavailableError
 from intrasplat.names import DETAIL, RECORDED, REPORT
 from intrasplat.report import DetailScores
 from intrasplat.scene.checkpoint import load_scene
-from intrasplat.scene.inline import CannotInlineError, inlined, joined
+from intrasplat.scene.inline import inlined, joined
 from intrasplat.scene.recorded_file import name_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
@@ -47,7 +45,6 @@ from tests.client.test_player import scattered
 from tests.client.test_player_detail import SIZE
 from tests.client.test_player_detail import stored as with_recorded_frames
 from tests.client.words import say, table
-from tests.intrasplat.scenes import random_scene
 
 LEAST_DB = 50.0
 OPENS_WITHIN_S = 120.0
@@ -268,50 +265,6 @@ def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
     assert f'"{name_of("right", HELD_OUT, "jpg")}"'.encode() not in asked  # nothing shows it
 
 
-@pytest.mark.parametrize("damage", ["directory", "picture", "encrypted", "cut"])
-def test_damaged_recorded_frames_stop_only_who_asks_for_them(tmp_path: Path, damage: str) -> None:
-    folder, name = stored(tmp_path / "scene", small_scene()), name_of("left", HELD_OUT, "jpg")
-    with zipfile.ZipFile(folder / RECORDED, "w") as archive:
-        archive.writestr(name, SHADE * b"picture")
-    sound = (folder / RECORDED).read_bytes()
-    listed = sound.index(b"PK\x01\x02")
-    spoilt = bytearray(sound)
-    if damage == "directory":
-        spoilt = spoilt[:listed]
-    elif damage == "picture":
-        spoilt[listed - 1] ^= 1
-    elif damage == "encrypted":
-        spoilt[6], spoilt[listed + 8] = 1, 1
-    else:
-        spoilt[listed + 20 : listed + 28] = 2 * (2 * len(sound)).to_bytes(4, "little")
-    whole = b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD))
-    assert f'{{"{name}": "'.encode() in whole
-    (folder / RECORDED).write_bytes(spoilt)
-    assert b'"state": "damaged"' in b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD))
-    assert b'"state": "off"' in b"".join(stored_parts("html", folder, ORIGIN, DASHBOARD, recorded="off"))
-    with pytest.raises(SceneError, match="cannot be read"):
-        stored_parts("html", folder, ORIGIN, DASHBOARD, recorded="on")
-
-
-def test_pictures_are_read_one_by_one_while_the_file_is_sent(tmp_path: Path) -> None:
-    folder, count, size = stored(tmp_path / "scene", small_scene()), 12, 4_000_000
-    names = [name_of("left", frame, "jpg") for frame in range(count)]
-    with zipfile.ZipFile(folder / RECORDED, "w") as archive:
-        for name in names:
-            archive.writestr(name, bytes(size))
-    tracemalloc.start()
-    content, length = re.compile(rb'"(left/\d+\.jpg)": "'), 0
-    found = []
-    for part in stored_parts("html", folder, ORIGIN, DASHBOARD, recorded="on"):
-        found += content.findall(part[:100])
-        length += len(part)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert [name.decode() for name in found] == names
-    assert length > count * size * 4 / 3
-    assert peak < 10 * size
-
-
 def test_its_policy_lets_nothing_out_and_nothing_in(driver: webdriver.Chrome, file: Path) -> None:
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', file.read_text(encoding="utf-8"))
     rules = dict(each.strip().partition(" ")[::2] for each in policy.split(";"))
@@ -356,39 +309,6 @@ def test_the_command_line_writes_the_file(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("intrasplat.scene.stored_exports.server_part", lambda name: None)
     monkeypatch.delenv(DASHBOARD_VARIABLE)
     assert main(["export", str(tmp_path / "scene"), "--format", "html"]) == ExitCode.UNAVAILABLE
-
-
-def test_what_cannot_be_shown_so_is_refused_before_anything_is_sent(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="hexplane") as refused:
-        stored_parts("html", stored(tmp_path / "planes", random_scene("hexplane")), None, DASHBOARD)
-    assert refused.value.field == "format"
-    with pytest.raises(SceneError):
-        stored_parts("html", tmp_path, None, DASHBOARD)
-    with pytest.raises(InputError, match="no recorded frames"):
-        stored_parts("html", stored(tmp_path / "plain", small_scene()), None, DASHBOARD, recorded="on")
-    with pytest.raises(UnavailableError, match="INTRASPLAT_DASHBOARD_DIR"):
-        stored_parts("html", stored(tmp_path / "scene", small_scene()), None, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("source", "problem"),
-    [
-        ('import * as all from "./b.js";', "not understood"),
-        ('import "./b.js";', "not understood"),
-        ('const b = await import("./b.js");', "not understood"),
-        ("export default 1;", "not understood"),
-        ("export let a = 1;", "not understood"),
-        ("const a = 1;\nexport { a };", "not understood"),
-        ('import { a } from "./a.js";\nexport const a = 1;', "imports itself"),
-        ("export const a = '</script>';", "would end the script"),
-        ("console.log(import.meta.url);", "not understood"),
-    ],
-)
-def test_a_form_that_the_inliner_does_not_know_is_refused(tmp_path: Path, source: str, problem: str) -> None:
-    (tmp_path / "b.js").write_text("export const b = 1;\n")
-    (tmp_path / "a.js").write_text(source)
-    with pytest.raises(CannotInlineError, match=problem):
-        inlined(tmp_path / "a.js")
 
 
 def test_modules_keep_their_names_apart_and_are_made_once(driver: webdriver.Chrome, tmp_path: Path) -> None:
@@ -443,42 +363,3 @@ def test_a_page_has_one_module_its_workers_and_what_it_imports_later_shares_its_
         driver.get(f"http://127.0.0.1:{server.server_port}/")
         WebDriverWait(driver, OPENS_WITHIN_S).until(lambda _: driver.title == "b,start,l,later,x.css,41")
         server.shutdown()
-
-
-@pytest.mark.parametrize(
-    ("sources", "problem"),
-    [
-        ({"main": "await import('b')", "b": "await import('c')", "c": ""}, "b.js is imported later and imports c.js"),
-        ({"main": "await import('b')", "b": "await import('b')"}, "by itself"),
-        ({"main": "await import('main')"}, "by itself"),
-        (
-            {"main": "await import('b'); await import('c')", "b": "import d", "c": "import d", "d": ""},
-            "d.js is needed by b.js and c.js",
-        ),
-        ({"main": "await import('b'); await import('c')", "b": "import c", "c": ""}, "c.js is needed by b.js and c.js"),
-        ({"main": "await import('b')", "other": "await import('b')", "b": ""}, "by two scripts"),
-    ],
-)
-def test_late_modules_that_would_be_made_twice_are_refused(
-    tmp_path: Path, sources: dict[str, str], problem: str
-) -> None:
-    for name, source in sources.items():
-        lines = re.sub(r"^import (\w)$", r'import { \1 } from "./\1.js";', source)
-        lines = re.sub(r"import\('(\w+)'\)", r'import("./\1.js")', lines)
-        (tmp_path / f"{name}.js").write_text(f"{lines}\nexport const {name} = 1;\n")
-    with pytest.raises(CannotInlineError, match=problem):
-        joined(*(tmp_path / f"{name}.js" for name in ("main", "other") if name in sources))
-
-
-def test_late_modules_share_what_the_page_has_and_a_worker_may_start_itself(tmp_path: Path) -> None:
-    worker = 'new Worker(new URL("./w.worker.js", import.meta.url), { type: "module" });\n'
-    sources = {
-        "main": f'import {{ d }} from "./d.js";\n{worker}await import("./b.js");\nawait import("./c.js");\n',
-        "b": 'import { d } from "./d.js";\nexport const b = d;\n',
-        "c": 'import { d } from "./d.js";\nexport const c = d;\n',
-        "d": "export const d = [];\n",
-        "w.worker": f"export const again = () => {worker}",
-    }
-    for name, source in sources.items():
-        (tmp_path / f"{name}.js").write_text(source)
-    assert {path.stem for path in joined(tmp_path / "main.js")} == {"main", "b", "c", "w.worker"}
