@@ -49,8 +49,8 @@ DESCRIPTION = (
     "Research use only; not a medical device.\n\n"
     "The WebSocket /stream shows many views over one connection. Send the parameters of /render as a JSON text, with "
     "an `id` of your choice. A view is one binary message: 4 bytes, big-endian, with the length of the head, the head "
-    "(JSON), the image. A JSON text with `status` is an error. docs/stream.md of the source has the messages, keys, "
-    "close codes and an example."
+    "(JSON), the image. A JSON text with `status` is an error; one with `state` and no `status` answers `confirm`. "
+    "docs/stream.md of the source has the messages, keys, close codes and an example."
 )
 
 BACKGROUND_PAUSE_S = 10.0

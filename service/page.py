@@ -3,7 +3,7 @@
 Each HTML file, such as `/`, names its scripts and styles below `/v/HASH/`. There its script is one module with all that
 it imports, so that a first visit does not wait for a hundred requests. The same files are there without a hash, too, as
 they were written, and are cached nowhere. An HTML file has its words in the browser's language: on a slow line they are
-there at the first paint.
+there at the first paint. Scripts that cannot be joined are served as they were written.
 """
 
 from __future__ import annotations
@@ -12,18 +12,22 @@ import gzip
 import hashlib
 import html
 import json
+import logging
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Scope
 
-from intrasplat.scene.inline import joined
+from intrasplat.scene.inline import CannotInlineError, joined
 
 INDEX = "index.html"
 VERSIONED = "v"
@@ -38,11 +42,15 @@ SCRIPT = re.compile(r'<script type="module" src="([^"]+)"')
 PLACE = re.compile(r'(<(?:\w+)[^>]*\bdata-words="(\w+)\.(\w+)"[^>]*>)[^<]*')
 MESSAGES = {language: f"base/messages.{language}.js" for language in ("en", "de")}
 """Tables of words; the first is of whoever asks for no other."""
+_JOINING = Lock()
+"""After a change on disk scripts are joined once, whoever asks for them at the same time."""
+
+logger = logging.getLogger("intrasplat.service")
 
 
 def page_files(folder: Path) -> ASGIApp:
     """The application that serves the page in a folder, compressed for whoever takes gzip."""
-    _scripts(folder, _version(folder))  # not while others wait
+    _current(folder)  # not while others wait
     return GZipMiddleware(_Files(folder), minimum_size=MIN_COMPRESSED_BYTES)
 
 
@@ -54,16 +62,17 @@ class _Files(StaticFiles):
     async def get_response(self, path: str, scope: Scope) -> Response:
         name = INDEX if path == "." else path
         if name in (each.name for each in self._folder.glob("*.html")):
-            return _html(self._folder, name, _version(self._folder), _language(Headers(scope=scope)))
+            return await run_in_threadpool(_html, self._folder, name, _language(Headers(scope=scope)))
         first, _, rest = path.partition("/")
         if first != VERSIONED:
             return await super().get_response(path, scope)
         version, _, file = rest.partition("/")
+        current, scripts = await run_in_threadpool(_current, self._folder)
         response = await super().get_response(file, scope)
-        script = _scripts(self._folder, _version(self._folder)).get(self._folder.resolve() / file)
+        script = scripts.get(self._folder.resolve() / file)
         if script is not None and response.status_code == 200:
             response = _script(script, is_compressed="gzip" in Headers(scope=scope).get("Accept-Encoding", ""))
-        if version == _version(self._folder):  # another one is of a page that is older or newer than this service
+        if version == current:  # another one is of a page that is older or newer than this service
             response.headers["Cache-Control"] = FOREVER
         return response
 
@@ -77,9 +86,9 @@ def _text(folder: Path, name: str, version: str, language: str) -> str:
     return REFERENCE.sub(rf"\g<1>{VERSIONED}/{version}/\g<2>", text)
 
 
-def _html(folder: Path, name: str, version: str, language: str) -> Response:
+def _html(folder: Path, name: str, language: str) -> Response:
     headers = {"Cache-Control": REVALIDATE, "Vary": "Accept-Language"}
-    return HTMLResponse(_text(folder, name, version, language), headers=headers)
+    return HTMLResponse(_text(folder, name, _version(folder), language), headers=headers)
 
 
 def _script(compressed: bytes, *, is_compressed: bool) -> Response:
@@ -88,13 +97,22 @@ def _script(compressed: bytes, *, is_compressed: bool) -> Response:
     return Response(body, media_type="text/javascript", headers=headers)
 
 
+def _current(folder: Path) -> tuple[str, Mapping[Path, bytes]]:
+    """The version of the files as they are now, and their scripts."""
+    version = _version(folder)
+    with _JOINING:
+        return version, _scripts(folder, version)
+
+
 @lru_cache(maxsize=2)
 def _scripts(folder: Path, version: str) -> Mapping[Path, bytes]:
-    """The modules of the HTML files' scripts, joined, as gzip."""
-    scripts: dict[Path, str] = {}
-    for page in folder.glob("*.html"):
-        for entry in SCRIPT.findall(page.read_text(encoding="utf-8")):
-            scripts |= joined(folder / entry)
+    """The modules of the HTML files' scripts, joined, as gzip; none of them if one cannot be joined."""
+    try:
+        pages = [page.read_text(encoding="utf-8") for page in sorted(folder.glob("*.html"))]
+        scripts = joined(*(folder / entry for page in pages for entry in SCRIPT.findall(page)))
+    except (CannotInlineError, OSError, UnicodeError) as error:
+        logger.warning("the page's scripts are served as they were written: %s", error)
+        return {}
     return {path: gzip.compress(text.encode()) for path, text in scripts.items()}
 
 
@@ -115,8 +133,12 @@ def _language(headers: Headers) -> str:
 
 
 def _version(folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return _hash_of(tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files))
+    files = []
+    for path in sorted(folder.rglob("*")):
+        with suppress(OSError):  # it was removed just now
+            if path.is_file():
+                files.append((path, path.stat().st_mtime_ns, path.stat().st_size))
+    return _hash_of(tuple(files))
 
 
 @lru_cache(maxsize=2)
@@ -125,5 +147,6 @@ def _hash_of(files: tuple[tuple[Path, int, int], ...]) -> str:
     digest = hashlib.sha256()
     for path, _, size in files:
         digest.update(f"{path.name} {size}\n".encode())
-        digest.update(path.read_bytes())
+        with suppress(OSError):  # nobody gets it
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:HASH_DIGITS]

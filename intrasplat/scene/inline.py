@@ -50,22 +50,43 @@ def inlined(entry: Path) -> str:
     return script
 
 
-def joined(entry: Path) -> dict[Path, str]:
-    """The modules to serve in place of files, by these: a page's script with all that it imports, its workers likewise,
-    and what it imports later with what only that needs.
+def joined(*entries: Path) -> dict[Path, str]:
+    """The modules to serve in place of files, by these: each page's script with all that it imports, its workers
+    likewise, and what it imports later with what only that needs.
 
-    Raises: as inlined.
+    Raises:
+        CannotInlineError: also if a module that is imported later imports others later, or if two scripts would each
+            have a module of their own that they should share.
+        OSError: a module is missing.
     """
-    return _scripts(_Joined(entry))
-
-
-def _scripts(bundle: _Joined) -> dict[Path, str]:
-    scripts = {bundle.entry: bundle.text()}
-    for worker in bundle.workers:
-        scripts |= joined(worker)
-    for later in bundle.later:
-        scripts |= _scripts(_Joined(later, bundle))
+    scripts: dict[Path, str] = {}
+    for entry in entries:
+        _join(_Joined(entry), scripts)
     return scripts
+
+
+def _join(bundle: _Joined, scripts: dict[Path, str]) -> None:
+    """Add the script of a bundle, of its workers and of what it imports later. Raises as joined()."""
+    text = bundle.text()
+    if bundle.entry in scripts:
+        if scripts[bundle.entry] == text:
+            return
+        raise CannotInlineError(f"{bundle.entry.name} is imported later by two scripts, or by itself")
+    scripts[bundle.entry] = text
+    for worker in bundle.workers:
+        _join(_Joined(worker), scripts)
+    owners: dict[Path, Path] = {}
+    for entry in dict.fromkeys(bundle.later):
+        part = _Joined(entry, bundle)
+        _join(part, scripts)
+        if part.later:
+            raise CannotInlineError(f"{entry.name} is imported later and imports {part.later[0].name} later")
+        for path in part.names.keys() - bundle.names.keys():
+            if owners.setdefault(path, entry) != entry:
+                raise CannotInlineError(
+                    f"{path.name} is needed by {owners[path].name} and {entry.name}, which are imported later, "
+                    f"and not by {bundle.entry.name}"
+                )
 
 
 class _Bundle(ABC):
@@ -89,7 +110,7 @@ class _Bundle(ABC):
 
     @abstractmethod
     def _bound(self, source: str, folder: Path) -> str:
-        """The source of a module in a folder, in which FORMS are such that the script finds what they name."""
+        """The source of a module in a folder, with FORMS rewritten: the addresses in them fit the script's place."""
 
     def _add(self, path: Path) -> str:
         """Add a module after those that it imports; return the name of the variable with its exports."""
@@ -104,7 +125,11 @@ class _Bundle(ABC):
         return self.names[path]
 
     def _name(self, path: Path) -> str:
-        """Of its folder and itself: what is imported later may be of a newer version than what imports it."""
+        """A variable for a module's exports, made of the names of its folder and file.
+
+        It does not change when other modules come or go: a page that was opened before an update may import a later
+        script of after it, which asks for modules by these names.
+        """
         name = re.sub(r"\W", "_", f"module_{path.parent.name}_{path.stem}")
         return name + "_" * sum(each.rstrip("_") == name for each in self.names.values())
 
@@ -138,7 +163,10 @@ class _Inlined(_Bundle):
 
 
 class _Joined(_Bundle):
-    """A module that stands in place of its entry. whole: of the script that imports it later, which has run by then."""
+    """A module that is served in place of its entry.
+
+    whole: the script that imports this one later. This one takes the modules that both need from it.
+    """
 
     DECLARES = "export const"
     FORMS = (_URL, _LATER)

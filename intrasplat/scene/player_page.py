@@ -19,7 +19,7 @@ from zipfile import ZipInfo
 
 from intrasplat.errors import InputError, LimitError, SceneError, UnavailableError
 from intrasplat.formats import MAX_RECORDED_BYTES
-from intrasplat.names import DETAIL, MANIFEST, REPORT, SCENE, Keep
+from intrasplat.names import DETAIL, MANIFEST, RECORDED, REPORT, SCENE, Keep
 from intrasplat.scene.inline import CannotInlineError, inlined
 from intrasplat.scene.recorded_file import read_files, seam_files
 from intrasplat.version import version
@@ -27,6 +27,7 @@ from intrasplat.version import version
 PAGE, SCRIPT = "alone.html", "alone.js"
 STYLE_TAG = re.compile(r'<link rel="stylesheet" href="([^"]+)">')
 CHARSET = '<meta charset="utf-8">'
+PICTURES_TAG = '<script type="application/json" id="pictures">'
 SCENE_TAG = '<script type="text/plain" id="scene">'
 VIDEO_TAG = '<script type="text/plain" id="video">'
 DRAWN = ("compact", "shared")
@@ -43,14 +44,14 @@ DASHBOARD_REMEDY = "Set INTRASPLAT_DASHBOARD_DIR to the page's files, the folder
 class _Recorded:
     """A scene's recorded frames in a page.
 
-    size    bytes of those that there are
-    state   in: they are in the page; off, large, none: why they are not
+    size    bytes of those that there are; 0 if nobody looked, or they are damaged
+    state   in: they are in the page; off, large, damaged, none: why they are not
     video   detail.mkv; None: not in the page
     files   of recorded.zip in the page
     """
 
     size: int
-    state: Literal["in", "off", "large", "none"]
+    state: Literal["in", "off", "large", "damaged", "none"]
     video: Path | None = None
     files: tuple[ZipInfo, ...] = ()
 
@@ -61,12 +62,12 @@ def page_parts(
     """The HTML file of the scene in a folder, piece by piece.
 
     Args:
-        recorded: whether the recorded frames are put in; None: if they have at most MAX_RECORDED_BYTES.
+        recorded: whether the recorded frames are put in; None: if they have at most MAX_RECORDED_BYTES and are sound.
 
     Raises, before the first piece:
         InputError: the player does not draw scenes of this kind, or the scene has no recorded frames.
         LimitError: scene and recorded frames are too large for one file.
-        SceneError: there is no scene, or its manifest cannot be read.
+        SceneError: there is no scene, or its manifest cannot be read, or the recorded frames that are asked for cannot.
         UnavailableError: the page's files are missing.
     """
     try:
@@ -91,14 +92,29 @@ def page_parts(
         "report": {"warnings": ()} | {name: report[name] for name in REPORTED if name in report} if report else None,
         "hasDetail": frames.video is not None,
     }
-    contents = read_files(folder, frames.files)
-    pictures = {name: base64.b64encode(content).decode() for name, content in contents.items()}
-    page = _page(dashboard_dir, {"manifest": manifest, "about": about, "pictures": pictures})
-    return _written(page, {SCENE_TAG: folder / SCENE, VIDEO_TAG: frames.video})
+    page = _page(dashboard_dir, {"manifest": manifest, "about": about})
+    pictures = _pictures(folder, frames.files)
+    return _written(
+        page, {PICTURES_TAG: pictures, SCENE_TAG: _base64(folder / SCENE), VIDEO_TAG: _base64(frames.video)}
+    )
 
 
 def _recorded_frames(folder: Path, recorded: Keep | None, max_bytes: int) -> _Recorded:
     """The recorded frames that go into the page; raises as page_parts()."""
+    if recorded == "off":
+        return _Recorded(0, "off" if any((folder / each).is_file() for each in (DETAIL, RECORDED)) else "none")
+    try:
+        frames = _fitting_frames(folder, recorded, max_bytes)
+        for _ in read_files(folder, frames.files):
+            pass  # their checksums are right
+    except SceneError:
+        if recorded == "on":
+            raise
+        return _Recorded(0, "damaged")
+    return frames
+
+
+def _fitting_frames(folder: Path, recorded: Keep | None, max_bytes: int) -> _Recorded:
     video = folder / DETAIL if (folder / DETAIL).is_file() else None
     files = seam_files(folder)
     size = sum(each.file_size for each in files) + (video.stat().st_size if video else 0)
@@ -107,28 +123,41 @@ def _recorded_frames(folder: Path, recorded: Keep | None, max_bytes: int) -> _Re
     if recorded == "on" and size > max_bytes:
         problem = f"the recorded frames have {size} bytes; in one file there is space for {max_bytes}."
         raise LimitError("recorded", problem, "Add recorded=off.")
-    if size == 0 or recorded == "off":
-        return _Recorded(size, "off" if size else "none")
+    if size == 0:
+        return _Recorded(0, "none")
     if recorded is None and size > min(max_bytes, MAX_RECORDED_BYTES):
         return _Recorded(size, "large")
     return _Recorded(size, "in", video, files)
 
 
-def _written(page: str, inserted: Mapping[str, Path | None]) -> Iterator[bytes]:
-    """The page with a file in base64 behind each tag, in their order."""
-    for tag, path in inserted.items():
+def _written(page: str, inserted: Mapping[str, Iterator[bytes]]) -> Iterator[bytes]:
+    """The page with something behind each tag, in their order."""
+    for tag, parts in inserted.items():
         head, _, page = page.partition(tag)
         yield f"{head}{tag}".encode()
-        if path is None:
-            continue
-        with path.open("rb") as file:
-            while piece := file.read(PIECE_BYTES):
-                yield base64.b64encode(piece)
+        yield from parts
     yield page.encode()
 
 
+def _base64(path: Path | None) -> Iterator[bytes]:
+    if path is None:
+        return
+    with path.open("rb") as file:
+        while piece := file.read(PIECE_BYTES):
+            yield base64.b64encode(piece)
+
+
+def _pictures(folder: Path, files: tuple[ZipInfo, ...]) -> Iterator[bytes]:
+    """A JSON object of files in base64, by name."""
+    before = b"{"
+    for name, content in read_files(folder, files):
+        yield before + f'"{name}": "'.encode() + base64.b64encode(content) + b'"'
+        before = b", "
+    yield b"}" if files else b"{}"
+
+
 def _page(dashboard_dir: Path | None, documents: Mapping[str, object]) -> str:
-    """The page with documents, and with tags for scene and video."""
+    """The page with documents, and with tags for pictures, scene and video."""
     if dashboard_dir is None:
         raise UnavailableError("The page's files are not known here.", DASHBOARD_REMEDY)
     folder = dashboard_dir / "file"
@@ -150,7 +179,7 @@ def _page(dashboard_dir: Path | None, documents: Mapping[str, object]) -> str:
         CHARSET: f'{CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">',
         "</head>": f"<style>{''.join(styles)}</style>\n</head>",
         f'<script type="module" src="{SCRIPT}"></script>': (
-            f"{data}{SCENE_TAG}</script>\n{VIDEO_TAG}</script>\n<script>{script}</script>"
+            f"{data}{PICTURES_TAG}</script>\n{SCENE_TAG}</script>\n{VIDEO_TAG}</script>\n<script>{script}</script>"
         ),
     }
     page = STYLE_TAG.sub("", page)

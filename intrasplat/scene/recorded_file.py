@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -30,6 +30,8 @@ MASK: Kind = "png"
 MAX_FRAME_BYTES = 8 << 20
 """Limit of one file in the zip, which may come from another site."""
 NAME = re.compile(r"(left|right)/(\d{6})\.(jpg|png)")
+_DAMAGED = (ValueError, LookupError, RuntimeError, EOFError, zipfile.BadZipFile)
+"""What zipfile and PyAV raise on content that they cannot read; an encrypted file is a RuntimeError."""
 _DECODING = Lock()
 """A run of pictures is decoded once, whoever asks for its frames at the same time."""
 
@@ -71,7 +73,7 @@ def read_frame(folder: Path, frame_count: int, t: float, eye: Eye = "left", kind
             return index, archive.read(entry)
     except FileNotFoundError:
         raise _no_recorded_frames() from None
-    except (OSError, ValueError, LookupError, NotImplementedError, zipfile.BadZipFile) as error:
+    except (OSError, *_DAMAGED) as error:
         raise _unreadable(error) from error
 
 
@@ -93,18 +95,19 @@ def seam_files(folder: Path) -> tuple[zipfile.ZipInfo, ...]:
             return found
     except FileNotFoundError:
         return ()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+    except (OSError, *_DAMAGED) as error:
         raise _unreadable(error) from error
 
 
-def read_files(folder: Path, entries: Collection[zipfile.ZipInfo]) -> dict[str, bytes]:
-    """Contents of entries of seam_files(), by name. Raises as it does."""
+def read_files(folder: Path, entries: Collection[zipfile.ZipInfo]) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of entries of seam_files(), one after another. Raises as it does."""
     if not entries:
-        return {}
+        return
     try:
         with zipfile.ZipFile(folder / RECORDED) as archive:
-            return {entry.filename: archive.read(entry) for entry in entries}
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+            for entry in entries:
+                yield entry.filename, archive.read(entry)
+    except (OSError, *_DAMAGED) as error:
         raise _unreadable(error) from error
 
 
@@ -127,7 +130,7 @@ def complete_zip(folder: Path) -> BinaryIO:
                     archive.writestr(zipfile.ZipInfo(name_of(eye, frame, PICTURE)), pictures[frame])
             for each in stored.infolist():
                 archive.writestr(zipfile.ZipInfo(each.filename), stored.read(each))
-    except (ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         raise _unreadable(error) from error
     content.seek(0)
     return content

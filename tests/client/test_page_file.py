@@ -25,11 +25,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 from client.page import DASHBOARD
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
-from intrasplat.errors import InputError, SceneError, UnavailableError
 from intrasplat.names import DETAIL, RECORDED, REPORT
 from intrasplat.report import DetailScores
 from intrasplat.scene.checkpoint import load_scene
-from intrasplat.scene.inline import CannotInlineError, inlined, joined
+from intrasplat.scene.inline import inlined, joined
 from intrasplat.scene.recorded_file import name_of
 from intrasplat.scene.scene import TrainedScene
 from intrasplat.scene.stored_exports import DASHBOARD_VARIABLE, stored_parts
@@ -46,7 +45,6 @@ from tests.client.test_player import scattered
 from tests.client.test_player_detail import SIZE
 from tests.client.test_player_detail import stored as with_recorded_frames
 from tests.client.words import say, table
-from tests.intrasplat.scenes import random_scene
 
 LEAST_DB = 50.0
 OPENS_WITHIN_S = 120.0
@@ -311,39 +309,6 @@ def test_the_command_line_writes_the_file(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("intrasplat.scene.stored_exports.server_part", lambda name: None)
     monkeypatch.delenv(DASHBOARD_VARIABLE)
     assert main(["export", str(tmp_path / "scene"), "--format", "html"]) == ExitCode.UNAVAILABLE
-
-
-def test_what_cannot_be_shown_so_is_refused_before_anything_is_sent(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="hexplane") as refused:
-        stored_parts("html", stored(tmp_path / "planes", random_scene("hexplane")), None, DASHBOARD)
-    assert refused.value.field == "format"
-    with pytest.raises(SceneError):
-        stored_parts("html", tmp_path, None, DASHBOARD)
-    with pytest.raises(InputError, match="no recorded frames"):
-        stored_parts("html", stored(tmp_path / "plain", small_scene()), None, DASHBOARD, recorded="on")
-    with pytest.raises(UnavailableError, match="INTRASPLAT_DASHBOARD_DIR"):
-        stored_parts("html", stored(tmp_path / "scene", small_scene()), None, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("source", "problem"),
-    [
-        ('import * as all from "./b.js";', "not understood"),
-        ('import "./b.js";', "not understood"),
-        ('const b = await import("./b.js");', "not understood"),
-        ("export default 1;", "not understood"),
-        ("export let a = 1;", "not understood"),
-        ("const a = 1;\nexport { a };", "not understood"),
-        ('import { a } from "./a.js";\nexport const a = 1;', "imports itself"),
-        ("export const a = '</script>';", "would end the script"),
-        ("console.log(import.meta.url);", "not understood"),
-    ],
-)
-def test_a_form_that_the_inliner_does_not_know_is_refused(tmp_path: Path, source: str, problem: str) -> None:
-    (tmp_path / "b.js").write_text("export const b = 1;\n")
-    (tmp_path / "a.js").write_text(source)
-    with pytest.raises(CannotInlineError, match=problem):
-        inlined(tmp_path / "a.js")
 
 
 def test_modules_keep_their_names_apart_and_are_made_once(driver: webdriver.Chrome, tmp_path: Path) -> None:

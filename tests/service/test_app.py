@@ -216,6 +216,29 @@ def test_the_dashboards_files_are_compressed_and_cached_under_an_address_that_ch
         assert_problem(service.http.get("/v/0/../../data"), 404)
 
 
+@pytest.mark.parametrize("source", ['export * from "./b.js";', 'import { gone } from "./gone.js";', b"\xff"])
+def test_scripts_that_cannot_be_joined_are_served_as_written(
+    tmp_path: Path, source: str | bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "page"
+    folder.mkdir()
+    (folder / "index.html").write_text('<script type="module" src="main.js"></script>')
+    (folder / "live.html").write_text('<script type="module" src="live.js"></script>')
+    live = 'import { b } from "./b.js";\nb();\n'
+    (folder / "live.js").write_text(live)
+    (folder / "b.js").write_text("export const b = () => {};\n")
+    content = source if isinstance(source, bytes) else source.encode()
+    (folder / "main.js").write_bytes(content)
+    for service in running_service(tmp_path / "data", dashboard_dir=folder):
+        answer = service.http.get(script_of_page(service))
+        assert (answer.status_code, answer.content) == (200, content)
+        assert service.http.get(script_of_page(service, "/live.html")).text == live
+        assert [each.getMessage() for each in caplog.records if "as they were written" in each.getMessage()] != []
+        (folder / "main.js").write_text("mended();")
+        assert "mended();" in service.http.get(script_of_page(service)).text
+        assert "import {" not in service.http.get(script_of_page(service, "/live.html")).text
+
+
 @pytest.mark.parametrize(
     ("path", "field", "remedy"),
     [

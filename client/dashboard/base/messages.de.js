@@ -382,6 +382,7 @@ export const DE = {
     "recorded_in": "in dieser Datei, {size} MB: Sie zeigen das Gewebe des Patienten und die Instrumente",
     "recorded_off": "nicht in dieser Datei: Sie wurden weggelassen",
     "recorded_large": "nicht in dieser Datei: {size} MB sind zu viele",
+    "recorded_damaged": "nicht in dieser Datei: Die der Szene sind beschädigt",
     "recorded_none": "nicht in dieser Datei: Die Szene bewahrt keine auf",
     "fact_quality": "Ähnlichkeit"
   },

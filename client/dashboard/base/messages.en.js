@@ -382,6 +382,7 @@ export const EN = {
     "recorded_in": "in this file, {size} MB: they show the patient's tissue and the instruments",
     "recorded_off": "not in this file: they were left out",
     "recorded_large": "not in this file: {size} MB are too many",
+    "recorded_damaged": "not in this file: the scene's are damaged",
     "recorded_none": "not in this file: the scene keeps none",
     "fact_quality": "Likeness"
   },
