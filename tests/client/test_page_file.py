@@ -183,7 +183,6 @@ def test_its_controls_move_time_and_camera_and_say_what_is_shown(driver: webdriv
 
 HELD_OUT, SHADE = 1, 90
 RECORDED_PICTURE = "return document.getElementById('recorded').toDataURL('image/png')"
-ON_LOAD = "Page.addScriptToEvaluateOnNewDocument"
 HAS_DETAIL = "return document.getElementById('picture').hasAttribute('data-detail')"
 
 
@@ -250,13 +249,6 @@ def test_it_has_the_recorded_frames_as_detail_and_beside_the_model(
     of_both = say("figure.likeness_beside_copies", db="38.10 dB", best="30.00 dB")
     assert f"{of_both} {alone}" in text(driver, "#facts")
     assert driver.get_log("browser") == []
-
-    blind = driver.execute_cdp_cmd(ON_LOAD, {"source": "delete window.VideoDecoder;"})
-    opened(driver, path, "shown", f"#t={first / scene.frame_count}&compare=wipe")
-    assert text(driver, "#message") == TABLE["no_video"]
-    assert f"{TABLE['fact_quality']}{alone}" in text(driver, "#facts")
-    assert not driver.find_element(By.ID, "compare").is_displayed()
-    driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blind)
 
     inside = (folder / DETAIL).stat().st_size
     size = path.stat().st_size
