@@ -63,6 +63,6 @@ def test_a_scene_is_there_while_the_service_still_draws_a_view_that_was_given_up
         page.until_state("live")
         page.until_text("#readout", "stream")
         site.painter.pause_s = SLOW_S
-        assert page.driver.execute_async_script(CONFIRM, scene) == "there"  # type: ignore[no-untyped-call]
+        assert page.driver.execute_async_script(CONFIRM, scene) == "there"
         assert page.state == "live"
         driver.get("about:blank")
