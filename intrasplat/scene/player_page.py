@@ -90,7 +90,6 @@ def page_parts(
         "sceneBytes": size,
         "recorded": {"bytes": frames.size, "state": frames.state},
         "report": {"warnings": ()} | {name: report[name] for name in REPORTED if name in report} if report else None,
-        "hasDetail": frames.video is not None,
     }
     page = _page(dashboard_dir, {"manifest": manifest, "about": about})
     pictures = _pictures(folder, frames.files)

@@ -68,8 +68,13 @@ def test_a_wrong_address_is_told_in_plain_words(site: Site, page: Page, tail: st
 
 
 def test_an_address_of_a_scene_that_is_gone_says_so(site: Site, page: Page) -> None:
+    strokes = f"intrasplat-strokes-{'0' * 32}"
+    page.script("sessionStorage.setItem(arguments[0], '[1]')", strokes)
     page.driver.get(f"{site.url}/#/scene/{'0' * 32}")
     page.until_text("#stage-message", say("problem.http_404:scene"))
+    gone = "return import(document.scripts[0].src).then(({ jobs }) => jobs.gone.size)"
+    page.until(lambda: page.script(gone) == 1)
+    assert page.script("return sessionStorage.getItem(arguments[0])", strokes) == "[1]"  # it may be another key's
 
 
 def test_an_address_waits_for_the_key_and_never_holds_it(tmp_path: Path, driver: webdriver.Chrome) -> None:

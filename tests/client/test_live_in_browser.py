@@ -188,8 +188,8 @@ def test_freeze_holds_the_model_and_never_the_endoscope(site: Site, page: LivePa
     asked = len(painter.renders)
     page.until(lambda: len(painter.renders) > asked + 1)
     page.until_text("#trust-why", say("notice.coarse"))
-    painter.is_coarse = False  # there is time: from now on no picture of a frozen moment is asked for
-    time.sleep(2)
+    painter.is_coarse = False  # there is time: from the next picture on none of a frozen moment is asked for
+    page.until(lambda: say("notice.coarse") not in page.text("#trust-why"))
     asked = len(painter.renders)
     time.sleep(2)
     assert len(painter.renders) == asked

@@ -140,7 +140,7 @@ export const stillThere = async (id) => {
 /** @returns {Promise<Problem | null>} why nothing would be trained now; null if it would */
 export async function trouble() {
   try {
-    await request("/readyz");
+    await json("/readyz"); // browsers count an answer's bytes once it is read
     return null;
   } catch (error) {
     if (error instanceof Problem && error.status === 503) return error;

@@ -350,7 +350,7 @@ export const DE = {
     "tracks": "Wo jeder Punkt mit der Zeit ist, für NumPy",
     "ply-zip": "Splats jedes Bildes, in mm",
     "scene": "Für den Import in einer anderen Installation",
-    "html": "Eine Seite, die ohne Dienst läuft, mit kleinen Aufnahmen",
+    "html": "Eine Seite, die ohne Dienst läuft, mit den Bildern der Aufnahme, wenn sie klein sind",
     "tum": "Der Weg des Endoskops"
   },
   "file": {
@@ -369,6 +369,7 @@ export const DE = {
     "opening": "Die Szene wird geöffnet.",
     "slow": "Die Szene wird geöffnet. Dieser Browser zeichnet ohne Grafikkarte: Jedes Bild dauert Sekunden.",
     "no_webgl2": "Dieser Browser hat kein WebGL2, das zum Zeichnen nötig ist. Öffnen Sie die Datei in einem aktuellen Chromium, Firefox oder Safari.",
+    "no_video": "Ohne Einzelheiten und Vergleich: Dieser Browser kann das Video mit den Bildern der Aufnahme nicht dekodieren.",
     "refused": "Die Szene kann nicht gezeigt werden. {why}",
     "frames": "{frames} Bilder in {seconds} s, {width} × {height} Pixel",
     "megabytes": "{size} MB",

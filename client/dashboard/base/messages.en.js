@@ -350,7 +350,7 @@ export const EN = {
     "tracks": "Where each point is over time, for NumPy",
     "ply-zip": "Splats of every frame, in mm",
     "scene": "To be imported by another installation",
-    "html": "A page that opens without a service, with small recordings",
+    "html": "A page that opens without a service, with the recorded frames if they are small",
     "tum": "The endoscope's path"
   },
   "file": {
@@ -369,6 +369,7 @@ export const EN = {
     "opening": "The scene is opening.",
     "slow": "The scene is opening. This browser draws without a graphics card: each picture takes seconds.",
     "no_webgl2": "This browser has no WebGL2, which drawing needs. Open the file in a current Chromium, Firefox or Safari.",
+    "no_video": "Without detail and comparison: this browser cannot decode the video of the recorded frames.",
     "refused": "The scene cannot be shown. {why}",
     "frames": "{frames} frames in {seconds} s, {width} × {height} pixels",
     "megabytes": "{size} MB",

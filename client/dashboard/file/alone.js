@@ -122,7 +122,7 @@ class View {
 
   /** Draw what rests with the detail of recorded frames, where there are any. */
   async #refined(view, drawn) {
-    if (drawn.hasDetail || this.isWanted || this.player.opening === null) return drawn;
+    if (drawn.hasDetail || this.isWanted || this.player.detail === null) return drawn;
     const isOutdated = () => this.isWanted;
     try {
       return await this.player.draw({ ...view, isRefined: true, isOutdated });
@@ -181,7 +181,12 @@ function refuse(error) {
   get("message").textContent = words("file.refused", { why: error.message });
 }
 
-function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, report, hasDetail }, manifest) {
+/** @param {string} name @param {string} text of one more fact */
+function tellFact(name, text) {
+  get("facts").append(element("dt", { text: words(`file.fact_${name}`) }), element("dd", { text }));
+}
+
+function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, report }, manifest) {
   const { width, height } = manifest.intrinsics;
   const facts = {
     scene: sceneId ?? "–",
@@ -191,11 +196,8 @@ function describe({ sceneId, version, exportedAtMs, sceneBytes, recorded, report
     gaussians: figure(manifest.gaussians),
     size: words("file.megabytes", { size: figure(sceneBytes / 1e6, 2) }),
     recorded: words(`file.recorded_${recorded.state}`, { size: figure(recorded.bytes / 1e6, 2) }),
-    quality: report === null ? "–" : likenessOf(report, hasDetail),
   };
-  for (const [name, text] of Object.entries(facts)) {
-    get("facts").append(element("dt", { text: words(`file.fact_${name}`) }), element("dd", { text }));
-  }
+  for (const [name, text] of Object.entries(facts)) tellFact(name, text);
   if (report === null) return;
   get("verdict").append(lightMark(trustOf(report).light));
   const items = report.warnings.map((each) => element("li", { text: `${noticeWords(each)} ` }, element("small", { text: each.text })));
@@ -244,13 +246,14 @@ function listen(view) {
   new ResizeObserver(() => view.show()).observe(get("stage"));
 }
 
-/** What shows the recorded frames beside the model. @param {Player} player @returns {Promise<Comparison | null>} null: no frames */
+/** What shows the recorded frames beside the model. @param {Player} player @returns {Promise<Comparison | null>} null: it lacks frames */
 async function comparisonFor(player) {
   const recording = new Recording(bytesOf(taken("video")), JSON.parse(taken("pictures")));
   try {
     await recording.open(player);
   } catch (error) {
-    say(words("compare.failed", { why: error.message }));
+    say(error.code === "no_codec" ? words("file.no_video") : words("compare.failed", { why: error.message }));
+    return null; // the other frames are of other moments
   }
   if (recording.frames.length === 0) return null;
   const parts = {
@@ -269,13 +272,16 @@ async function comparisonFor(player) {
 async function start() {
   showWords(document);
   const manifest = JSON.parse(taken("manifest"));
-  describe(JSON.parse(taken("about")), manifest);
+  const about = JSON.parse(taken("about"));
+  describe(about, manifest);
   const support = graphics();
   if (!support.isFast && support.name === "") throw new Error(words("file.no_webgl2"));
   get("message").textContent = words(support.isFast ? "file.opening" : "file.slow");
   const player = await Player.of({ manifest, scene: bytesOf(taken("scene")).buffer }, get("picture"));
   get("message").textContent = "";
-  const view = new View(player, await comparisonFor(player));
+  const comparison = await comparisonFor(player);
+  tellFact("quality", about.report === null ? "–" : likenessOf(about.report, player.detail !== null));
+  const view = new View(player, comparison);
   view.read(location.hash);
   listen(view);
   view.show();

@@ -12,8 +12,10 @@ import { words } from "../base/messages.js";
 const POLL_MS = 2000;
 /** While nobody looks at the list and nothing is under way, every so manieth time is enough. */
 const IDLE_POLLS = 4;
-/** The same while the service is heard otherwise. */
-const HEARD_POLLS = 20;
+/** The same while the service is heard by another way, */
+const HEARD_POLLS = 48;
+/** and between, to ask only whether clips would be trained. */
+const READY_POLLS = 16;
 /** Jobs in a page of the list. */
 export const PAGE_SIZE = 30;
 /** Browsers open six connections to a place, and uploads and pictures need some. */
@@ -48,7 +50,7 @@ export class Jobs {
    * @param {() => void} onChange after any change of the jobs
    * @param {(text: string, kind: "good"|"starting"|"bad") => void} onConnection how the service is
    * @param {() => boolean} isWatched whether somebody looks at the list, or waits for the service
-   * @param {() => boolean} isHeard whether the service tells otherwise that it is there
+   * @param {() => boolean} isHeard whether the service is known by another way to be there
    */
   constructor(onChange, onConnection, isWatched, isHeard = () => false) {
     this.isWatched = isWatched;
@@ -91,7 +93,16 @@ export class Jobs {
 
   #tick() {
     const isBusy = this.isWatched() || !this.isWell || [...this.byId.values()].some(isActive);
-    if (isBusy || ++this.ticks >= (this.isHeard() ? HEARD_POLLS : IDLE_POLLS)) this.poll();
+    const isHeard = this.isHeard();
+    if (isBusy || ++this.ticks >= (isHeard ? HEARD_POLLS : IDLE_POLLS)) this.poll();
+    else if (isHeard && this.ticks % READY_POLLS === 0) this.#askIfReady();
+  }
+
+  /** Notice that nothing would be trained any more. */
+  async #askIfReady() {
+    const { round } = this;
+    const wrong = await trouble().catch((error) => error);
+    if (wrong !== null && round === this.round) this.#tellConnection(wrong);
   }
 
   /** Somebody comes back to the page. */
@@ -119,6 +130,7 @@ export class Jobs {
   /** @param {string} id of a job that was purged */
   forget(id) {
     this.#lose(id);
+    storeStrokes(id, []);
     this.kept.delete(id);
     this.newest = this.newest.filter((each) => each !== id);
     this.scores.delete(id);
@@ -126,11 +138,10 @@ export class Jobs {
     this.onChange();
   }
 
-  /** It is no more, and what was painted for it goes with it. */
+  /** It is no more, or not this key's. */
   #lose(id) {
     this.gone.add(id);
     this.byId.delete(id);
-    storeStrokes(id, []);
   }
 
   /** Ask for all jobs now. */
@@ -239,12 +250,14 @@ export class Jobs {
     untold.unshift(...new Set([this.viewed, ...this.awaited].filter(isUnknown)));
     if (untold.length === 0) return;
     const id = untold[this.round % untold.length];
+    const wasThere = this.byId.has(id); // for this key
     try {
       const job = await getJob(id);
       if (this.byId.has(id) || id === this.viewed || this.awaited.includes(id)) this.byId.set(id, job);
     } catch (error) {
       if (error.status !== 404) throw error;
       this.#lose(id);
+      if (wasThere) storeStrokes(id, []);
     }
     this.onChange();
   }

@@ -20,22 +20,22 @@ function recordingOf({ state, recording }) {
   return words(RECORDED.includes(state) ? "live.recorded" : "live.not_recorded");
 }
 
+const secondsWords = (s, digits = 2) => (s == null || Number.isNaN(s) ? "–" : words("live.in_seconds", { s: figure(s, digits) }));
+
 /**
  * @param {import("./feeds.js").Feed} feed
- * @param {number} modelAgeS as the screen has it; NaN: unknown
  * @param {number} sentRate pictures a second that this browser sends; NaN: none
- * @returns {[string, string][]} name and value
+ * @returns {[string, string | null][]} name and value; null: the model's age
  */
-function rowsOf(feed, modelAgeS, sentRate) {
-  const seconds = (s, digits = 2) => (s == null || Number.isNaN(s) ? "–" : words("live.in_seconds", { s: figure(s, digits) }));
+function rowsOf(feed, sentRate) {
   const rate = (fps) => words("live.per_second", { fps: figure(fps, 1) });
   const rows = [
     [words("live.recording"), recordingOf(feed)],
     [words("live.received"), rate(feed.received_fps)],
     [words("live.used"), rate(feed.used_fps)],
     [words("live.dropped"), figure(feed.dropped)],
-    [words("live.lag"), seconds(feed.decode_lag_s)],
-    [words("live.model_age"), seconds(modelAgeS, 1)],
+    [words("live.lag"), secondsWords(feed.decode_lag_s)],
+    [words("live.model_age"), null],
     [words("live.reconnects"), figure(feed.reconnects)],
     [words("live.stored"), words("live.megabytes", { mb: figure(feed.stored_bytes / MB, 1) })],
   ];
@@ -46,19 +46,30 @@ export class Health {
   /** @param {{summary: HTMLElement, list: HTMLDListElement, why: HTMLElement}} parts */
   constructor(parts) {
     this.parts = parts;
+    /** @type {HTMLElement | null} where the model's age stands */
+    this.age = null;
+    this.modelAgeS = NaN;
   }
 
-  /** @param {import("./feeds.js").Feed | null} feed @param {number} modelAgeS @param {number} sentRate */
-  refresh(feed, modelAgeS, sentRate) {
+  /** @param {number} modelAgeS as the screen has it; NaN: unknown */
+  tellAge(modelAgeS) {
+    this.modelAgeS = modelAgeS;
+    if (this.age) setText(this.age, secondsWords(modelAgeS, 1));
+  }
+
+  /** @param {import("./feeds.js").Feed | null} feed @param {number} sentRate */
+  refresh(feed, sentRate) {
     const { summary, list, why } = this.parts;
     setText(why, feed === null ? "" : whyOf(feed));
     setText(summary, feed === null ? words("live.health") : recordingOf(feed));
-    const rows = feed === null ? [] : rowsOf(feed, modelAgeS, sentRate);
+    const rows = feed === null ? [] : rowsOf(feed, sentRate);
     while (list.children.length > rows.length) list.lastChild.remove();
     while (list.children.length < rows.length) list.append(element("div", {}, element("dt"), element("dd")));
     for (const [i, [name, value]] of rows.entries()) {
       setText(list.children[i].firstChild, name);
-      setText(list.children[i].lastChild, value);
+      if (value === null) this.age = list.children[i].lastChild;
+      else setText(list.children[i].lastChild, value);
     }
+    this.tellAge(this.modelAgeS);
   }
 }

@@ -107,6 +107,7 @@ function view(id) {
   get("screen").hidden = id === null;
   document.body.dataset.kind = "";
   light.keep(id !== null);
+  tellHealth();
   refresh();
 }
 
@@ -118,6 +119,7 @@ function take(told) {
   picture.allow(!HIDDEN_STATES.includes(told.state));
   if (told.begins_s === null) model.clear();
   allow();
+  tellHealth();
   refresh();
 }
 
@@ -127,8 +129,12 @@ function end() {
   picture.open(null);
   look.open(null);
   model.clear();
+  tellHealth();
   refresh();
 }
+
+/** All of it but the model's age. */
+const tellHealth = () => health.refresh(feed, push?.pace.rate ?? NaN);
 
 /** What the key may do. */
 function allow() {
@@ -178,7 +184,7 @@ function refresh() {
   setText(get("live-age"), now.pictureAgeS === null ? "" : ageWords(now.pictureAgeS));
   setText(get("live-message"), picture.isBlank ? blankWords(ofPicture) : "");
   refreshModel(now);
-  health.refresh(feed, now.modelAgeS ?? NaN, push?.pace.rate ?? NaN); // the age beside the model, and no other
+  health.tellAge(now.modelAgeS ?? NaN); // the age beside the model, and no other
   const isAway = look.mode !== "live" || look.isTurned || look.rock.isOn;
   get("live").classList.toggle("wanted", isAway);
   get("freeze").setAttribute("aria-pressed", String(look.mode === "frozen"));
@@ -282,6 +288,7 @@ setInterval(refresh, TICK_MS);
 setInterval(() => {
   if (feedId === null || document.hidden) return;
   tape.refresh(feed);
+  tellHealth();
   if (model.shown === null) showTrust();
 }, TAPE_MS);
 

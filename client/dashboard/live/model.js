@@ -6,7 +6,10 @@ import { Problem, wrongKeyWords } from "../base/problem.js";
 import { unpack } from "../stage/stream.js";
 
 /** @typedef {{scene: string, t: string, pose?: string, follow?: true}} Wish of a view */
-/** @typedef {{id: number, wish: Wish, atMs: number, isAnswered: boolean, isRefused: boolean}} Asked */
+/**
+ * tries: how often the same was asked for before without a good picture. againMs: when to ask once more for one.
+ * @typedef {{id: number, wish: Wish, atMs: number, isAnswered: boolean, isRefused: boolean, tries: number, againMs: number}} Asked
+ */
 /**
  * What came. image: of the view. capturedAtS: the moment of the feed. asked: the wish that it answers.
  * @typedef {{asked: Wish, capturedAtS: number, camera: import("../stage/stream.js").Camera | null, unseen: number,
@@ -15,6 +18,8 @@ import { unpack } from "../stage/stream.js";
 
 const RECONNECT_MS = 500;
 const AGAIN_MS = 1000;
+/** A coarse view is asked for again ever more rarely, up to this: rendering it adds to the load that makes it coarse. */
+const MAX_AGAIN_MS = 8000;
 /** An answer that has not come after this comes over another connection. */
 const SILENCE_MS = 5000;
 const BUSY = [429, 503];
@@ -73,29 +78,29 @@ export class ModelPicture extends EventTarget {
   }
 
   /** Ask for what is wished, unless that was asked for already or an answer is under way. */
-  #send() {
+  #send(tries = 0) {
     const { socket, wish, asked } = this;
     if (wish === null || socket?.readyState !== WebSocket.OPEN) return;
     if (asked && (!asked.isAnswered || JSON.stringify(asked.wish) === JSON.stringify(wish))) return;
-    this.asked = { id: ++this.number, wish, atMs: performance.now(), isAnswered: false, isRefused: false };
+    this.asked = { id: ++this.number, wish, atMs: performance.now(), isAnswered: false, isRefused: false, tries, againMs: Infinity };
     socket.send(JSON.stringify({ format: "jpeg", quality: QUALITY, ...wish, id: this.number }));
   }
 
   #watch() {
     const { asked, socket } = this;
     if (asked && !asked.isAnswered && performance.now() - asked.atMs > SILENCE_MS) socket?.close();
-    if (asked && this.#isUnfinished(asked)) this.#sendAgain();
+    if (asked && performance.now() >= asked.againMs && this.#isUnfinished(asked)) this.#sendAgain(asked.tries + 1);
   }
 
   /** Whether a view that rests has lost its picture, or has a coarse one. @param {Asked} asked */
   #isUnfinished({ wish, isAnswered, isRefused }) {
     if (!isAnswered || isRefused || wish.follow) return false;
-    return this.shown === null || this.shown.warnings.some(({ code }) => code === COARSE);
+    return this.shown?.asked !== wish || this.shown.warnings.some(({ code }) => code === COARSE);
   }
 
-  #sendAgain() {
+  #sendAgain(tries) {
     this.asked = null;
-    this.#send();
+    this.#send(tries);
   }
 
   #take(data, key) {
@@ -108,7 +113,10 @@ export class ModelPicture extends EventTarget {
     const isAnswer = asked?.id === head.id && !asked.isAnswered;
     this.clock.note(capturedAtS + head.age_s, receivedMs);
     if (asked?.id !== head.id) return; // of a view that nobody waits for any more
-    if (isAnswer) asked.isAnswered = true;
+    if (isAnswer) {
+      asked.isAnswered = true;
+      asked.againMs = receivedMs + Math.min(MAX_AGAIN_MS, AGAIN_MS * 2 ** asked.tries);
+    }
     this.#show(blob, { asked: asked.wish, capturedAtS, camera: head.camera, unseen: head.unseen, warnings: head.warnings });
     this.#send();
   }
@@ -122,13 +130,14 @@ export class ModelPicture extends EventTarget {
     this.dispatchEvent(new CustomEvent("refused", { detail: problem }));
     if (JSON.stringify(asked.wish) !== JSON.stringify(this.wish)) this.#send();
     else if (BUSY.includes(problem.status) && !asked.wish.follow) {
-      setTimeout(() => this.asked === asked && this.#sendAgain(), Math.max(AGAIN_MS, 1000 * problem.turnInS));
+      setTimeout(() => this.asked === asked && this.#sendAgain(asked.tries), Math.max(AGAIN_MS, 1000 * problem.turnInS));
     }
   }
 
   async #show(blob, shown) {
     const number = ++this.number; // also orders pictures that are decoded at once
-    const bitmap = await createImageBitmap(blob);
+    const bitmap = await createImageBitmap(blob).catch(() => null);
+    if (bitmap === null) return; // damaged: a view that rests is asked for again
     if (number > this.drawn && this.wish?.scene === shown.asked.scene) {
       this.drawn = number;
       const { canvas } = this;

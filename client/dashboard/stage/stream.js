@@ -27,6 +27,8 @@ import { connectionLost, Problem, wrongKeyWords } from "../base/problem.js";
  */
 
 const LENGTH_BYTES = 4;
+/** Who waits no more. */
+const NOBODY = { resolve() {}, reject() {} };
 
 /** @param {ArrayBuffer} message @returns {[Record<string, any>, Blob]} head and image */
 export function unpack(message) {
@@ -39,7 +41,7 @@ export class Stream {
   constructor() {
     this.socket = null;
     this.number = 0;
-    /** @type {Map<number, {resolve: (picture: Picture) => void, reject: (error: Error) => void}>} views under way, in order */
+    /** @type {Map<number, {resolve: (answer?: Picture) => void, reject: (error: Error) => void}>} under way, in order */
     this.pending = new Map();
   }
 
@@ -47,6 +49,7 @@ export class Stream {
     return this.socket?.readyState === WebSocket.OPEN;
   }
 
+  /** Whether the service works on something, also on what nobody waits for. */
   get isBusy() {
     return this.pending.size > 0;
   }
@@ -62,19 +65,22 @@ export class Stream {
     socket.binaryType = "arraybuffer";
     socket.addEventListener("open", () => key && socket.send(JSON.stringify({ authorize: key })));
     socket.addEventListener("message", (event) => socket === this.socket && this.#take(event.data, key));
-    socket.addEventListener("close", () => socket === this.socket && this.giveUp());
+    socket.addEventListener("close", () => socket === this.socket && this.#fail(connectionLost()));
   }
 
   /** Wait no more for what was asked; no picture of it is taken when it comes. */
   giveUp() {
-    this.#fail(connectionLost());
+    for (const [id, { reject }] of this.pending) {
+      this.pending.set(id, NOBODY);
+      reject(connectionLost());
+    }
   }
 
   close() {
     const socket = this.socket;
     this.socket = null;
     socket?.close();
-    this.giveUp();
+    this.#fail(connectionLost());
   }
 
   /**
@@ -83,11 +89,7 @@ export class Stream {
    * @returns {Promise<Picture>}
    */
   ask(view) {
-    const id = ++this.number;
-    return new Promise((resolve, reject) => {
-      this.pending.set(id, { resolve, reject });
-      this.socket.send(JSON.stringify({ ...view, id }));
-    });
+    return this.#send(view);
   }
 
   /**
@@ -96,7 +98,16 @@ export class Stream {
    * @returns {Promise<void>}
    */
   confirm(scene) {
-    return this.ask({ scene, confirm: true });
+    return this.#send({ scene, confirm: true });
+  }
+
+  /** @param {object} message @returns {Promise<Picture | undefined>} what answers it; undefined: no picture, but it is there */
+  #send(message) {
+    const id = ++this.number;
+    return new Promise((resolve, reject) => {
+      this.pending.set(id, { resolve, reject });
+      this.socket.send(JSON.stringify({ ...message, id }));
+    });
   }
 
   #take(data, key) {
@@ -111,7 +122,7 @@ export class Stream {
     }
     const [head, blob] = unpack(data);
     const asked = this.#answered(head.id);
-    if (!asked) return; // of a view that nobody waits for any more
+    if (!asked) return;
     const { scene, state, t, iteration, unseen, camera, depth_range_mm: depthRangeMm, warnings, total_ms: totalMs } = head;
     const codes = warnings.map(({ code }) => code);
     asked.resolve({ blob, scene, state, t, iteration, unseen, codes, totalMs, camera, depthRangeMm, way: "stream" });
