@@ -28,7 +28,7 @@ def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_p
     assert page.text("#badge") == say("screen.own_clip")
     assert not page.find("#drawer").is_displayed()
     claim = site.claim()
-    assert not page.find("#play").is_enabled()
+    page.until(lambda: not page.find("#play").is_enabled())
     page.script(SPACE)
     assert page.script(PRESSED) == "false"
     site.train(claim, 20, 24.0)
