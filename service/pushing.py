@@ -91,7 +91,7 @@ class Push:
             UnavailableError: nobody follows the feed, or another process does that cannot join this stream.
         """
         self._has_begun = True
-        if not self.bytes and piece[:1] == bytes([TS_SYNC]):
+        if not self.bytes and piece.startswith(TS_SYNC):
             self._can_be_joined = True
         start, until_s = 0, time.monotonic() + PATIENCE_S
         while start < len(piece):

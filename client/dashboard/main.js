@@ -43,6 +43,7 @@ import { Legend } from "./stage/legend.js";
 import { drawStrip } from "./stage/lightstrip.js";
 import { setMoving } from "./stage/moving.js";
 import { Scale } from "./stage/scale.js";
+import { comparisonParts } from "./stage/seam.js";
 import { Snapshot } from "./stage/snapshot.js";
 import { steer } from "./stage/steer.js";
 import { Verdict } from "./stage/verdict.js";
@@ -84,12 +85,7 @@ const handles = { home: get("home"), eye: get("eye"), rock: get("rock"), stepBac
 steer(viewer, { stage: get("stage"), canvas: get("picture"), ...handles }, tell);
 
 const compare = new Compare(viewer, {
-  stage: get("stage"),
-  box: get("compare-box"),
-  canvas: get("recorded"),
-  seam: get("seam"),
-  ofRecorded: get("of-recorded"),
-  ofModel: get("of-model"),
+  ...comparisonParts(get),
   mode: get("compare"),
   beside: get("beside"),
   tools: get("compare-tools"),

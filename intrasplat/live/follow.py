@@ -163,7 +163,7 @@ class Follower:
         window = self._window
         return 0 if window is None else window.model.count
 
-    def add(self, pair: FeedPair, budget_s: float = 0.2, coming: Callable[[], FeedPair | None] = lambda: None) -> Added:
+    def add(self, pair: FeedPair, budget_s: float = 0.2, coming: Callable[[], FeedPair | None] = ignore) -> Added:
         """Learn a pair; budget_s: seconds from now that it may take, where settings.steps is None.
 
         The window's frames train until the pair is read and its motion is known. While it is learnt, the pair that
@@ -174,7 +174,7 @@ class Follower:
         """
         end_s = time.perf_counter() + budget_s
         ahead, self._ahead = self._ahead, None
-        clip = ahead[1] if ahead is not None and ahead[0] is pair else self._reader.submit(self._tissue, pair)
+        clip = ahead[1] if ahead is not None and ahead[0] is pair else self._reader.submit(self._read_tissue, pair)
         reading = self._reader.submit(self._prepared, pair, clip)
         try:
             self._rehearse(reading)
@@ -183,7 +183,7 @@ class Follower:
                 return ready
             following = coming()
             if following is not None:
-                self._ahead = following, self._reader.submit(self._tissue, following)
+                self._ahead = following, self._reader.submit(self._read_tissue, following)
             if self._window is None or ready.carried is None:
                 return self._begin(ready, end_s)
             self._go_on(self._window, ready.moment, ready.carried)
@@ -257,7 +257,7 @@ class Follower:
                 self._trusted.look(window)
             self._version += 1
 
-    def _tissue(self, pair: FeedPair) -> DepthClip | Added:
+    def _read_tissue(self, pair: FeedPair) -> DepthClip | Added:
         """The clip of one frame that a pair gives, or why it is not used."""
         with one_opencv_thread():
             clip = self.read(pair)

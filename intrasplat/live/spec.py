@@ -27,7 +27,7 @@ FeedLayout = Literal["auto", "sbs", "tb", "two"]
 PICTURE_HEADER = struct.Struct("<dI")
 """Before each pushed picture: the sender's time, s, or NaN; bytes."""
 
-TS_SYNC = 0x47
+TS_SYNC = b"\x47"
 """The first byte of MPEG-TS, which a reader may join anywhere. Other streams begin with a head that it must have."""
 STREAM_HEAD_BYTES = 8
 """So many first bytes of a stream tell its format."""
@@ -229,7 +229,7 @@ def _rest(parts: SplitResult) -> str:
 
 def stream_format(head: bytes) -> str | None:
     """FFmpeg's demuxer of a stream with these first STREAM_HEAD_BYTES; None: not MPEG-TS, mp4 or Matroska."""
-    if head[:1] == bytes([TS_SYNC]):
+    if head.startswith(TS_SYNC):
         return "mpegts"
     if head.startswith(EBML):
         return "matroska"

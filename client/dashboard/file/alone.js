@@ -7,6 +7,7 @@ import { likenessOf } from "../library/figures.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { Player } from "../player/player.js";
 import { graphics } from "../player/support.js";
+import { comparisonParts } from "../stage/seam.js";
 import { Comparison } from "./comparison.js";
 import { bytesOf, Recording } from "./recording.js";
 
@@ -256,16 +257,7 @@ async function comparisonFor(player) {
     return null; // the other frames are of other moments
   }
   if (recording.frames.length === 0) return null;
-  const parts = {
-    stage: get("stage"),
-    box: get("compare-box"),
-    canvas: get("recorded"),
-    seam: get("seam"),
-    ofRecorded: get("of-recorded"),
-    ofModel: get("of-model"),
-    button: get("compare"),
-    tools: get("tools"),
-  };
+  const parts = { ...comparisonParts(get), button: get("compare"), tools: get("tools") };
   return new Comparison(parts, recording, player.hasRecordedLight);
 }
 

@@ -12,9 +12,9 @@ import { words } from "../base/messages.js";
 const POLL_MS = 2000;
 /** While nobody looks at the list and nothing is under way, every so manieth time is enough. */
 const IDLE_POLLS = 4;
-/** The same while the service is heard by another way, */
+/** While also the stream confirms that the service is there, the list is asked for every so manieth time. */
 const HEARD_POLLS = 48;
-/** and between, to ask only whether clips would be trained. */
+/** And every so manieth time, whether clips would be trained. */
 const READY_POLLS = 16;
 /** Jobs in a page of the list. */
 export const PAGE_SIZE = 30;

@@ -6,6 +6,19 @@ const STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2, PageDow
 const ENDS = { Home: 0, End: 100 };
 export const MIDDLE = 50;
 
+/**
+ * The elements of a comparison, by the ids that every page gives them.
+ * @param {(id: string) => HTMLElement} get
+ */
+export const comparisonParts = (get) => ({
+  stage: get("stage"),
+  box: get("compare-box"),
+  canvas: get("recorded"),
+  seam: get("seam"),
+  ofRecorded: get("of-recorded"),
+  ofModel: get("of-model"),
+});
+
 export class Seam {
   /** @param {HTMLElement} handle a slider @param {HTMLElement} box the pictures, which take the place from --seam */
   constructor(handle, box) {
