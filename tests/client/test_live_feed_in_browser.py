@@ -16,7 +16,7 @@ from tests.client.page import browser
 from tests.client.test_live_in_browser import CLICK, DRAG_TAPE
 from tests.client.words import say
 from tests.live.senders import PhantomSender
-from tests.test_live_end_to_end import Push, eventually
+from tests.test_live_end_to_end import Push, eventually, past_s
 from tests.test_live_end_to_end import sender as sender
 
 
@@ -40,7 +40,7 @@ def test_a_feed_is_watched_frozen_measured_kept_and_ended(
         page.until_text("#word", say("live.word_connecting"))
         push = Push(f"{client.url}{feed.links['video']}", sender)
         push.start()
-        eventually(lambda: (client.feed(feed.id).source_ends_s or 0) > 4, lambda: client.feed(feed.id))
+        eventually(lambda: past_s(client, feed.id) > 4, lambda: client.feed(feed.id))
         for name in ("live", "model"):
             page.until(lambda name=name: not page.script(f"return document.getElementById('{name}-picture').hidden"))  # type: ignore[misc]
         page.until(lambda: page.script("return !document.getElementById('tape').disabled"))
