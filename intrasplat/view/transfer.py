@@ -35,47 +35,46 @@ def carry(  # type: ignore[no-untyped-def]
     """
     height, width = depth_mm.shape
     rows, columns = moved_mm.shape[:2]
-    last_u, last_v = np.float32(there_mm.shape[1] - 1), np.float32(there_mm.shape[0] - 1)
-    inverse_f, inverse_error, unit = _ONE / lens[0], _ONE / max_error, weight / np.float32(ONE)
+    last_u, last_v = np.float32(there_mm.shape[1]) - _ONE - _HALF, np.float32(there_mm.shape[0]) - _ONE - _HALF
+    inverse_error, unit = _ONE / max_error, weight / np.float32(ONE)
     cells, shares = _places(width, columns)
     tall_cells, tall_shares = _places(height, rows)
-    line = np.empty((columns + 1, 3), np.float32)
+    line, pose = np.empty((3, columns + 1), np.float32), eye_from_view
+    fx, fy, cx, cy = eye_lens[0], eye_lens[1], eye_lens[2] + _HALF, eye_lens[3] + _HALF
+    xs = (np.arange(width).astype(np.float32) + _HALF - lens[2]) / lens[0]
+    us, vs, zs = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     for i in range(height * thread // threads, height * (thread + 1) // threads):
         y = (np.float32(i) + _HALF - lens[3]) / lens[1]
-        ax = eye_from_view[0, 1] * y + eye_from_view[0, 2]
-        ay = eye_from_view[1, 1] * y + eye_from_view[1, 2]
-        az = eye_from_view[2, 1] * y + eye_from_view[2, 2]
+        ax, ay, az = (pose[0, 1] * y + pose[0, 2]), (pose[1, 1] * y + pose[1, 2]), (pose[2, 1] * y + pose[2, 2])
         above = tall_cells[i]
         below = min(above + 1, rows - 1)
         for j in range(columns + 1):
             j0 = min(j, columns - 1)
             for n in range(3):
-                line[j, n] = moved_mm[above, j0, n] + tall_shares[i] * (moved_mm[below, j0, n] - moved_mm[above, j0, n])
+                line[n, j] = moved_mm[above, j0, n] + tall_shares[i] * (moved_mm[below, j0, n] - moved_mm[above, j0, n])
         for j in range(width):
-            d = depth_mm[i, j]
-            if d <= _ZERO:
-                continue
-            x = (np.float32(j) + _HALF - lens[2]) * inverse_f
             j0, f = cells[j], shares[j]
-            m0 = line[j0, 0] + f * (line[j0 + 1, 0] - line[j0, 0])
-            m1 = line[j0, 1] + f * (line[j0 + 1, 1] - line[j0, 1])
-            m2 = line[j0, 2] + f * (line[j0 + 1, 2] - line[j0, 2])
-            z = d * (eye_from_view[2, 0] * x + az) + eye_from_view[2, 3] + m2
-            if z < _LEAST_Z:
+            us[j] = line[0, j0] + f * (line[0, j0 + 1] - line[0, j0])
+            vs[j] = line[1, j0] + f * (line[1, j0 + 1] - line[1, j0])
+            zs[j] = line[2, j0] + f * (line[2, j0 + 1] - line[2, j0])
+        for j in range(width):  # without branches and look-ups, so that several pixels are computed at once
+            d, x = depth_mm[i, j], xs[j]
+            z = d * (pose[2, 0] * x + az) + pose[2, 3] + zs[j]
+            inverse_z = _ONE / max(z, _LEAST_Z)
+            us[j] = fx * (d * (pose[0, 0] * x + ax) + pose[0, 3] + us[j]) * inverse_z + cx
+            vs[j] = fy * (d * (pose[1, 0] * x + ay) + pose[1, 3] + vs[j]) * inverse_z + cy
+            zs[j] = z if d > _ZERO else _ZERO
+        for j in range(width):
+            z, u, v = zs[j], us[j], vs[j]
+            if not (z >= _LEAST_Z and u >= _HALF and v >= _HALF and u < last_u and v < last_v):
                 continue
-            inverse_z = _ONE / z
-            u = eye_lens[0] * (d * (eye_from_view[0, 0] * x + ax) + eye_from_view[0, 3] + m0) * inverse_z
-            v = eye_lens[1] * (d * (eye_from_view[1, 0] * x + ay) + eye_from_view[1, 3] + m1) * inverse_z
-            u, v = u + eye_lens[2] + _HALF, v + eye_lens[3] + _HALF
-            if not (u >= _HALF and v >= _HALF and u < last_u - _HALF and v < last_v - _HALF):
-                continue
-            k, l0 = np.int32(v), np.int32(u)
-            fv, fu = v - np.float32(k), u - np.float32(l0)
+            k, m = np.int32(v), np.int32(u)
+            fv, fu = v - np.float32(k), u - np.float32(m)
+            # unsigned, since Numba looks whether a signed index counts from the end
+            k0, k1, m0, m1 = np.uint64(k), np.uint64(k + 1), np.uint64(m), np.uint64(m + 1)
             a, b, c, e = (_ONE - fv) * (_ONE - fu), (_ONE - fv) * fu, fv * (_ONE - fu), fv * fu
-            there = (
-                a * there_mm[k, l0] + b * there_mm[k, l0 + 1] + c * there_mm[k + 1, l0] + e * there_mm[k + 1, l0 + 1]
-            )
-            apart = (z - there) * inverse_z * inverse_error
+            there = a * there_mm[k0, m0] + b * there_mm[k0, m1] + c * there_mm[k1, m0] + e * there_mm[k1, m1]
+            apart = (z - there) / z * inverse_error
             near = _ONE - apart * apart
             if near <= _ZERO:
                 continue
@@ -83,8 +82,8 @@ def carry(  # type: ignore[no-untyped-def]
             a, b, c, e = a * scale, b * scale, c * scale, e * scale
             for n in range(4):
                 total[i, j, n] += (
-                    a * np.float32(planes[k, l0, n]) + b * np.float32(planes[k, l0 + 1, n])
-                    + c * np.float32(planes[k + 1, l0, n]) + e * np.float32(planes[k + 1, l0 + 1, n])
+                    a * np.float32(planes[k0, m0, n]) + b * np.float32(planes[k0, m1, n])
+                    + c * np.float32(planes[k1, m0, n]) + e * np.float32(planes[k1, m1, n])
                 )  # fmt: skip
 
 
