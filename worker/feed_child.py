@@ -35,12 +35,16 @@ logger = logging.getLogger("intrasplat.worker")
 
 
 class FeedProcess:
-    """One running process, what it said last, and its orders. Any thread may use it."""
+    """One running process, what it said last, and its orders. Any thread may use it.
+
+    fed_since_s: monotonic time from which on pairs have been coming in; None: none come in
+    """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
         self.ready: FeedReady | None = None
         self.report: FeedReport | None = None
+        self.fed_since_s: float | None = None
         self.said_s = time.monotonic()
         assert process.stdin is not None
         self.orders = OrderWriter(process.stdin)
@@ -59,6 +63,8 @@ class FeedProcess:
                     self.ready = message
                 else:
                     self.report = message.report
+                    is_fed = self.report.state in FOLLOWS and self.report.received_fps > 0
+                    self.fed_since_s = (self.fed_since_s or self.said_s) if is_fed else None
         self.orders.end()
 
 
@@ -186,6 +192,6 @@ class FeedChild:
             return None if self._supervised.age_s < MAX_START_S else f"was not ready after {MAX_START_S:g} s"
         if time.monotonic() - running.said_s > MAX_SILENCE_S:
             return f"was silent for {MAX_SILENCE_S:g} s"
-        report = running.report
-        is_lost = report.state in FOLLOWS and report.received_fps > 0 and (report.model_age_s or 0.0) > MAX_LOST_S
+        fed_since_s, age_s = running.fed_since_s, running.report.model_age_s or 0.0
+        is_lost = fed_since_s is not None and min(age_s, time.monotonic() - fed_since_s) > MAX_LOST_S
         return f"has learnt nothing for {MAX_LOST_S:g} s" if is_lost else None

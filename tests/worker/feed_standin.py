@@ -3,6 +3,8 @@
 ended    report that the source has ended, an hour ago
 silent   say nothing after the first report
 dies     end with status 7 after the first report
+stuck    report that the newest pair it knows is an hour old
+returns  the same for half a second, as of a source that was away
 """
 
 from __future__ import annotations
@@ -35,10 +37,13 @@ def main() -> None:
         os._exit(0)
 
     threading.Thread(target=obey, daemon=True).start()
+    began_s = time.monotonic()
     while True:
         known = {"run": "live", "pause": "paused"}[state[0]]
         report = {"state": "ended" if word == "ended" else known, "since_s": time.time() - 3600, "begins_s": 1.0}
-        tell("feed_reported", report=report | {"ends_s": time.time() - 1, "received_fps": 30.0})
+        is_old = word == "stuck" or (word == "returns" and time.monotonic() - began_s < 0.5)
+        report |= {"ends_s": time.time() - 1, "received_fps": 30.0, "model_age_s": 3600.0 if is_old else 0.2}
+        tell("feed_reported", report=report)
         if word == "dies":
             os._exit(7)
         if word == "silent":

@@ -180,14 +180,25 @@ def test_a_paused_feed_is_paused_in_its_next_process(started: Start) -> None:
     eventually(lambda: hosted.state(record.feed_id) == "paused")
 
 
-@pytest.mark.parametrize("label", ["silent", "dies"])
+@pytest.mark.parametrize("label", ["silent", "dies", "stuck"])
 def test_a_process_that_hangs_or_ends_again_and_again_is_replaced(
     started: Start, label: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed_child, "MAX_SILENCE_S", 0.5)
+    monkeypatch.setattr(feed_child, "MAX_LOST_S", 0.5)
     hosted = started()
     record = hosted.open(feed_record(None, label=label))
     eventually(lambda: len(process_ids(hosted, record.feed_id)) == 3)
+
+
+def test_that_a_source_was_away_does_not_count_against_its_process(
+    started: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed_child, "MAX_LOST_S", 20.0)
+    hosted = started()
+    record = hosted.open(feed_record(None, label="returns"))
+    eventually(lambda: (report := hosted.report(record.feed_id)) is not None and report.model_age_s == 0.2)
+    assert len(process_ids(hosted, record.feed_id)) == 1
 
 
 def test_a_feed_that_another_worker_claimed_is_left_to_it_with_its_files(tmp_path: Path) -> None:
