@@ -50,7 +50,7 @@ LARGE_FROM = 400
 LEAST_BUDGET_SHARE = 0.4
 """Of the period, for reading and training, however long the rest takes."""
 NO_SCENE_S = 3.0
-"""Without a used pair for longer the feed is stalled."""
+"""While pairs come in, and none can be used for longer, the feed is stalled."""
 FIRST_BACK_OFF_S, MOST_BACK_OFF_S = 0.5, 8.0
 """After a fault, and after several in turn."""
 
@@ -103,7 +103,8 @@ class FeedModel:
         self._over_s: deque[float] = deque(maxlen=JUDGED_PAIRS)
         self._width = settings.eyes.width
         self._has_chosen = settings.eyes.width is not None
-        self._began_s = self._last_used_at = time.monotonic()
+        self._began_s = self._tried_at = time.monotonic()
+        self._unused_s = 0.0
         self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
         self._thread.start()
 
@@ -111,7 +112,7 @@ class FeedModel:
     def trouble(self) -> Trouble | None:
         """Why pairs that come in are not learnt; None: they are."""
         trouble = self._trouble
-        if trouble is None and self._given > self._used and time.monotonic() - self._last_used_at > NO_SCENE_S:
+        if trouble is None and self._unused_s > NO_SCENE_S:
             return Trouble(FeedReason.NO_SCENE, "the pairs show no scene with depth")
         return trouble
 
@@ -193,6 +194,9 @@ class FeedModel:
 
     def _take(self, pair: FeedPair) -> None:
         """Learn a pair."""
+        now_s = time.monotonic()
+        self._unused_s += min(now_s - self._tried_at, POLL_S)  # while none comes in, there is nothing to be used
+        self._tried_at = now_s
         follower = self._follower or self._begun()
         before, budget_s, start_s = follower.iteration, self._budget(), time.perf_counter()
         became = follower.add(pair, budget_s, partial(self._next, pair.sequence))
@@ -202,8 +206,8 @@ class FeedModel:
             return
         with self.changed:
             self._used += 1
-            self._last_used_at = time.monotonic()
-            self._used_at.append(self._last_used_at)
+            self._unused_s = 0.0
+            self._used_at.append(time.monotonic())
             if became is Added.FOLLOWED:
                 self._steps.append(follower.iteration - before)
                 self._over_s.append(time.perf_counter() - start_s - budget_s)
@@ -269,12 +273,13 @@ class FeedModel:
 
     def _end_follower(self) -> None:
         """End the follower; what it knows becomes a segment."""
-        follower, self._follower = self._follower, None
+        follower = self._follower
         if follower is not None:
             try:
                 follower.write_off()
             except Exception:  # what it knows is what failed
                 logger.exception("a model of a feed is lost")
+            self._follower = None  # not before: until then what it knows is no segment
             follower.close()
 
     def _fail(self, error: Exception) -> None:

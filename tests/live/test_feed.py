@@ -7,15 +7,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from intrasplat.errors import InputError
+from intrasplat.live import model
 from intrasplat.live.feed import Feed
 from intrasplat.live.follow import Follower
 from intrasplat.live.spec import SourceSpec
-from intrasplat.live.state import FeedReason, FeedState, StateClock
+from intrasplat.live.state import FeedReason, FeedState, PastRange, StateClock
 from intrasplat.live.times import FeedTime
 from intrasplat.names import Detail
 from intrasplat.splat.metrics import psnr_tissue
@@ -45,6 +47,40 @@ def test_a_feed_becomes_live_and_shows_the_newest_moment(followed: Follow, sende
     assert report.numbers.model_age_s == pytest.approx(view.age_s, abs=0.5)
     best_db = max(psnr_tissue(render_frame(view.scene, view.t).rgb, frame.left, frame.tissue) for frame in _frames())
     assert best_db > 22
+
+
+def test_time_without_a_picture_is_no_time_without_a_scene(followed: Follow, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model, "NO_SCENE_S", 0.3)
+    monkeypatch.setattr(model, "POLL_S", 0.05)
+    feed, reasons, add = followed(), list[FeedReason | None](), Follower.add
+    until_known(feed, 0.5)
+    feed.pause()
+    time.sleep(0.5)
+
+    def watched(follower: Follower, *given: Any) -> Any:
+        reasons.append(feed.report().reason)
+        return add(follower, *given)
+
+    monkeypatch.setattr(Follower, "add", watched)
+    feed.resume()
+    until(lambda: len(reasons) > 0)
+    assert reasons[0] is None
+
+
+def test_a_model_that_ends_is_known_until_it_is_a_segment(followed: Follow, monkeypatch: pytest.MonkeyPatch) -> None:
+    feed, seen, write_off = followed(), list[PastRange | None](), Follower.write_off
+    until_known(feed, 0.5)
+    feed.pause()
+    known = feed.report().past
+
+    def watched(follower: Follower) -> None:
+        seen.append(feed.report().past)
+        write_off(follower)
+        seen.append(feed.report().past)
+
+    monkeypatch.setattr(Follower, "write_off", watched)
+    feed.close()
+    assert seen == [known, known]
 
 
 def test_the_newest_picture_is_that_of_the_source_and_counts_as_no_used_one(followed: Follow) -> None:
