@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from intrasplat.errors import InputError
-from intrasplat.live.times import LIVE, REMEDY, FeedTime
+from intrasplat.live.times import LIVE, REMEDY, FeedTime, NoFeedTime
 
 MAX_T = 1e6
 SCENE_T_REMEDY = "Give a number: 0 is the first frame, 1 the end of the clip."
@@ -23,7 +23,7 @@ def _checked(asked: float | str | None) -> float | str | None:
     if isinstance(asked, str):
         try:
             FeedTime.parse(asked)
-        except InputError:
+        except NoFeedTime:
             raise InputError("t", f"{asked[:40]!r} is no time.", f"{SCENE_T_REMEDY} Of a live feed: {REMEDY}") from None
     return asked
 

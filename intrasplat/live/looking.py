@@ -20,6 +20,8 @@ MAX_STEP_S = 1.0
 """Between used frames that are farther apart nothing is known: the nearest one is shown."""
 TOLERANCE_S = 0.05
 """A moment that is shown in place of one that is so near needs no notice."""
+FUTURE_S = 60.0
+"""A caller's clock may be so far ahead: a time beyond that is in the future."""
 WINDOW = -1
 """Number of what the window covers, which is no segment yet."""
 Axis = Literal["source_s", "arrived_at"]
@@ -66,7 +68,7 @@ def find_moment(
     notice, if it is at most max_age_s old: the time will be known soon.
 
     Raises:
-        InputError: the time lies before the past that is stored.
+        InputError: the time lies before the past that is stored, or in the future.
     """
     newest = None if window is None else PastSegment.of(WINDOW, window)
     while spans := _spans(newest, past):
@@ -77,7 +79,9 @@ def find_moment(
         )
         begins = getattr(spans[0], axis)[0]
         if wanted < begins - TOLERANCE_S:
-            raise _too_early(asked, spans)
+            raise _outside("it lies before the past that is stored.", asked, spans)
+        if wanted - getattr(spans[-1], axis)[1] > time.time() - spans[-1].arrived_at[1] + FUTURE_S:
+            raise _outside("it lies in the future.", asked, spans)
         chosen = _chosen(spans, axis, wanted)
         scene = window if chosen is newest else past.load(chosen)
         if scene is not None:
@@ -126,13 +130,12 @@ def _side(shown: float, wanted: float) -> str:
     return "before" if shown < wanted else "after"
 
 
-def _too_early(asked: FeedTime, spans: list[PastSegment]) -> InputError:
+def _outside(problem: str, asked: FeedTime, spans: list[PastSegment]) -> InputError:
     first, last = spans[0], spans[-1]
-    problem = "it lies before the past that is stored."
     if asked.kind is FeedTimeKind.UNIX:
-        remedy = f"Ask for a time after {_utc(first.arrived_at[0])}."
+        remedy = f"Ask for a time from {_utc(first.arrived_at[0])} to {_utc(last.arrived_at[1])}."
     elif asked.kind is FeedTimeKind.BEFORE_LIVE:
-        remedy = f"Ask for live to -{last.source_s[1] - first.source_s[0]:.1f}."
+        remedy = f"Ask for -{last.source_s[1] - first.source_s[0]:.1f} to live."
     else:
         remedy = f"Ask for {first.source_s[0]:.1f} to {last.source_s[1]:.1f} s of the source."
     return InputError(FIELD, problem, remedy)

@@ -12,7 +12,12 @@ from intrasplat.live.spec import MAX_KEEP_S
 
 REMEDY = "Give live, -12.5 (seconds before live), 73.2 (seconds of the source), or 2026-11-29T08:15:00.5Z (RFC 3339)."
 FIELD = "t"
+_UNESCAPED = re.compile(r".+T.+ [0-9]{2}:[0-9]{2}", re.ASCII)
 _NUMBER = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
+
+
+class NoFeedTime(InputError):
+    """A text or number that is no time of a feed."""
 
 
 class FeedTimeKind(StrEnum):
@@ -57,7 +62,7 @@ class FeedTime:
         Raises:
             InputError: it is none of these, or more than MAX_KEEP_S before live.
         """
-        text = value.strip() if isinstance(value, str) else f"{value:.9f}"
+        text = value.strip() if isinstance(value, str) else f"{value:.9f}".rstrip("0").rstrip(".")
         if text == FeedTimeKind.LIVE:
             return LIVE
         if not _NUMBER.fullmatch(text):
@@ -78,6 +83,9 @@ def _unix_s(text: str) -> float:
         moment = datetime.fromisoformat(text)
         unix_s = moment.timestamp() if moment.tzinfo is not None else 0.0
     except (ValueError, OverflowError):
+        if _UNESCAPED.fullmatch(text):
+            remedy = "In an address write %2B for the + of a time zone, or give the time in UTC, with a Z."
+            raise InputError(FIELD, f"{text[:40]!r} has a space before its time zone.", remedy) from None
         raise _no_time(text) from None
     if moment.tzinfo is None:
         raise InputError(FIELD, f"{text[:40]!r} has no time zone.", "Append Z, or an offset such as +01:00.")
@@ -86,5 +94,5 @@ def _unix_s(text: str) -> float:
     return unix_s
 
 
-def _no_time(text: str) -> InputError:
-    return InputError(FIELD, f"{text[:40]!r} is no time of a feed.", REMEDY)
+def _no_time(text: str) -> NoFeedTime:
+    return NoFeedTime(FIELD, f"{text[:40]!r} is no time of a feed.", REMEDY)

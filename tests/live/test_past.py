@@ -82,6 +82,11 @@ def test_what_is_no_time_is_refused(text: str) -> None:
     assert refused.value.field == "t"
 
 
+def test_a_time_zone_whose_plus_became_a_space_is_named() -> None:
+    with pytest.raises(InputError, match="%2B"):
+        FeedTime.parse("2026-11-29T22:44:30 01:00")
+
+
 def test_a_moment_is_looked_up_in_segments_gaps_and_the_window() -> None:
     past = Past(PastSpec(keep_s=1000.0))
     for begins_s in (0.0, 0.6, 5.0):  # nothing from 1.2 to 5.0
@@ -123,6 +128,9 @@ def test_of_a_feed_that_goes_on_what_the_model_has_not_come_to_yet_is_no_gap() -
         assert codes(when, goes_on=True, max_age_s=1.0) == ["time_in_gap"]  # it may be of before an outage
     for later in (FeedTime.at(time.time() + 30.0), FeedTime.of_source(newest_s + age_s + 30.0)):
         assert codes(later, goes_on=True) == ["time_in_gap"]
+    for future in (FeedTime.at(time.time() + 100.0), FeedTime.of_source(newest_s + age_s + 100.0)):
+        with pytest.raises(InputError, match="future"):
+            codes(future, goes_on=True)
 
 
 def test_between_frames_that_are_far_apart_the_nearer_one_is_shown() -> None:
