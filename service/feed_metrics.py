@@ -44,6 +44,15 @@ def of_feeds(records: Sequence[FeedRecord], now_s: float) -> Iterator[Metric]:
     for feed in feeds:
         is_in.add_metric((feed.id, feed.state.value), 1)
     yield is_in
+    why = GaugeMetricFamily("intrasplat_feed_reason", "1: this is why it is in its state.", labels=("feed", "reason"))
+    unrecorded = GaugeMetricFamily(
+        "intrasplat_feed_unrecorded", "1: nothing is recorded, for this reason.", labels=("feed", "reason")
+    )
+    for feed in feeds:
+        for gauge_of_reason, reason in ((why, feed.reason), (unrecorded, feed.recording)):
+            if reason is not None:
+                gauge_of_reason.add_metric((feed.id, reason.value), 1)
+    yield from (why, unrecorded)
     for name, (about, gauge_of) in GAUGES.items():
         gauge = GaugeMetricFamily(name, about, labels=("feed",))
         for feed in feeds:

@@ -378,5 +378,9 @@ def test_the_metrics_tell_of_feeds_without_their_labels(service: ServiceUnderTes
         'intrasplat_workers{device="cpu",trains="yes"} 1.0',
     ):
         assert line in text
+    assert "intrasplat_feed_reason{" not in text
+    service.http.post(f"/feeds/{feed_id}/pause")
+    paused = f'intrasplat_feed_reason{{feed="{feed_id}",reason="by_hand"}} 1.0'
+    wait_until(lambda: paused in service.http.get("/metrics").text)
     assert "Smith" not in text
     assert 'trains="no"' not in text
