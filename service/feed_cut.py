@@ -148,7 +148,7 @@ async def _fetch(services: Deps, request: CutRequest, folder: Path, received: Re
 
     Raises:
         Problem: the worker's error; 507: the disk has no space for it.
-        LimitError: the file is larger than an upload may be.
+        LimitError: the file is larger than an upload may be, or has more frames than a clip may have.
         UnavailableError: the worker has ended or is too slow, or says not what the file holds.
     """
     available_bytes, until_s = services.intake.available_bytes(), time.monotonic() + MAX_WAIT_S
@@ -159,6 +159,8 @@ async def _fetch(services: Deps, request: CutRequest, folder: Path, received: Re
             if answer.head.error is not None:
                 raise problem_of_reply(answer.head.error)
             cut = cut or answer.head.cut
+            if cut is not None and cut.frames > services.settings.max_frames:
+                raise _too_many_frames(cut, services.settings.max_frames)
             received.total_bytes += len(answer.body)
             _check_size(services, received.total_bytes, available_bytes)
             digest.update(answer.body)
@@ -186,6 +188,12 @@ def _check_size(services: Deps, size_bytes: int, available_bytes: int) -> None:
         raise LimitError("from", f"the part is larger than {settings.max_upload_bytes} bytes.", LIMIT_REMEDY)
     if size_bytes > available_bytes:
         raise disk_full_for_upload(size_bytes, available_bytes, settings.min_free_bytes)
+
+
+def _too_many_frames(cut: CutRange, most: int) -> LimitError:
+    problem = f"the part has {cut.frames} frames; a clip may have {most} (INTRASPLAT_MAX_FRAMES)."
+    possible_s = (cut.to_s - cut.from_s) * most / cut.frames
+    return LimitError("from", problem, f"At this frame rate ask for at most {possible_s:.0f} s.")
 
 
 def _add(folder: Path, feed: FeedRecord, received: Received) -> None:

@@ -49,6 +49,8 @@ STEPS_PER_S = 10.0
 """Converts `iterations` to seconds of training: the speed of a plain machine with `paper`."""
 MAX_SUBMISSION_BYTES = 128 * 1024
 """Maximum bytes of a JSON body."""
+UNION_MEMBERS = frozenset({"float", "str"})
+"""What pydantic adds to the place of an error in a field of several types."""
 JSON_REMEDY = 'Send ids of finished uploads by part, and options: {"clip": ID, "options": {"budget_s": 20}}.'
 
 Body = TypeVar("Body", bound=BaseModel)
@@ -158,7 +160,7 @@ async def read_json(request: Request, services: Deps, model: type[Body], max_byt
         first = error.errors()[0]
         if first["type"] == "json_invalid":
             raise Problem(400, "The body is not JSON.", field="body", remedy=remedy) from None
-        field = ".".join(str(part) for part in first["loc"]) or "body"
+        field = ".".join(str(part) for part in first["loc"] if part not in UNION_MEMBERS) or "body"
         raise InputError(field, f"{first['msg']}.", remedy) from None
 
 

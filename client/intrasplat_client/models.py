@@ -303,7 +303,9 @@ class CutRange(Model):
     """of its last frame"""
     frames: int
     is_whole: bool = True
-    """whether it holds all recorded frames of the range: a change of the coding ends it"""
+    """whether it holds all frames of the range that are recorded so far: a change of size or coding ends it. The
+    newest seconds are recorded a little later: to_s says where it ends
+    """
 
 
 class Delivery(Model):

@@ -176,7 +176,9 @@ class CutRange(BaseModel):
     to_s: float = Field(description="of its last frame")
     frames: int
     is_whole: bool = Field(
-        default=True, description="whether it holds all recorded frames of the range: a change of the coding ends it"
+        default=True,
+        description="whether it holds all frames of the range that are recorded so far: a change of size or coding "
+        "ends it. The newest seconds are recorded a little later: to_s says where it ends",
     )
 
 

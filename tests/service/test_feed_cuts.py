@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,21 @@ def test_a_cut_until_live_ends_with_the_newest_pairs(service: ServiceUnderTest, 
     assert 60 <= asked[1].seconds - BEGAN_S < 65
 
 
+def test_a_cut_of_too_many_frames_is_refused_with_the_seconds_that_are_possible(tmp_path: Path) -> None:
+    running = contextmanager(running_service)(tmp_path, feed_keep_s=600.0, max_frames=600)
+    with running as service, following(service.queue, service.store.run_dir, CLIP):
+        feed_id = followed(service)
+        wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
+        answer = service.http.post(f"/feeds/{feed_id}/cut", json={"from": -30, "to": "2023-11-14T22:14:20Z"})
+        assert "at most 20 s" in assert_problem(answer, 413, "from")["remedy"]
+        assert not service.spooled()
+
+
 @pytest.mark.parametrize(
     ("given", "status", "field"),
     [
         ({"from": "then"}, 422, "from"),
+        ({"from": None}, 422, "from"),
         ({"from": -10, "to": -20}, 422, "from"),
         ({"from": -10, "to": "then"}, 422, "to"),
         ({"from": 0, "to": "2027-01-01T00:00:00Z"}, 413, "from"),
