@@ -275,6 +275,8 @@ class _Coverage:
         self._covered = np.zeros(self.pixels.size, dtype=np.bool_)
         self._view: tuple[Intrinsics, NDArray[np.float64]] | None = None
         self._points: list[_Covering] = []
+        self._projected: dict[tuple[bool, int], tuple[NDArray[np.uint8], int]] = {}
+        """For each view (whether the left eye, frame): the cells that points project into, and how many of _points."""
 
     def open_pixels(self, eye: Eye, index: int) -> NDArray[np.intp]:
         """Middle pixels of the cells that no point covers as seen by this eye in this frame."""
@@ -307,10 +309,12 @@ class _Coverage:
         self._view = view
         if not self._points:
             return
-        points_mm = np.concatenate([each.at(index) for each in self._points])
-        cells, _ = cells_of(points_mm, *view, self._stride)
-        covered = np.zeros(self._shape, dtype=np.uint8)
-        covered.reshape(-1)[cells] = 1
+        key = eye is self._clip, index
+        covered, done = self._projected.get(key, (np.zeros(self._shape, np.uint8), 0))
+        if added := self._points[done:]:
+            cells, _ = cells_of(np.concatenate([each.at(index) for each in added]), *view, self._stride)
+            covered.reshape(-1)[cells] = 1
+            self._projected[key] = covered, len(self._points)
         # From another pose the grid is uneven: a gap of one cell between points is not a hole.
         closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         self._covered = np.asarray(closed, dtype=np.bool_).reshape(-1)
