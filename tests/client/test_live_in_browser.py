@@ -318,6 +318,8 @@ def test_pause_and_end_say_what_they_do(site: Site, page: LivePage, painter: Liv
     page.click("#confirm [value=yes]")
     page.until_text("#word", say("live.word_ended"))
     assert site.queue.feed(feed_id) is None
+    for name in ("keep", "live", "pause", "end"):
+        assert not page.find(f"#{name}").is_enabled(), name
 
 
 def test_health_says_rates_and_why_nothing_is_recorded(site: Site, page: LivePage, painter: LivePainter) -> None:
@@ -361,25 +363,6 @@ def test_a_presenter_freezes_and_goes_back_to_live(site: Site, page: LivePage, p
     for key, state in (("PageDown", "frozen"), ("PageUp", "live"), (" ", "frozen"), (" ", "live")):
         page.script(PRESS, key)
         page.until(lambda state=state: page.state == state)  # type: ignore[misc]
-
-
-def test_the_page_leads_to_open_feeds(site: Site, page: LivePage, painter: LivePainter) -> None:
-    feed_id = opened_feed(site, "theatre 2")
-    page.driver.get(site.url)
-    page.until(lambda: page.script("return document.querySelector('#tools [data-drawer=library]') !== null"))
-    page.show("library")
-    page.until_text("#open-feeds", "theatre 2")
-    page.driver.get("about:blank")
-    page.driver.get(f"{site.url}/#/live/{feed_id}")
-    page.until(lambda: page.driver.current_url == f"{site.url}/live.html#/{feed_id}")
-    page.until_text("#word", say("live.word_live"))
-
-
-def test_a_feed_that_is_no_more_is_said_to_have_ended(site: Site, page: LivePage) -> None:
-    page.watch("0" * 32)
-    page.until_text("#word", say("live.word_ended"))
-    for name in ("keep", "live", "pause", "end"):
-        assert not page.find(f"#{name}").is_enabled(), name
 
 
 def test_every_state_and_reason_has_words() -> None:

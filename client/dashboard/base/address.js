@@ -15,7 +15,7 @@ import { comparisonOf } from "./spelling.js";
  */
 
 const SCENE = /^#\/scene\/([^/?]*)(?:\?(.*))?$/;
-const LIVE = /^#\/live\/([0-9a-f]{32}(?:\?.*)?)$/;
+const LIVE = /^#\/live(?:\/(.*))?$/;
 const ID = /^[0-9a-f]{32}$/;
 const POSE = /^(right|orbit:[-\d.e]+(,[-\d.e]+){2}((,[-\d.e]+){3})?|[-\d.e]+(,[-\d.e]+){11})$/;
 const RANGE = /^([1-9]\d{0,3}),([1-9]\d{0,3})$/;
@@ -95,9 +95,9 @@ export class Address {
 
   /** Go where the address says. @returns {boolean} whether it names a scene */
   follow() {
-    const [, feed] = LIVE.exec(location.hash) ?? [];
-    if (feed) location.replace(addressOf(feed));
-    if (feed) return true;
+    const live = LIVE.exec(location.hash);
+    if (live) location.replace(addressOf(live[1] ?? ""));
+    if (live) return true;
     const { place, wrong } = placeOf(location.hash, this.#layers);
     this.tell("");
     if (place) this.go(place);

@@ -688,6 +688,7 @@ export const DE = {
     "megabytes": "{mb} MB",
     "open_feeds": "Offene Übertragungen",
     "none_open": "Keine Übertragung ist offen.",
+    "unknown": "Diese Adresse nennt keine offene Übertragung: Die Übertragung ist beendet, oder die Adresse ist falsch.",
     "unnamed": "Übertragung {id}",
     "to_scenes": "Szenen und Clips",
     "open_another": "Übertragung öffnen",

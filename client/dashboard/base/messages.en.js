@@ -688,6 +688,7 @@ export const EN = {
     "megabytes": "{mb} MB",
     "open_feeds": "Open feeds",
     "none_open": "No feed is open.",
+    "unknown": "This address names no open feed: the feed has ended, or the address is wrong.",
     "unnamed": "Feed {id}",
     "to_scenes": "Scenes and clips",
     "open_another": "Open a feed",

@@ -81,6 +81,7 @@ const opening = new Opening(
     form: get("open-feed"),
     list: get("feeds"),
     none: get("no-feeds"),
+    unknown: get("unknown-feed"),
     message: get("open-message"),
   },
   (id, media) => {
@@ -90,8 +91,12 @@ const opening = new Opening(
   },
 );
 
-/** Show a feed. @param {string | null} id null: the list of those that are open */
-function view(id) {
+/**
+ * Show a feed.
+ * @param {string | null} id null: the list of those that are open
+ * @param {boolean} [isUnknown] the address names none of them
+ */
+function view(id, isUnknown = false) {
   events?.stop();
   if (push && push.feedId !== id) push.end();
   [feedId, feed, isGone, refused] = [id, null, false, null];
@@ -103,7 +108,7 @@ function view(id) {
   look.open(id);
   picture.open(id);
   events = id && new FeedEvents(id, take, end);
-  opening.show(id === null);
+  opening.show(id === null, isUnknown);
   get("screen").hidden = id === null;
   document.body.dataset.kind = "";
   light.keep(id !== null);
@@ -124,6 +129,7 @@ function take(told) {
 }
 
 function end() {
+  if (feed === null) return view(null, true); // it never said anything
   isGone = true;
   feed = null;
   picture.open(null);
@@ -347,8 +353,8 @@ showWords(document);
 
 /** Show what the address names. */
 function follow() {
-  const { id, atS, isWrong } = feedPlaceOf(location.hash);
-  view(id);
+  const { id, isNone, atS, isWrong } = feedPlaceOf(location.hash);
+  view(id, isNone);
   if (isWrong) showFault(words("live.at_unreadable"));
   if (id === null || atS === null) return;
   tape.mark({ atS, kind: "frozen" });

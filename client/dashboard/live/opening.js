@@ -12,7 +12,8 @@ const LOOK_MS = 2000;
 
 export class Opening {
   /**
-   * @param {{section: HTMLElement, form: HTMLFormElement, list: HTMLElement, none: HTMLElement, message: HTMLElement}} parts
+   * @param {{section: HTMLElement, form: HTMLFormElement, list: HTMLElement, none: HTMLElement, unknown: HTMLElement,
+   *   message: HTMLElement}} parts
    * @param {(id: string, media: MediaStream | null) => void} onOpen
    */
   constructor(parts, onOpen) {
@@ -35,9 +36,10 @@ export class Opening {
     this.#offer();
   }
 
-  /** @param {boolean} isShown */
-  show(isShown) {
+  /** @param {boolean} isShown @param {boolean} isUnknown the address names no open feed */
+  show(isShown, isUnknown) {
     this.parts.section.hidden = !isShown;
+    this.parts.unknown.hidden = !isUnknown;
     clearInterval(this.timer);
     if (!isShown) return;
     this.#list();
