@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from contract.queue.embedded import short_socket_path
 from contract.store.shelf import new_job_id
 from contract.wire.feeds import CutRange, FeedOptions, FeedRecord, FeedReport, FeedShown
-from contract.wire.rendering import MeasureRequest, RecordedRequest, RenderRequest, WorkerAddress
+from contract.wire.rendering import (
+    CutRequest,
+    MeasureRequest,
+    PushRequest,
+    RecordedRequest,
+    RenderRequest,
+    WorkerAddress,
+)
 from intrasplat.errors import InputError
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.live.times import LIVE, FeedTimeKind
@@ -81,6 +88,7 @@ class LivePainter(FeedWorker):
         self.has_model = True
         self.is_coarse = False
         self.answer_after_s = 0.0
+        self.refuses_cuts: InputError | None = None
         self.renders: list[RenderRequest] = []
         self.measured: list[MeasureRequest] = []
         self._lock = threading.Lock()
@@ -154,6 +162,11 @@ class LivePainter(FeedWorker):
             warnings += (Notice.info(NoticeCode.COARSE, "coarse"),)
         camera = CAMERA.model_copy(update={"width": 400, "height": 320, "fx": 400, "fy": 400, "cx": 200, "cy": 160})
         return Reply(picture, "image/jpeg", 0.0, warnings, camera=camera, feed=shown)
+
+    def _answer_aside(self, request: CutRequest | PushRequest, content: bytes) -> Reply:
+        if self.refuses_cuts is not None and isinstance(request, CutRequest):
+            raise self.refuses_cuts
+        return super()._answer_aside(request, content)
 
     def _at(self, moment: Any, newest_s: float) -> float:
         at_s = moment.seconds if moment.kind is FeedTimeKind.UNIX else newest_s - moment.seconds

@@ -84,15 +84,26 @@ export class Keeping {
     const text = this.#text();
     line.hidden = text === "";
     const link = line.querySelector("a") ?? element("a");
-    if (!line.firstChild) line.append(link, document.createTextNode(" "), element("span"));
-    setText(line.lastChild, text);
+    if (!line.firstChild) {
+      line.append(link, " ", element("span"), " ", element("span"));
+      line.lastChild.lang = "en";
+    }
+    const [own, said] = line.querySelectorAll("span");
+    setText(own, text);
+    setText(said, this.#refusal);
     link.hidden = kept === null || kept.job.state === "failed";
     if (kept) link.href = `./#/scene/${kept.job.id}`;
     setText(link, words("live.kept_open"));
   }
 
+  /** Why the service refuses a part, and which it would take: its own words, for only they say how long it may be. */
+  get #refusal() {
+    const { mayPass, document: { detail, remedy } = {} } = this.problem ?? {};
+    return mayPass ? "" : [detail, remedy].filter(Boolean).join(" ");
+  }
+
   #text() {
-    if (this.problem) return words("live.kept_failed", { why: this.problem.message });
+    if (this.problem) return words("live.kept_failed", { why: this.#refusal ? "" : this.problem.message }).trim();
     if (this.isCutting) return words("live.keeping");
     if (!this.kept) return "";
     const { fromS, toS, job } = this.kept;
