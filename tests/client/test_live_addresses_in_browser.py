@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from datetime import UTC, datetime
+
 import pytest
 
-from tests.client.live_feed import LivePage, LivePainter, opened_feed
+from tests.client.live_feed import PAST_S, LivePage, LivePainter, opened_feed
 from tests.client.page import Site
 from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
@@ -36,3 +39,23 @@ def test_an_address_of_no_open_feed_leads_to_those_that_are_open(
     page.click("#feeds a")
     page.until(lambda: page.driver.current_url == f"{site.url}/live.html#/{feed_id}")
     page.until_text("#word", say("live.word_live"))
+
+
+def test_an_address_of_a_moment_that_is_not_stored_says_so_and_how_to_come_to_live(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    feed_id = opened_feed(site)
+
+    def open_at(at_s: float) -> None:
+        page.watch(f"{feed_id}?at={datetime.fromtimestamp(at_s, UTC).isoformat(timespec='milliseconds')}")
+
+    open_at(time.time() - PAST_S - 3600)
+    begin, end = say("live.moment_gone", **{"from": "|"}).split("|")
+    page.until_text("#model-message", begin)
+    assert page.text("#model-message").endswith(end)
+    assert page.script("return document.getElementById('live').classList.contains('wanted')")
+    page.click("#live")
+    page.until(lambda: page.state == "live" and page.text("#model-message") == "")
+    open_at(time.time() + 3600)
+    page.until_text("#model-age", "of ")
+    assert page.text("#word") == say("live.word_frozen", time=page.text("#model-age").removeprefix("of "))

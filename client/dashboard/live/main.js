@@ -164,7 +164,7 @@ function known() {
     pictureAgeS: picture.ageS,
     pictureProblem: picture.problem,
     modelAgeS,
-    frozenAt: clockTime(1000 * look.atS),
+    frozenAt: clockTime(1000 * (model.shown?.capturedAtS ?? look.atS)), // the service may show a moment beside it
     backS: look.behindS,
   };
 }
@@ -214,9 +214,14 @@ function refreshModel({ modelAgeS }) {
   setText(get("model-age"), age);
   get("model-pane").dataset.kind = isLive ? "live" : look.mode;
   setText(get("model-place"), look.rock.isOn ? words("live.rocking") : look.orbit.words);
-  const message = refused?.message ?? (shown === null && !isGone ? words("live.no_model") : "");
-  setText(get("model-message"), message);
+  const message = shown === null && !isGone ? words("live.no_model") : "";
+  setText(get("model-message"), refused ? refusalWords() : message);
   get("model-message").classList.toggle("over-picture", shown !== null);
+}
+
+function refusalWords() {
+  const isOfTime = refused.document?.field === "t" && feed?.begins_s != null;
+  return isOfTime ? words("live.moment_gone", { from: clockTime(1000 * feed.begins_s) }) : refused.message;
 }
 
 /** How far the view in sight can be trusted, with the worst reason, and what else the service notes of it. */
