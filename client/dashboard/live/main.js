@@ -12,6 +12,7 @@ import { Scopes } from "../base/scopes.js";
 import { lightMark, trustOf } from "../library/trustlight.js";
 import { placeInPicture } from "../measure/pointer.js";
 import { prepareControlSets } from "../stage/controlsets.js";
+import { Aloud } from "./aloud.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
 import { headlineOf, headlineOfPicture } from "./headline.js";
@@ -54,6 +55,7 @@ export const model = new ModelPicture(get("model-picture"), clock);
 export const look = new Look(model, clock);
 const tape = new Tape({ slider: get("tape"), svg: get("tape-drawing"), ticks: get("tape-ticks") }, look, clock);
 const health = new Health({ summary: get("health-summary"), list: get("health-list"), why: get("why") });
+const aloud = new Aloud(get("word-aloud"));
 const scopes = new Scopes(() => allow());
 const light = new ScreenLight();
 const keeping = new Keeping({ button: get("keep"), line: get("kept") }, clock, (fromS, toS) => {
@@ -182,8 +184,8 @@ function refresh() {
   if (document.body.dataset.kind !== top.kind) {
     document.body.dataset.kind = top.kind;
     get("icon").firstElementChild.setAttribute("d", ICONS[top.kind]);
-    setText(get("word-told"), text); // read aloud once, not at every second
   }
+  aloud.note(top, text);
   get("live-pane").dataset.kind = ofPicture.kind;
   get("live-icon").firstElementChild.setAttribute("d", ICONS[ofPicture.kind]);
   setText(get("live-word"), words(ofPicture.place, ofPicture.values));

@@ -1,0 +1,36 @@
+"""What the live screen says while something changes: nothing that is wrong for a second."""
+
+from __future__ import annotations
+
+from tests.client.live_feed import LivePage, LivePainter
+from tests.client.page import Site
+from tests.client.test_live_in_browser import DRAG_TAPE, watched
+from tests.client.test_live_in_browser import page as page
+from tests.client.test_live_in_browser import painter as painter
+from tests.client.words import say
+
+NOTE_WORDS = """
+const [id, key] = arguments;
+const line = document.getElementById(id);
+window[key] = [];
+new MutationObserver(() => window[key].push(line.textContent)).observe(line, { childList: true, subtree: true });
+"""
+"""What an element says from now on."""
+
+
+def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, painter: LivePainter) -> None:
+    watched(site, page)
+    aloud = "return document.getElementById('word-aloud').textContent"
+    page.until(lambda: page.script(aloud) == say("live.word_live"))
+    page.script(NOTE_WORDS, "word-aloud", "said")
+    for back_s in (1, 3, 5):
+        page.script(DRAG_TAPE, -back_s)
+    page.until(lambda: page.script(aloud) == say("live.word_back", s=5))
+    page.click("#live")
+    page.until(lambda: page.script(aloud) == say("live.word_live"))
+    painter.model_lag_s = 3.3
+    page.until(lambda: page.script(aloud).startswith("MODEL BEHIND"))
+    painter.model_lag_s = 6.3
+    page.until(lambda: page.script(aloud) == "")
+    said = [text for text in page.script("return window.said") if text]
+    assert [text.rstrip("0123456789 s") for text in said] == ["LOOKING BACK", "LIVE", "MODEL BEHIND"]
