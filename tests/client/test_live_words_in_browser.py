@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.client.live_feed import LivePage, LivePainter
+from tests.client.live_feed import LivePage, LivePainter, opened_feed
 from tests.client.page import Site
 from tests.client.test_live_in_browser import DRAG_TAPE, watched
 from tests.client.test_live_in_browser import page as page
@@ -34,3 +34,12 @@ def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, 
     page.until(lambda: page.script(aloud) == "")
     said = [text for text in page.script("return window.said") if text]
     assert [text.rstrip("0123456789 s") for text in said] == ["LOOKING BACK", "LIVE", "MODEL BEHIND"]
+
+
+def test_a_model_that_is_there_is_said_to_be_loaded(site: Site, page: LivePage, painter: LivePainter) -> None:
+    painter.answer_after_s = 2.0
+    page.watch(opened_feed(site))
+    page.until_text("#model-message", say("live.model_loads"))
+    painter.answer_after_s, painter.has_model = 0.0, False
+    page.watch(opened_feed(site))
+    page.until_text("#model-message", say("live.no_model"))

@@ -643,6 +643,7 @@ export const DE = {
     "nothing_recorded": "Solange kein Gewebe im Bild ist, wird nichts gezeigt und nichts aufgezeichnet.",
     "ended_note": "Diese Übertragung ist beendet, ihre Aufzeichnung gelöscht.",
     "no_model": "Noch kein Modell.",
+    "model_loads": "Das Modell wird geladen.",
     "moment_gone": "Dieser Zeitpunkt ist nicht gespeichert. Gespeichert ist ab {from}. „Zurück zu live“ zeigt, was jetzt ist.",
     "rocking": "pendelt hin und her",
     "stage": "Das Modell. Ziehen dreht es; beim Messen bewegen Pfeiltasten ein Kreuz, und die Eingabetaste wählt.",

@@ -216,7 +216,7 @@ function refreshModel({ modelAgeS }) {
   setText(get("model-age"), age);
   get("model-pane").dataset.kind = isLive ? "live" : look.mode;
   setText(get("model-place"), look.rock.isOn ? words("live.rocking") : look.orbit.words);
-  const message = shown === null && !isGone ? words("live.no_model") : "";
+  const message = shown === null && !isGone ? words(feed?.begins_s == null ? "live.no_model" : "live.model_loads") : "";
   setText(get("model-message"), refused ? refusalWords() : message);
   get("model-message").classList.toggle("over-picture", shown !== null);
 }
