@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.client.live_feed import LivePage, LivePainter, opened_feed
 from tests.client.page import Site
-from tests.client.test_live_in_browser import DRAG_TAPE, watched
+from tests.client.test_live_in_browser import DRAG_TAPE, age_of, watched
 from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
 from tests.client.words import say
@@ -43,3 +43,17 @@ def test_a_model_that_is_there_is_said_to_be_loaded(site: Site, page: LivePage, 
     painter.answer_after_s, painter.has_model = 0.0, False
     page.watch(opened_feed(site))
     page.until_text("#model-message", say("live.no_model"))
+
+
+def test_a_frozen_picture_s_age_is_not_said_of_the_model_that_goes_on(
+    site: Site, page: LivePage, painter: LivePainter
+) -> None:
+    watched(site, page)
+    page.script(DRAG_TAPE, -20)
+    page.until(lambda: page.state == "back" and (age_of(page, "model") or {"ageMs": 0})["ageMs"] > 19_000)
+    page.script(NOTE_WORDS, "word", "said")
+    painter.answer_after_s = 0.3
+    page.click("#live")
+    page.until(lambda: (age_of(page, "model") or {"ageMs": 9999})["ageMs"] < 2000)
+    assert say("live.word_live") in (said := page.script("return window.said"))
+    assert [text for text in said if text.startswith("MODEL BEHIND")] == []

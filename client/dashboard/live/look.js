@@ -10,6 +10,8 @@ const TICK_MS = 50;
 export const RETURN_AFTER_MS = 20_000;
 /** Less than this behind the newest moment is live. */
 const LIVE_S = 0.5;
+/** The newest moment, as the service calls it. */
+export const LIVE = "live";
 const HANDS = ["pointermove", "pointerdown", "wheel", "keydown"];
 
 /** Tells "changed" when another moment or place is looked at, or a mode is. */
@@ -33,6 +35,8 @@ export class Look extends EventTarget {
     /** @type {number} UNIX time, s, of the frozen moment */
     this.atS = 0;
     this.backS = 0;
+    /** @type {number} since when it is live, by this browser's steady clock */
+    this.liveMs = performance.now();
   }
 
   /** @param {string | null} feedId */
@@ -124,7 +128,7 @@ export class Look extends EventTarget {
   }
 
   get #t() {
-    if (this.mode === "live") return "live";
+    if (this.mode === "live") return LIVE;
     return isoOf(this.mode === "frozen" ? this.atS : this.clock.nowS - this.backS);
   }
 }

@@ -15,10 +15,10 @@ import { prepareControlSets } from "../stage/controlsets.js";
 import { Aloud } from "./aloud.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
-import { headlineOf, headlineOfPicture } from "./headline.js";
+import { BEHIND_S, headlineOf, headlineOfPicture } from "./headline.js";
 import { Health } from "./health.js";
 import { Keeping } from "./keeping.js";
-import { Look } from "./look.js";
+import { LIVE, Look } from "./look.js";
 import { LiveMeasure } from "./measuring.js";
 import { ModelPicture } from "./model.js";
 import { Opening } from "./opening.js";
@@ -154,9 +154,16 @@ function allow() {
   setText(get("pause"), words(isPaused ? "live.resume" : "live.pause"));
 }
 
+/** @returns {number | null} s; null: the model follows nothing, or shows what was looked at before until its first picture */
+function modelAge() {
+  const { shown } = model;
+  if (shown === null || look.mode !== "live") return null;
+  const isBefore = shown.asked.t !== LIVE && performance.now() - look.liveMs < 1000 * BEHIND_S;
+  return isBefore ? null : Math.max(0, clock.nowS - shown.capturedAtS);
+}
+
 /** @returns {import("./headline.js").Known} */
 function known() {
-  const modelAgeS = model.shown && look.mode === "live" ? Math.max(0, clock.nowS - model.shown.capturedAtS) : null;
   return {
     feed,
     isGone,
@@ -165,7 +172,7 @@ function known() {
     pictureAtS: picture.capturedAtS,
     pictureAgeS: picture.ageS,
     pictureProblem: picture.problem,
-    modelAgeS,
+    modelAgeS: modelAge(),
     frozenAt: clockTime(1000 * (model.shown?.capturedAtS ?? look.atS)), // the service may show a moment beside it
     backS: look.behindS,
   };
@@ -210,7 +217,7 @@ function blankWords({ kind }) {
 function refreshModel({ modelAgeS }) {
   const { shown } = model;
   const isLive = look.mode === "live";
-  const age = shown === null ? "" : isLive
+  const age = shown === null ? "" : modelAgeS !== null
     ? words("live.model_behind", { s: figure(modelAgeS, 1) })
     : words("live.model_at", { time: clockTime(1000 * shown.capturedAtS) });
   setText(get("model-age"), age);
