@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from intrasplat.live.state import FeedReason, FeedState
@@ -79,7 +81,7 @@ def test_it_is_accessible_and_fits_in_every_state(
         page.click("#live")
         page.click("#keep")
         page.until_text("#kept", say("live.kept_open", language))
-        painter.state, painter.reason = FeedState.STALLED, FeedReason.SILENT
+        painter.stops_s, painter.state, painter.reason = time.time(), FeedState.STALLED, FeedReason.SILENT
         page.until(lambda: page.state == "lost")
         page.until_text("#why", say("live.reason_silent", language)[:10])
         judge("lost")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import pytest
+
 from tests.client.live_feed import LivePage, LivePainter, opened_feed
 from tests.client.page import Site
 from tests.client.test_live_in_browser import DRAG_TAPE, age_of, watched
@@ -16,6 +20,31 @@ window[key] = [];
 new MutationObserver(() => window[key].push(line.textContent)).observe(line, { childList: true, subtree: true });
 """
 """What an element says from now on."""
+HEADLINES = """
+const [cases] = arguments;
+const picture = { pictureAtS: 100, pictureAgeS: 0.2, pictureProblem: null };
+const fresh = { isGone: false, mode: "live", answerAgeS: 0, modelAgeS: 0.4, ...picture };
+const feed = { state: "live", reason: null, received_fps: 30, last_frame_at_s: 100 };
+return import("/live/headline.js").then(({ headlineOf }) =>
+  cases.map((each) => headlineOf({ ...fresh, ...each, feed: { ...feed, ...each.feed } }).place));
+"""
+STALLED = {"state": "stalled", "reason": "undecodable"}
+
+
+@pytest.mark.parametrize(
+    ("known", "word"),
+    [
+        ({"feed": STALLED}, "unusable"),
+        ({"feed": {**STALLED, "last_frame_at_s": 99.5}}, "live"),
+        ({"feed": {**STALLED, "last_frame_at_s": 99.5}, "modelAgeS": 8.0}, "behind"),
+        ({"feed": {**STALLED, "last_frame_at_s": 99.5}, "pictureAgeS": 3.0}, "unusable"),
+        ({"feed": {**STALLED, "reason": "no_scene"}}, "no_model"),
+    ],
+)
+def test_a_picture_that_came_later_than_a_report_says_more(
+    site: Site, page: LivePage, known: dict[str, Any], word: str
+) -> None:
+    assert page.script(HEADLINES, [known]) == [f"live.word_{word}"]
 
 
 def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, painter: LivePainter) -> None:

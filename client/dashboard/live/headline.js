@@ -20,6 +20,8 @@ export const LOST_AFTER_S = 1;
 const SILENT_AFTER_S = 2;
 /** Pairs that came so much later than a picture show that the picture is late, and not the source. */
 const LATER_S = 0.5;
+/** Of the times of pictures. */
+const ROUNDED_S = 0.002;
 /** In place of a status: the service did not answer. */
 const NO_ANSWER = 0;
 /** A model that is older than this is said to be behind. */
@@ -38,6 +40,14 @@ const STALLED = {
 /** Reasons that may be the model's alone: the picture comes in. */
 const OF_MODEL = ["no_scene", "calibration", "fault"];
 
+/**
+ * Whether pictures have come in since the feed said that none can be shown.
+ * @param {import("./feeds.js").Feed} feed
+ * @param {number | null} pictureAtS
+ */
+export const isBack = ({ state, last_frame_at_s }, pictureAtS) =>
+  state === "stalled" && pictureAtS !== null && last_frame_at_s !== null && pictureAtS > last_frame_at_s + ROUNDED_S;
+
 const said = (kind, place, values = {}) => ({ kind, place, values });
 const seconds = (ageS) => Math.max(1, Math.round(ageS));
 
@@ -48,7 +58,8 @@ export function headlineOfPicture({ feed, isGone, answerAgeS, pictureAtS, pictur
   if (answerAgeS > (isRefused ? LOST_AFTER_S : SILENT_AFTER_S)) return said("lost", "live.word_service_lost");
   if (feed === null) return said("connecting", "live.word_connecting");
   const why = STALLED[feed.reason] ?? "stalled";
-  const isSeen = feed.state === "stalled" && OF_MODEL.includes(feed.reason) && pictureAtS !== null;
+  const isModelsAlone = feed.state === "stalled" && OF_MODEL.includes(feed.reason) && pictureAtS !== null;
+  const isSeen = isModelsAlone || isBack(feed, pictureAtS);
   if (feed.state in KINDS && !isSeen) return said(KINDS[feed.state], `live.word_${feed.state === "stalled" ? why : feed.state}`);
   if (pictureAtS === null) return said("connecting", "live.word_connecting");
   const missedS = feed.received_fps > 0 ? MISSED / feed.received_fps : 0;
@@ -65,7 +76,7 @@ export function headlineOf(known) {
   if (known.mode === "back") return said("back", "live.word_back", { s: seconds(known.backS) });
   const found = headlineOfPicture(known);
   if (found.kind !== "live") return found;
-  if (known.feed.state === "stalled") return said("behind", "live.word_no_model");
+  if (known.feed.state === "stalled" && OF_MODEL.includes(known.feed.reason)) return said("behind", "live.word_no_model");
   if (known.modelAgeS === null) return found;
   const isBehind = known.modelAgeS > BEHIND_S || (known.feed.state === "behind" && known.modelAgeS > LOST_AFTER_S);
   return isBehind ? said("behind", "live.word_behind", { s: seconds(known.modelAgeS) }) : found;

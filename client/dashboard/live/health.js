@@ -2,6 +2,7 @@
 
 import { element, setText } from "../base/element.js";
 import { figure, hasWords, words } from "../base/messages.js";
+import { isBack } from "./headline.js";
 
 /** States in which pairs come in and are recorded, unless `recording` says why not. */
 const RECORDED = ["live", "behind"];
@@ -57,10 +58,14 @@ export class Health {
     if (this.age) setText(this.age, secondsWords(modelAgeS, 1));
   }
 
-  /** @param {import("./feeds.js").Feed | null} feed @param {number} sentRate */
-  refresh(feed, sentRate) {
+  /**
+   * @param {import("./feeds.js").Feed | null} feed
+   * @param {number} sentRate
+   * @param {number | null} pictureAtS of the endoscope's picture in sight, UNIX time
+   */
+  refresh(feed, sentRate, pictureAtS) {
     const { summary, list, why } = this.parts;
-    setText(why, feed === null ? "" : whyOf(feed));
+    setText(why, feed === null || isBack(feed, pictureAtS) ? "" : whyOf(feed));
     setText(summary, feed === null ? words("live.health") : recordingOf(feed));
     const rows = feed === null ? [] : rowsOf(feed, sentRate);
     while (list.children.length > rows.length) list.lastChild.remove();

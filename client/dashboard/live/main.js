@@ -142,7 +142,7 @@ function end() {
 }
 
 /** All of it but the model's age. */
-const tellHealth = () => health.refresh(feed, push?.pace.rate ?? NaN);
+const tellHealth = () => health.refresh(feed, push?.pace.rate ?? NaN, picture.capturedAtS);
 
 /** What the key may do. */
 function allow() {
