@@ -6,12 +6,14 @@ from typing import Any
 
 import pytest
 
+from client.page import DASHBOARD
+from intrasplat.live.state import FeedReason, FeedState
 from tests.client.live_feed import LivePage, LivePainter, opened_feed
 from tests.client.page import Site
 from tests.client.test_live_in_browser import DRAG_TAPE, age_of, watched
 from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
-from tests.client.words import say
+from tests.client.words import LANGUAGES, say, table
 
 NOTE_WORDS = """
 const [id, key] = arguments;
@@ -28,6 +30,7 @@ const feed = { state: "live", reason: null, received_fps: 30, last_frame_at_s: 1
 return import("/live/headline.js").then(({ headlineOf }) =>
   cases.map((each) => headlineOf({ ...fresh, ...each, feed: { ...feed, ...each.feed } }).place));
 """
+REFUSED = {"pictureProblem": {"status": 503}, "pictureAgeS": 2.5}
 STALLED = {"state": "stalled", "reason": "undecodable"}
 
 
@@ -39,12 +42,24 @@ STALLED = {"state": "stalled", "reason": "undecodable"}
         ({"feed": {**STALLED, "last_frame_at_s": 99.5}, "modelAgeS": 8.0}, "behind"),
         ({"feed": {**STALLED, "last_frame_at_s": 99.5}, "pictureAgeS": 3.0}, "unusable"),
         ({"feed": {**STALLED, "reason": "no_scene"}}, "no_model"),
+        ({**REFUSED, "feed": {"last_frame_at_s": 102.4}}, "picture_behind"),
+        ({**REFUSED, "feed": {"last_frame_at_s": 104.9}, "pictureAgeS": 5.0}, "no_picture"),
+        (REFUSED, "no_picture"),
     ],
 )
-def test_a_picture_that_came_later_than_a_report_says_more(
+def test_no_word_is_said_for_a_second_where_a_report_is_late(
     site: Site, page: LivePage, known: dict[str, Any], word: str
 ) -> None:
     assert page.script(HEADLINES, [known]) == [f"live.word_{word}"]
+
+
+def test_every_state_and_reason_has_words() -> None:
+    for language in LANGUAGES:
+        places = set(table(language)["live"])
+        assert {f"reason_{reason.value}" for reason in FeedReason} == {each for each in places if "reason_" in each}
+        assert {f"state_{state.value}" for state in FeedState} == {each for each in places if "state_" in each}
+    source = (DASHBOARD / "live" / "headline.js").read_text()
+    assert all(f"{state.value}:" in source for state in FeedState if state not in (FeedState.LIVE, FeedState.BEHIND))
 
 
 def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, painter: LivePainter) -> None:

@@ -18,12 +18,16 @@
 export const LOST_AFTER_S = 1;
 /** The same where answers are only awaited: numbers come once a second, and a busy worker's pictures later. */
 const SILENT_AFTER_S = 2;
+/** The same where no picture is asked for, so that numbers alone come. */
+const UNASKED_AFTER_S = 4;
 /** Pairs that came so much later than a picture show that the picture is late, and not the source. */
 const LATER_S = 0.5;
 /** Of the times of pictures. */
 const ROUNDED_S = 0.002;
 /** In place of a status: the service did not answer. */
 const NO_ANSWER = 0;
+/** A picture that the service does not give is behind until then: the report that says why is under way. */
+const NO_PICTURE_AFTER_S = 4;
 /** A model that is older than this is said to be behind. */
 export const BEHIND_S = 2;
 /** Pictures of a source that may stay out before it is called lost. */
@@ -37,6 +41,8 @@ const STALLED = {
   too_slow: "too_slow",
   no_scene: "no_model", calibration: "no_model",
 };
+/** What every picture of the endoscope may show; else the screen is blank, and none is asked for. */
+export const HIDDEN_STATES = ["no_tissue"];
 /** Reasons that may be the model's alone: the picture comes in. */
 const OF_MODEL = ["no_scene", "calibration", "fault"];
 
@@ -55,7 +61,8 @@ const seconds = (ageS) => Math.max(1, Math.round(ageS));
 export function headlineOfPicture({ feed, isGone, answerAgeS, pictureAtS, pictureAgeS, pictureProblem }) {
   if (isGone) return said("ended", "live.word_ended");
   const isRefused = pictureProblem?.status === NO_ANSWER;
-  if (answerAgeS > (isRefused ? LOST_AFTER_S : SILENT_AFTER_S)) return said("lost", "live.word_service_lost");
+  const silentAfterS = feed && HIDDEN_STATES.includes(feed.state) ? UNASKED_AFTER_S : SILENT_AFTER_S;
+  if (answerAgeS > (isRefused ? LOST_AFTER_S : silentAfterS)) return said("lost", "live.word_service_lost");
   if (feed === null) return said("connecting", "live.word_connecting");
   const why = STALLED[feed.reason] ?? "stalled";
   const isModelsAlone = feed.state === "stalled" && OF_MODEL.includes(feed.reason) && pictureAtS !== null;
@@ -64,8 +71,9 @@ export function headlineOfPicture({ feed, isGone, answerAgeS, pictureAtS, pictur
   if (pictureAtS === null) return said("connecting", "live.word_connecting");
   const missedS = feed.received_fps > 0 ? MISSED / feed.received_fps : 0;
   if (pictureAgeS <= Math.max(LOST_AFTER_S, missedS)) return said("live", "live.word_live");
-  if (pictureProblem !== null && !isRefused) return said("lost", "live.word_no_picture");
   const isLate = feed.last_frame_at_s !== null && feed.last_frame_at_s > pictureAtS + LATER_S;
+  const isSoon = isLate && pictureAgeS <= NO_PICTURE_AFTER_S;
+  if (pictureProblem !== null && !isRefused && !isSoon) return said("lost", "live.word_no_picture");
   if (!isLate) return said("lost", `live.word_${why === "no_model" ? "stalled" : why}`);
   return said("behind", "live.word_picture_behind", { s: seconds(pictureAgeS) });
 }

@@ -15,7 +15,7 @@ import { prepareControlSets } from "../stage/controlsets.js";
 import { Aloud } from "./aloud.js";
 import { FeedClock } from "./clock.js";
 import { endFeed, FeedEvents, pauseFeed, resumeFeed } from "./feeds.js";
-import { BEHIND_S, headlineOf, headlineOfPicture } from "./headline.js";
+import { BEHIND_S, headlineOf, headlineOfPicture, HIDDEN_STATES } from "./headline.js";
 import { Health } from "./health.js";
 import { Keeping } from "./keeping.js";
 import { LIVE, Look } from "./look.js";
@@ -33,8 +33,6 @@ const WRITE_AFTER_MS = 400;
 const STEP_S = 1;
 const TURN = 20;
 const NEARER = 1.1;
-/** What every picture of the endoscope may show; else the screen is blank. */
-const HIDDEN_STATES = ["no_tissue"];
 const ICONS = {
   live: "M12 4a8 8 0 1 0 .01 0z",
   behind: "M12 2 23 21H1z",

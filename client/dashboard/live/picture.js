@@ -39,10 +39,10 @@ export class LivePicture extends EventTarget {
     if (id !== null) this.#poll(id, this.visit);
   }
 
-  /** @param {boolean} mayShow false: what comes is not to be seen */
+  /** @param {boolean} mayShow false: what comes is not to be seen, and nothing is asked for */
   allow(mayShow) {
     this.mayShow = mayShow;
-    if (!mayShow && !this.isBlank) this.clear();
+    if (!mayShow) this.clear();
   }
 
   get ageS() {
@@ -54,7 +54,7 @@ export class LivePicture extends EventTarget {
       const began = performance.now();
       let pauseMs = PERIOD_MS;
       if (document.hidden) pauseMs = HIDDEN_MS;
-      else if (!(await this.#once(id, visit))) pauseMs = AFTER_TROUBLE_MS;
+      else if (this.mayShow && !(await this.#once(id, visit))) pauseMs = AFTER_TROUBLE_MS;
       await pause(Math.max(0, began + pauseMs - performance.now()));
     }
   }
