@@ -104,6 +104,24 @@ def test_a_feed_that_cannot_be_opened_says_why(site: Site, page: LivePage, tmp_p
     page.until_text("#open-message", say("problem.not_listed"))
 
 
+def test_pickers_of_files_speak_the_language_of_the_page(site: Site, page: LivePage, tmp_path: Path) -> None:
+    page.script("localStorage.setItem('intrasplat-language', 'de')")
+    file = tmp_path / "endoskop.json"
+    file.write_text("{}")
+    for path, form in (("live.html", "#open-feed"), ("", "#upload")):
+        page.driver.get("about:blank")
+        page.driver.get(f"{site.url}/{path}")
+        page.until(lambda: page.find("html").get_attribute("lang") == "de")
+        shown = f"return document.querySelector('{form} label:has([name=calibration]) .picked').textContent"
+        page.until(lambda shown=shown: page.script(shown) == say("form.pick", "de") + say("form.picked_none", "de"))  # type: ignore[misc]
+        page.find(f"{form} [name=calibration]").send_keys(str(file))
+        page.until(lambda shown=shown: page.script(shown) == say("form.pick", "de") + file.name)  # type: ignore[misc]
+        page.script(f"document.querySelector('{form}').reset()")
+        page.until(lambda shown=shown: page.script(shown).endswith(say("form.picked_none", "de")))  # type: ignore[misc]
+        own = f"return getComputedStyle(document.querySelector('{form} [name=calibration]')).color"
+        assert page.script(own) == "rgba(0, 0, 0, 0)"
+
+
 @pytest.mark.parametrize("url", GOOD_ADDRESSES)
 def test_the_service_takes_what_the_form_lets_pass(url: str) -> None:
     assert parsed(url).host

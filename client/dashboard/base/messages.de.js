@@ -763,6 +763,8 @@ export const DE = {
     "failed": "Ein Clip ist fehlgeschlagen"
   },
   "form": {
+    "pick": "Datei wählen",
+    "picked_none": "keine",
     "drop": "Legen Sie Dateien hier ab oder wählen Sie sie.",
     "clip": "Clip",
     "clip_note": "beide Augen oder das linke",

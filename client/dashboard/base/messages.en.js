@@ -763,6 +763,8 @@ export const EN = {
     "failed": "A clip failed"
   },
   "form": {
+    "pick": "Choose a file",
+    "picked_none": "none",
     "drop": "Drop files here, or choose them.",
     "clip": "Clip",
     "clip_note": "both eyes, or the left one",

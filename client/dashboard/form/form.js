@@ -3,6 +3,7 @@
 import { element } from "../base/element.js";
 import { keyEvents } from "../base/key.js";
 import { languageEvents, words } from "../base/messages.js";
+import { translatePickers } from "../base/pickers.js";
 import { showProblem } from "../base/problem.js";
 import { findingsOf, showFindings } from "./checks.js";
 import { carriedFrom, limit, nameChoices, OPTIONS, optionsOf } from "./options.js";
@@ -57,6 +58,7 @@ export class ClipForm {
     this.isAllowed = true;
     this.looks = 0; // counts checks: only the newest is shown
     limit(this.form);
+    this.showPickers = translatePickers(this.form);
     this.submit = this.form.querySelector("[type=submit]");
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -191,6 +193,7 @@ export class ClipForm {
       transfer.items.add(file);
       this.form.elements[part].files = transfer.files;
     }
+    this.showPickers();
     this.#look();
   }
 

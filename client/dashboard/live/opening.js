@@ -2,6 +2,7 @@
 
 import { setText } from "../base/element.js";
 import { languageEvents, words } from "../base/messages.js";
+import { translatePickers } from "../base/pickers.js";
 import { showProblem } from "../base/problem.js";
 import { listFeeds, openFeed } from "./feeds.js";
 import { showFeeds } from "./links.js";
@@ -30,6 +31,7 @@ export class Opening {
       this.#offer();
       if (!parts.section.hidden) this.#list();
     });
+    translatePickers(form);
     form.elements.from.value = "url";
     for (const each of form.querySelectorAll("[value=capture]")) each.disabled = !canCapture();
     parts.form.querySelector(".no-capture").hidden = canCapture();
