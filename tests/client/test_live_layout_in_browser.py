@@ -14,7 +14,7 @@ from tests.client.test_accessible_in_browser import axe as axe
 from tests.client.test_live_in_browser import DRAG_TAPE, watched
 from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
-from tests.client.test_theatre_in_browser import SIZES, screen_of
+from tests.client.test_theatre_in_browser import SIZES, box_of, screen_of
 from tests.client.words import LANGUAGES, say
 
 LIVE_SIZES = (*SIZES, (844, 390))
@@ -30,8 +30,9 @@ return Object.fromEntries(arguments[0].map((id) => [id, sizeOf(id)]));
 CUT_NOTES = """
 const notes = document.querySelector(".notes");
 const { bottom } = notes.getBoundingClientRect();
-return [...notes.children].filter((each) => each.checkVisibility() && each.textContent)
-  .filter((each) => each.getBoundingClientRect().bottom > bottom + 1).map(({ id }) => id);
+const isCut = (each) => each.getBoundingClientRect().bottom > bottom + 1 || each.scrollWidth > each.clientWidth;
+const said = [...notes.children].filter((each) => each.checkVisibility() && each.textContent);
+return said.filter(isCut).map(({ id }) => id);
 """
 """Notes beside the word that are not to be seen whole."""
 
@@ -57,6 +58,8 @@ def test_it_is_accessible_and_fits_in_every_state(
             layout[state] = page.script(LAYOUT, MIN_TOUCH_PX, MIN_LETTER_PX)
 
         judge("live")
+        assert box_of(page, ".below > a")[2] <= width
+        assert page.text(".below > a") == say("live.all_feeds", language)
         sizes = page.script(
             "return arguments[0].map((id) => document.getElementById(id).getBoundingClientRect().height)", ACTIONS
         )

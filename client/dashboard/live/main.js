@@ -352,7 +352,7 @@ const wide = matchMedia("(min-width: 1200px) and (min-height: 640px)");
 const openHealth = () => (get("health").open = wide.matches);
 wide.addEventListener("change", openHealth);
 openHealth();
-prepareLanguages([get("language")]);
+prepareLanguages(document.querySelectorAll("[data-language]"));
 languageEvents.addEventListener("changed", () => {
   get("trust").dataset.of = "";
   showTrust();
