@@ -89,6 +89,9 @@ def test_it_is_accessible_and_fits_in_every_state(
         page.until_text("#why", say("live.reason_silent", language)[:10])
         judge("lost")
         assert page.script(CUT_NOTES) == []
+        painter.reason = FeedReason.UNDECODABLE  # a longer word, and a longer reason
+        page.until_text("#word", say("live.word_unusable", language))
+        assert "kept" not in page.script(CUT_NOTES)
         painter.state, painter.reason = FeedState.NO_TISSUE, None
         page.until(lambda: page.state == "empty")
         judge("empty")

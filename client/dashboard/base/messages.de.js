@@ -663,7 +663,7 @@ export const DE = {
     "measure_asking": "Es wird gemessen.",
     "measured": "{mm} ± {sigma} mm",
     "keeping": "Die letzten Sekunden werden behalten.",
-    "kept": "behalten: {from} bis {to} ({s} s)",
+    "kept": "{s} s bis {to} behalten",
     "kept_open": "Öffnen",
     "kept_failed": "Nichts wurde behalten. {why}",
     "pause": "Pause",

@@ -663,7 +663,7 @@ export const EN = {
     "measure_asking": "Measuring.",
     "measured": "{mm} ± {sigma} mm",
     "keeping": "Keeping the last seconds.",
-    "kept": "kept {from} to {to} ({s} s)",
+    "kept": "kept {s} s until {to}",
     "kept_open": "Open it",
     "kept_failed": "Nothing was kept. {why}",
     "pause": "Pause",

@@ -85,13 +85,15 @@ export class Keeping {
     line.hidden = text === "";
     const link = line.querySelector("a") ?? element("a");
     if (!line.firstChild) {
-      line.append(link, " ", element("span"), " ", element("span"));
+      line.append(link, " ", element("span"), element("span", { class: "progress" }), " ", element("span"));
       line.lastChild.lang = "en";
     }
-    const [own, said] = line.querySelectorAll("span");
+    const [own, progress, said] = line.querySelectorAll("span");
+    const isOnItsWay = kept !== null && this.problem === null && failureOf(kept.job) === "";
     setText(own, text);
+    setText(progress, isOnItsWay ? ` · ${progressOf(kept.job, this.times)}` : "");
     setText(said, this.#refusal);
-    link.hidden = kept === null || kept.job.state === "failed";
+    link.hidden = !isOnItsWay;
     if (kept) link.href = `./#/scene/${kept.job.id}`;
     setText(link, words("live.kept_open"));
   }
@@ -107,8 +109,7 @@ export class Keeping {
     if (this.isCutting) return words("live.keeping");
     if (!this.kept) return "";
     const { fromS, toS, job } = this.kept;
-    const range = { from: clockTime(1000 * fromS), to: clockTime(1000 * toS), s: figure(toS - fromS) };
-    const how = failureOf(job) || progressOf(job, this.times);
-    return `${how} · ${words("live.kept", range)}`;
+    const part = words("live.kept", { s: figure(toS - fromS), to: clockTime(1000 * toS) });
+    return [failureOf(job), part].filter(Boolean).join(" · ");
   }
 }
