@@ -10,8 +10,6 @@ from typing import Any
 import pytest
 from selenium import webdriver
 
-from contract.wire.job import JobState
-from intrasplat.errors import InputError, LimitError
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.live.times import FeedTimeKind
 from tests.client.live_feed import PAST_S, READ_TIME, LivePage, LivePainter, live_painter, opened_feed
@@ -273,39 +271,6 @@ def test_points_are_chosen_by_keys_too(site: Site, page: LivePage, painter: Live
         page.script(on_stage, "ArrowRight")
     page.script(on_stage, "Enter")
     page.until_text("#measured", "±")
-
-
-def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: LivePage, painter: LivePainter) -> None:
-    watched(site, page, "liver")
-    page.click("#keep")
-    page.until_text("#kept", say("live.kept_open"))
-    (job,) = site.queue.records()
-    assert page.script("return document.querySelector('#kept a').hash") == f"#/scene/{job.job_id}"
-    asked = f"import('/base/api.js').then(({{ getJob }}) => getJob('{job.job_id}'))"
-    label = page.script(f"return {asked}.then(({{ label }}) => label)")
-    assert label.startswith("liver")
-    assert job.state is JobState.QUEUED
-    page.until_text("#kept", say("state.queued"))
-    claim = site.claim()
-    site.train(claim, 40, 28.0)
-    page.until_text("#kept", say("stage.train"))
-    site.finish(claim)
-    page.until_text("#kept", say("state.done"))
-
-
-@pytest.mark.parametrize("refusal", [InputError, LimitError])
-def test_a_part_that_is_refused_says_why_and_which_part_is_possible(
-    site: Site, page: LivePage, painter: LivePainter, refusal: type[InputError]
-) -> None:
-    watched(site, page)
-    why, remedy = "30 s have 1476 frames; a clip may have 1000.", "Ask for the last 20 s."
-    painter.refuses_cuts = refusal("from", why, remedy)
-    page.click("#keep")
-    page.until_text("#kept", f"{say('live.kept_failed', why='').strip()} {why} {remedy}")
-    painter.refuses_cuts = None
-    page.click("#keep")
-    page.until_text("#kept", say("live.kept_open"))
-    assert remedy not in page.text("#kept")
 
 
 def test_out_of_the_body_nothing_is_shown(site: Site, page: LivePage, painter: LivePainter) -> None:

@@ -1,6 +1,7 @@
-// "Keep last 30 s": a part of the recording becomes a clip, and a scene in the background. A line says how far it is.
+// "Keep last 30 s", or as many as a clip has frames for: a part of the recording becomes a clip, and a scene in the
+// background. A line says how far it is.
 
-import { getJob } from "../base/api.js";
+import { getInfo, getJob } from "../base/api.js";
 import { clockTime, element, setText } from "../base/element.js";
 import { figure, languageEvents, words } from "../base/messages.js";
 import { pause } from "../base/pause.js";
@@ -11,8 +12,17 @@ import { cutFeed } from "./feeds.js";
 
 export const KEPT_S = 30;
 const LOOK_MS = 1000;
+/** Of the frames that a clip may have: a part begins and ends at key frames, so it may be longer than asked for. */
+const FILLED = 0.9;
 
+const capitalised = (sentence) => sentence[0].toUpperCase() + sentence.slice(1);
 const isOver = ({ state }) => state !== "queued" && state !== "running";
+
+/** @param {import("./feeds.js").Feed} feed @returns {Promise<number>} s that a clip of it may last, by its frames */
+async function longestOf({ received_fps: fps }) {
+  const { limits } = await getInfo();
+  return limits.max_frames === null || fps <= 0 ? Infinity : (FILLED * limits.max_frames) / fps;
+}
 
 export class Keeping {
   /**
@@ -42,10 +52,11 @@ export class Keeping {
     if (this.isCutting) return;
     const visit = ++this.visit;
     const nowS = this.clock.nowS;
-    const lengthS = feed.begins_s === null ? KEPT_S : Math.min(KEPT_S, Math.max(1, nowS - feed.begins_s));
+    const pastS = feed.begins_s === null ? KEPT_S : Math.max(1, nowS - feed.begins_s);
     Object.assign(this, { isCutting: true, kept: null, problem: null });
     this.#say();
     try {
+      const lengthS = Math.min(KEPT_S, pastS, await longestOf(feed));
       const job = await cutFeed(feed.id, { from: -Number(lengthS.toFixed(1)), to: "live", label: this.#label(feed, nowS) });
       this.isCutting = false;
       if (visit !== this.visit) return;
@@ -101,7 +112,7 @@ export class Keeping {
   /** Why the service refuses a part, and which it would take: its own words, for only they say how long it may be. */
   get #refusal() {
     const { mayPass, document: { detail, remedy } = {} } = this.problem ?? {};
-    return mayPass ? "" : [detail, remedy].filter(Boolean).join(" ");
+    return mayPass ? "" : [detail, remedy].filter(Boolean).map(capitalised).join(" ");
   }
 
   #text() {
