@@ -128,6 +128,7 @@ class Decoding:
         self._policies: dict[int, LagPolicy] = {}
         self._arrivals: dict[int, dict[int, float]] = {}
         self._epoch = 0
+        self._place: Place | None = None
         self._source_s = first_s
         self._queue: deque[tuple[Arrived, Place] | None] = deque()
         self._queue_bytes = 0
@@ -172,8 +173,7 @@ class Decoding:
         try:
             while (item := self._next()) is not None:
                 self._take(*item)
-            for number in self._contexts:
-                self._decode(number, None, self._place)
+            self._drain()
         except SourceEnd as end:
             self._stop(end)
         except MemoryError:
@@ -227,13 +227,19 @@ class Decoding:
             return any(each and each[0].stream == number and each[0].packet.is_keyframe for each in self._queue)
 
     def _begin_epoch(self, place: Place) -> None:
+        self._drain()
         for number, context in self._contexts.items():
-            self._decode(number, None, self._place)
             context.flush_buffers()
             self._policies[number] = LagPolicy()
         self._arrivals.clear()
         self._matcher.clear()
         self._epoch = place.epoch
+
+    def _drain(self) -> None:
+        """Take the frames that the decoders still have."""
+        if self._place is not None:
+            for number in self._contexts:
+                self._decode(number, None, self._place)
 
     def _decode(self, number: int, packet: av.Packet[Any] | None, place: Place) -> None:
         try:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import os
 import shutil
@@ -27,6 +28,8 @@ from intrasplat.decode.guard import Allowance
 from intrasplat.intake.limits import MIN_SIDE_PX
 from intrasplat.live.connecting import Connection
 from intrasplat.live.state import FeedReason
+
+logger = logging.getLogger(__name__)
 
 PROGRAM = ("-m", "intrasplat.live.child")
 MEMORY_BYTES = 3 << 30  # address space of libraries, decoder and packets that wait
@@ -194,6 +197,8 @@ class ReadingProcess:
             raise ValueError("a line that is no object")
         if "received" in line:
             self._note(line)
+        if "fault" in line:
+            logger.error("the process that reads a source failed: %r", str(line["fault"])[:300])
         if "end" in line:
             self._end(FeedReason(line["end"]), str(line["text"])[:300])
         elif "pair" in line:

@@ -23,6 +23,7 @@ from intrasplat.live.state import FeedReason
 
 REPORT_PERIOD_S = 0.05
 FINISH_S = 2.0
+MAX_FAULT_CHARACTERS = 300
 MAX_LINE_BYTES = 4096  # written whole or not at all
 
 
@@ -55,10 +56,10 @@ class Answers:
             return True
 
     def fail(self, error: BaseException | None) -> NoReturn:
-        """End this process, because one of its threads failed."""
+        """End this process, because one of its threads failed. Where it failed is for the parent's log alone."""
         place = "".join(traceback.format_tb(None if error is None else error.__traceback__)[-1:]).strip()
-        text = f"the process that reads the source failed ({type(error).__name__}; {place})"
-        self.send({"end": FeedReason.DECODER_ENDED, "text": text[:300]}, last=True)
+        end = {"end": FeedReason.DECODER_ENDED, "text": "the process that reads the source failed"}
+        self.send(end | {"fault": f"{type(error).__name__}; {place}"[:MAX_FAULT_CHARACTERS]}, last=True)
         os._exit(1)
 
 

@@ -32,6 +32,16 @@ PROBE = {"probesize": str(1 << 20), "analyzeduration": "500000", "fpsprobesize":
 MAX_ERRORS = 100
 """This many damaged packets in a row end the connection."""
 MAX_STREAMS = 2
+NOT_OPENED: dict[type[Exception], str] = {
+    av.error.HTTPUnauthorizedError: ": the server asks for another user and password",
+    av.error.HTTPForbiddenError: ": the server forbids it",
+    av.error.HTTPNotFoundError: ": the server has no such stream",
+    av.error.InvalidDataError: ": its beginning cannot be read",
+    PermissionError: ": access is denied",
+    FileNotFoundError: ": it is not there",
+}
+"""What is said of errors of opening; their own text is not for whoever looks at the feed."""
+NOT_FRAGMENTED = "the mp4 is not fragmented, and its index comes last; send it with -movflags frag_keyframe+empty_moov"
 
 
 class SourceEnd(Exception):
@@ -153,7 +163,8 @@ class PacketSource:
         except (av.error.FFmpegError, OSError, ValueError) as error:
             if isinstance(error, (EOFError, ConnectionError)):
                 raise SourceEnd(FeedReason.CLOSED, "the source closed the connection before a picture came") from error
-            text = f"the source cannot be opened ({getattr(error, 'strerror', None) or type(error).__name__})"
+            why = next((text for kind, text in NOT_OPENED.items() if isinstance(error, kind)), "")
+            text = f"the source cannot be opened{why}"
             is_network = isinstance(error, av.error.HTTPError | av.error.TimeoutError) or "rtsp" in self._request
             raise SourceEnd(FeedReason.REFUSED if is_network else FeedReason.UNDECODABLE, text) from error
 
@@ -167,13 +178,13 @@ class PacketSource:
 
     def _demuxed(self, container: av.container.InputContainer) -> Iterator[Arrived]:
         numbers = {stream.index: number for number, stream in enumerate(self.streams)}
-        errors, started_at = 0, time.time()
+        errors, is_empty, started_at = 0, True, time.time()
         while True:
             try:
                 for packet in container.demux(self.streams):
                     if not packet.size:
                         continue
-                    errors = 0
+                    errors, is_empty = 0, False
                     arrived_at = time.time() if self._bytes is None else self._bytes.arrived_at
                     number = numbers[packet.stream.index]
                     if packet.pts is None:
@@ -184,6 +195,8 @@ class PacketSource:
                 return
             except av.error.InvalidDataError:
                 errors += 1
+                if is_empty and self._bytes is not None and any(stream.frames for stream in self.streams):
+                    raise SourceEnd(FeedReason.UNDECODABLE, NOT_FRAGMENTED) from None
                 if errors > MAX_ERRORS:
                     raise SourceEnd(FeedReason.UNDECODABLE, "the source sends no video") from None
             except (av.error.FFmpegError, OSError, HTTPException):
@@ -229,7 +242,7 @@ def _answer(connected: int, http: dict[str, Any]) -> HTTPResponse:
         response = HTTPResponse(link, method="GET")
         response.begin()
     except (OSError, HTTPException, ValueError) as error:
-        raise SourceEnd(FeedReason.REFUSED, f"the server does not speak HTTP ({type(error).__name__})") from error
+        raise SourceEnd(FeedReason.REFUSED, "the server does not speak HTTP") from error
     if 300 <= response.status < 400:
         raise SourceEnd(FeedReason.REDIRECTED, "the server redirects to another place, which is not followed")
     if response.status != 200:

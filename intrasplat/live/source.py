@@ -217,9 +217,9 @@ class Source:
     def _run(self) -> None:
         try:
             self._read()
-        except Exception as error:
+        except Exception:
             logger.exception("a live source failed")
-            self._set(FeedState.ENDED, FeedReason.FAULT, f"a fault of the program ({type(error).__name__})")
+            self._set(FeedState.ENDED, FeedReason.FAULT, "a fault of the program")
         self._wait(lambda: False, None)  # what is recorded still grows old
 
     def _read(self) -> None:

@@ -284,6 +284,33 @@ def test_without_a_sender_a_push_waits_for_nothing(opened: Open) -> None:
         assert source.status.reason is not None
 
 
+def test_a_push_of_an_mp4_whose_index_comes_last_is_named(opened: Open) -> None:
+    source, stream = opened(), Stream("mov", crf="0")
+    for index in range(120):  # more than FFmpeg's buffer, in which it may go back
+        stream.frame(picture(index))
+    stream.end()
+    source.write(stream._buffer.getvalue())
+    source.end_push()
+    until_state(source, FeedState.STALLED, FeedReason.UNDECODABLE)
+    assert "fragmented" in source.status.text
+
+
+def test_where_a_process_failed_is_for_the_log_alone(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, opened: Open,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    script = tmp_path / "failing.py"
+    script.write_text(
+        "import os\nfrom intrasplat.live import child, reader\n"
+        "def failing(self): raise RuntimeError('secret')\nreader.Reader.run = failing\nchild.main()\n"
+    )
+    monkeypatch.setattr(process, "PROGRAM", ("-P", str(script)))
+    source = opened(str(video_file(tmp_path / "clip.mkv", 2)))
+    until_state(source, FeedState.STALLED, FeedReason.DECODER_ENDED)
+    assert source.status.text == "the process that reads the source failed"
+    assert "failing.py" in caplog.text
+
+
 def test_a_process_that_hangs_is_replaced(opened: Open) -> None:
     with tcp_server(send_stream) as url:
         source = opened(url)
