@@ -13,12 +13,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 from contract.runtime.supervised import ProcessEnd, Supervised, cause_of
 from contract.wire.job import JobProgress
 from intrasplat.machine.hooks import ignore
+from intrasplat.machine.processes import starved_s
 from worker.hang import HangDetector
 from worker.order_writer import OrderWriter
 from worker.orders import (
@@ -124,7 +126,7 @@ def watch(
     stop: when it returns True, the child is ordered to stop, and killed if it needs more than MAX_STOP_S for that.
     on_progress: receives the child's progress.
     """
-    detector, asked_s = HangDetector(), None
+    detector, asked_s = HangDetector(starved_s=partial(starved_s, child.process.pid)), None
     while True:
         report = child.next_report(LOOK_PERIOD_S)
         if isinstance(report, Ended):

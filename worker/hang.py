@@ -1,4 +1,7 @@
-"""Decide when a job hangs: each stage has a limit for the time between two advances."""
+"""Decide when a job hangs: each stage has a limit for the time between two advances.
+
+Time in which the job could have run but had no core does not count, up to STARVED_FACTOR times the limit in all.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from contract.wire.job import JobProgress
+from intrasplat.machine.processes import STARVED_FACTOR
 
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
@@ -33,11 +37,19 @@ MAX_LOOK_S = 1.0
 """Most time between two calls of is_hung() that counts: a suspended supervisor reads no reports."""
 
 
+MEASURED_AFTER_S = 1.0
+"""Silence after which it counts how long the job has no core."""
+
+
 class HangDetector:
     """Watches the reports of one job. Call is_hung() often."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, starved_s: Callable[[], float] = lambda: 0.0
+    ) -> None:
+        """starved_s: as of intrasplat/machine/processes.py, of the job's process."""
+        self._clock, self._starved_s = clock, starved_s
+        self._starved_before_s: float | None = None
         self._place: tuple[str, float, int] = ("", 0.0, 0)
         self._looked_s = clock()
         self._silence_s = 0.0
@@ -51,11 +63,18 @@ class HangDetector:
         """Take a report. It counts as an advance unless it repeats the last one's stage, fraction and iteration."""
         place = (progress.stage, progress.fraction, progress.iteration)
         if place != self._place:
-            self._place, self._silence_s = place, 0.0
+            self._place, self._silence_s, self._starved_before_s = place, 0.0, None
 
     def is_hung(self) -> bool:
         """Whether the job has not advanced for longer than its stage allows."""
         now_s = self._clock()
         self._silence_s += min(MAX_LOOK_S, now_s - self._looked_s)
         self._looked_s = now_s
-        return self._silence_s > STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)
+        if self._starved_before_s is None and self._silence_s > MEASURED_AFTER_S:
+            self._starved_before_s = self._starved_s()
+        limit_s = STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)
+        if self._silence_s <= limit_s:
+            return False
+        before_s = self._starved_before_s
+        starved_s = 0.0 if before_s is None else max(0.0, self._starved_s() - before_s)
+        return self._silence_s > min(limit_s + starved_s, STARVED_FACTOR * limit_s)

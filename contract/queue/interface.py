@@ -301,7 +301,7 @@ def worker_died() -> JobError:
     return JobError(
         code=ErrorCode.ATTEMPTS_EXHAUSTED,
         problem=problem,
-        remedy="Try a shorter or smaller clip, and look at the worker's log.",
+        remedy="Look at the worker's log. If memory ran out, try a shorter or smaller clip.",
     )
 
 

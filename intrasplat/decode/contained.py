@@ -24,6 +24,7 @@ from intrasplat.decode.guard import Allowance
 from intrasplat.errors import Cancelled, ErrorCode, InputError, LimitError, UnavailableError
 from intrasplat.files.disk import Disk
 from intrasplat.files.disk_errors import StoreFullError
+from intrasplat.machine.processes import STARVED_FACTOR, starved_s
 
 MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
 MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
@@ -48,7 +49,10 @@ OnReport = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Patience:
-    """Time limits of the process in seconds: without another picture, in total, and from its answer to its exit."""
+    """Time limits of the process in seconds: without another picture, in total, and from its answer to its exit.
+
+    Time in which it had no core does not count as silence, up to STARVED_FACTOR times the limit.
+    """
 
     max_silence_s: float = MAX_SILENCE_S
     max_total_s: float = MAX_TOTAL_S
@@ -113,7 +117,7 @@ class Decoder:
             patience,
         )
         self._field, self._pictures = "clip", -1
-        self._advanced_s = time.monotonic()
+        self._advance()
         self._end_s = self._advanced_s + patience.max_total_s
         self._lines = lines_of(self._process)
         assert self._process.stdin is not None
@@ -169,10 +173,22 @@ class Decoder:
     def _note(self, message: dict[str, Any]) -> None:
         self._field = "calibration" if message.get("field") == "calibration" else "clip"
         if int(message["pictures"]) > self._pictures:
-            self._pictures, self._advanced_s = int(message["pictures"]), time.monotonic()
+            self._pictures = int(message["pictures"])
+            self._advance()
         self.frames = max(self.frames, int(message["frames"]))
         if self.opened is None:
             self._on_report(min(1.0, max(0.0, float(message["share"]))))
+
+    def _advance(self) -> None:
+        self._advanced_s, self._starved_s = time.monotonic(), starved_s(self._process.pid)
+
+    def _is_silent(self, now_s: float) -> bool:
+        """Whether no picture came for too long; time in which the process had no core does not count."""
+        silence_s, limit_s = now_s - self._advanced_s, self._patience.max_silence_s
+        if silence_s <= limit_s:
+            return False
+        without_core_s = max(0.0, starved_s(self._process.pid) - self._starved_s)
+        return silence_s > min(limit_s + without_core_s, STARVED_FACTOR * limit_s)
 
     def _check(self) -> None:
         if self.result is not None:
@@ -180,7 +196,7 @@ class Decoder:
         if self._should_stop():
             raise Cancelled("Stopped during stage 'decode'.")
         now_s = time.monotonic()
-        if now_s - self._advanced_s > self._patience.max_silence_s:
+        if self._is_silent(now_s):
             raise _undecodable(self._field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
         if now_s > self._end_s:
             raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")

@@ -1,4 +1,4 @@
-"""Ends this process on a signal, or together with its parent."""
+"""Ends this process on a signal, or together with its parent; niceness of other processes, and how they starve."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from pathlib import Path
 
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
+STARVED_FACTOR = 10.0
+"""A time limit for a process may become so many times as long while it has no core. Its own threads may compete: even a
+process that never ends may seem to starve."""
 
 
 def shutdown_event() -> threading.Event:
@@ -55,12 +58,29 @@ def die_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+def starved_s(process_id: int) -> float:
+    """Seconds, in all, in which threads of a process and of its children could have run but had no core; 0 where the
+    system does not say. It falls when a thread ends."""
+    nanoseconds, waiting = 0, [process_id]
+    while waiting:
+        for thread in _threads(waiting.pop()):
+            with contextlib.suppress(OSError, ValueError, IndexError):  # it has ended, or the kernel counts nothing
+                nanoseconds += int((thread / "schedstat").read_text().split()[1])
+                waiting += map(int, (thread / "children").read_text().split())
+    return nanoseconds / 1e9
+
+
+def _threads(process_id: int) -> list[Path]:
+    """The folders of a process's threads; none if it has ended, or where the system has none."""
+    with contextlib.suppress(OSError):
+        return list(Path(f"/proc/{process_id}/task").iterdir())
+    return []
+
+
 def set_niceness(process_id: int, niceness: int) -> None:
     """Let a process, all its threads and later children run at a niceness in [0, 19], as far as the system allows:
     without privileges none becomes less nice again."""
-    tasks = Path(f"/proc/{process_id}/task")
-    threads = [int(each.name) for each in tasks.iterdir()] if tasks.is_dir() else [process_id]
-    for thread in threads:
+    for thread in [int(each.name) for each in _threads(process_id)] or [process_id]:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, thread, niceness)
     # Linux may compare whole sessions. A supervised process has one of its own.

@@ -8,6 +8,7 @@ import pytest
 
 from contract.wire.job import JobProgress
 from intrasplat.machine.hooks import Hooks, Progress
+from intrasplat.machine.processes import STARVED_FACTOR
 from intrasplat.machine.timing import Timings
 from intrasplat.options import ReconstructionOptions
 from intrasplat.pipeline import reconstruct
@@ -76,6 +77,14 @@ def test_time_in_which_the_supervisor_itself_was_stopped_is_not_held_against_the
     clock.now_s += 3600
     assert not detector.is_hung()
     assert clock.pass_by(detector, STAGE_LIMITS_S["train"] - MAX_LOOK_S + 1)
+
+
+def test_a_job_without_a_core_starves_and_does_not_hang_for_ten_times_the_limit() -> None:
+    clock, limit_s = Clock(), STAGE_LIMITS_S["stereo"]
+    detector = HangDetector(clock, lambda: 0.95 * clock.now_s)
+    detector.observe(JobProgress(stage="stereo", fraction=0.5))
+    assert not clock.pass_by(detector, STARVED_FACTOR * limit_s - 1)
+    assert clock.pass_by(detector, 2)
 
 
 def test_progress_holds_only_numbers_that_json_can() -> None:

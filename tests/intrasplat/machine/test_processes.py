@@ -6,11 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from intrasplat.machine.processes import heeding_signals, set_niceness
+from intrasplat.machine.processes import heeding_signals, set_niceness, starved_s
 
 PROGRAM = """
 import os, signal, sys, time
@@ -48,3 +49,27 @@ def test_a_process_and_its_session_become_nicer() -> None:
         assert not group.exists() or group.read_text().split()[-1] == str(niceness)
         process.kill()
     set_niceness(process.pid, niceness)  # it is gone
+
+
+STARVING = """
+import os, time
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+while os.fork() and os.fork():
+    time.sleep(60)
+while time.process_time() < 10:
+    pass
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not count it")
+def test_children_that_share_a_core_starve() -> None:
+    assert starved_s(os.getpid()) >= 0
+    with subprocess.Popen([sys.executable, "-c", STARVING], start_new_session=True) as process:
+        try:
+            deadline_s = time.monotonic() + 30
+            while starved_s(process.pid) < 0.3:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.05)
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert starved_s(process.pid) == 0  # it is gone
