@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
 from intrasplat.camera import Intrinsics
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, IntrasplatError, UnavailableError
 from intrasplat.intake.calibration.text import checked_calibration
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.looking import FeedMoment
-from intrasplat.live.spec import FeedLayout, RecordingSpec, SourceSpec
-from intrasplat.live.state import LiveReport
+from intrasplat.live.spec import FIELD, FeedLayout, RecordingSpec, SourceSpec
+from intrasplat.live.state import FeedReason, FeedState, LiveReport
 from intrasplat.live.times import FeedTime
 from intrasplat.names import DeviceName
 from intrasplat.reconstruction import AnyPose, lens_of, world_from_camera_of
@@ -28,6 +30,14 @@ from intrasplat.view.render import render_frame
 
 RECORDING, SEGMENTS = "recording", "segments"
 """Folders in `out`."""
+CALIBRATION = "calibration"
+POLL_S = 0.1
+OF_THE_INPUT = (
+    FeedReason.UNDECODABLE, FeedReason.NO_VIDEO, FeedReason.SIZE_CHANGED, FeedReason.PACKING_CHANGED,
+    FeedReason.PACKING_UNKNOWN, FeedReason.PICTURE_LIMIT, FeedReason.REDIRECTED, FeedReason.HOST_REFUSED,
+    FeedReason.NO_SCENE, FeedReason.END_OF_FILE,
+)  # fmt: skip
+"""Reasons for which a source cannot be used as it is. For others it may come back by itself."""
 
 
 class LiveScene:
@@ -52,14 +62,23 @@ class LiveScene:
         return self.feed.report()
 
     def wait(self, timeout_s: float = 10.0) -> bool:
-        """Wait until there is something to show. False: not in time; report() says why."""
-        return self.feed.wait_for_newer(float("-inf"), timeout_s) is not None
+        """Wait until there is something to show. False: not in time, or the source ended without a pair; report() says
+        why."""
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            if self.feed.wait_for_newer(float("-inf"), min(left_s, POLL_S)) is not None:
+                return True
+            report = self.report()
+            if report.state is FeedState.ENDED and report.segment is None:
+                return False
+        return False
 
     def moment(self, t: str | float = "live") -> FeedMoment:
         """The moment of a time, with its age and source time; raises as view()."""
-        found = self.feed.moment(FeedTime.parse(t))
+        found = self.feed.moment(FeedTime.parse(t if isinstance(t, str | Real) else repr(t)))
         if found is None:
-            raise InputError("t", "nothing is known yet.", "Wait until wait() answers True.")
+            why = why_unknown(self.report())
+            raise why or InputError("t", "nothing is known yet.", "Wait until wait() answers True.")
         return found
 
     def view(
@@ -80,7 +99,9 @@ class LiveScene:
             pose, width, height, intrinsics, detail: as for Scene.render.
 
         Raises:
-            InputError: the time lies before the stored past, nothing is known yet, or the pose or size cannot be used.
+            InputError: the time lies before the stored past, nothing is known yet, or the pose or size cannot be used;
+                or the source or its calibration cannot, so that nothing is known.
+            UnavailableError: nothing is known because nothing came from the source.
         """
         found = self.moment(t)
         scene, pose_mm = found.scene, world_from_camera_of(found.scene, pose)
@@ -94,9 +115,12 @@ class LiveScene:
         It begins and ends at key frames near these times; the last seconds may be missing (docs/live.md).
 
         Raises:
-            InputError: nothing of this range is recorded; `follow` records if it has `out`.
+            InputError: nothing of this range is recorded (`follow` records if it has `out`), or the path is unusable.
         """
-        return self.feed.cut(from_s, to_s, Path(path))
+        try:
+            return self.feed.cut(from_s, to_s, Path(path))
+        except OSError as error:
+            raise InputError("path", f"{path} cannot be written ({error.strerror}).", "Name another file.") from error
 
     def pause(self) -> None:
         """Read, learn and store nothing from now on."""
@@ -109,6 +133,18 @@ class LiveScene:
     def close(self) -> None:
         """End it. What is in `out` stays."""
         self.feed.close()
+
+
+def why_unknown(report: LiveReport) -> IntrasplatError | None:
+    """Why nothing is known of a feed of which nothing is known; None: only because it has just begun, or was closed."""
+    if report.reason is None or report.reason is FeedReason.BY_HAND:
+        return None
+    if report.reason is FeedReason.CALIBRATION:
+        return InputError(CALIBRATION, report.text.removeprefix(f"{CALIBRATION}: "), "Give this source's calibration.")
+    if report.reason in OF_THE_INPUT:
+        return InputError(FIELD, f"nothing can be learnt from it: {report.text}.", "Give a stereo source.")
+    problem = f"Nothing came from the source: {report.text}."
+    return UnavailableError(problem, "Start it, or name another one.", may_return=True)
 
 
 def follow(
@@ -162,5 +198,5 @@ def _calibration(given: FilePath | Mapping[str, Any]) -> StereoCalibration | Pat
     if isinstance(given, Mapping):
         return checked_calibration(dict(given))
     if not Path(given).is_file():
-        raise InputError("calibration", f"there is no {os.fspath(given)!r}.", "Name a file that is there.")
+        raise InputError(CALIBRATION, f"there is no {os.fspath(given)!r}.", "Name a file that is there.")
     return Path(given)

@@ -11,7 +11,7 @@ import pytest
 import intrasplat as isp
 from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
-from intrasplat.errors import InputError
+from intrasplat.errors import InputError, UnavailableError
 from tests.live.conftest import until
 from tests.live.senders import PhantomSender
 
@@ -31,6 +31,8 @@ def test_a_followed_source_is_shown_and_cut(sender: PhantomSender, tmp_path: Pat
         live.pause()
         cut = live.cut(0.5, 2.5, tmp_path / "cut.mp4")
         assert cut.frames > 30
+        with pytest.raises(InputError, match="cannot be written"):
+            live.cut(0.5, 2.5, tmp_path / "none" / "cut.mp4")
         with pytest.raises(InputError, match="before the past"):
             live.view(-1000.0)
     again = isp.follow(sender.url, calibration, out=tmp_path, width=128, layout="sbs", device="cpu")
@@ -52,6 +54,21 @@ def test_the_command_prints_reports_and_writes_a_cut(
     assert reports[-1]["model"]["width"] == 128
     assert (tmp_path / "feed" / "cut.mp4").stat().st_size > 1000
     assert any((tmp_path / "feed" / "segments").iterdir())
+
+
+def test_a_source_of_which_nothing_is_known_says_why(sender: PhantomSender, tmp_path: Path) -> None:
+    calibration, text = sender.calibration.model_dump(exclude={"assumptions"}), tmp_path / "text.mp4"
+    text.write_text("this is no video\n" * 100)
+    with isp.follow(str(text), calibration, out=tmp_path / "out", device="cpu") as live:
+        assert not live.wait(3600.0)
+        with pytest.raises(InputError, match="neither an MPEG transport stream"):
+            live.view()
+        with pytest.raises(InputError, match="is no time"):
+            live.moment(None)  # type: ignore[arg-type]
+    with isp.follow("tcp://127.0.0.1:9", calibration, device="cpu") as live:
+        until(lambda: live.report().reason, live.report)
+        with pytest.raises(UnavailableError, match="does not answer"):
+            live.view()
 
 
 def test_a_source_or_a_calibration_that_is_missing_is_named(tmp_path: Path) -> None:
