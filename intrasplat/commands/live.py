@@ -52,8 +52,8 @@ def run_cli(options: argparse.Namespace) -> int:
     """Follow until SIGINT, SIGTERM, the source's end or --seconds, and return the exit code.
 
     Raises:
-        InputError: the source, the calibration or an option cannot be used.
-        UnavailableError: the device is missing.
+        InputError: the source, the calibration or an option cannot be used, or nothing is recorded for the cut.
+        UnavailableError: the device is missing, or nothing came from the source.
     """
     if options.cut and options.out is None:
         raise InputError("--cut", "nothing is recorded.", "Name a folder with --out.")
@@ -66,24 +66,35 @@ def run_cli(options: argparse.Namespace) -> int:
             options.source, options.calibration, out=options.out, layout=options.layout, width=options.width,
             keep_s=options.keep, camera=options.camera, device=options.device,
         ) as live:  # fmt: skip
-            _print_reports(live, ended, options.seconds, is_json=options.json)
-            if options.cut:
+            trouble = _print_reports(live, ended, options.seconds, is_json=options.json)
+            if options.cut and (trouble is None or live.feed.recorded()):
                 _cut(live, options.cut, options.out / CUT)
+            if trouble is not None:
+                raise trouble
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     return ExitCode.OK
 
 
-def _print_reports(live: LiveScene, ended: threading.Event, seconds: float | None, *, is_json: bool) -> None:
-    from intrasplat.live.state import FeedState
+def _print_reports(
+    live: LiveScene, ended: threading.Event, seconds: float | None, *, is_json: bool
+) -> IntrasplatError | None:
+    """Print until the end. Returns why nothing was learnt; None: something was, or it has just begun."""
+    from intrasplat.live.followed import why_unknown
+    from intrasplat.live.state import FeedReason, FeedState
 
     passed_s, report = 0.0, live.report()
+    trouble, has_learnt = why_unknown(report), report.model is not None
     while not ended.wait(PERIOD_S) and (seconds is None or passed_s < seconds):
         passed_s, report = passed_s + PERIOD_S, live.report()
         print(json.dumps(asdict(report)) if is_json else line_of(report), flush=True)
+        if trouble is None or report.reason is not FeedReason.END_OF_FILE:  # the end hides why nothing was learnt
+            trouble = why_unknown(report)
+        has_learnt = has_learnt or report.model is not None
         if report.state is FeedState.ENDED:
             break
+    return None if has_learnt else trouble
 
 
 def line_of(report: LiveReport) -> str:
@@ -105,12 +116,9 @@ def line_of(report: LiveReport) -> str:
 
 
 def _cut(live: LiveScene, seconds: float, path: Path) -> None:
-    """Write the last seconds as a clip; say on stderr if that fails."""
+    """Write the last seconds as a clip."""
     past = live.report().past
     ends_s = 0.0 if past is None else past.ends_s
     live.pause()  # it completes the part that is being written
-    try:
-        cut = live.cut(ends_s - seconds, ends_s, path)
-        print(f"{cut.path}: {cut.frames} frames, {cut.from_s:.1f} to {cut.to_s:.1f} s of the source", file=sys.stderr)
-    except IntrasplatError as error:
-        print(f"intrasplat: {error}", file=sys.stderr)
+    cut = live.cut(ends_s - seconds, ends_s, path)
+    print(f"{cut.path}: {cut.frames} frames, {cut.from_s:.1f} to {cut.to_s:.1f} s of the source", file=sys.stderr)

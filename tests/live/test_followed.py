@@ -56,6 +56,32 @@ def test_the_command_prints_reports_and_writes_a_cut(
     assert any((tmp_path / "feed" / "segments").iterdir())
 
 
+def test_what_cannot_be_read_has_its_exit_code(
+    sender: PhantomSender, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration, text = tmp_path / "calibration.json", tmp_path / "text.mp4"
+    text.write_text("this is no video\n" * 100)
+    calibration.write_text(sender.calibration.model_dump_json(exclude={"assumptions"}))
+    for source, code, why in (
+        (str(text), ExitCode.BAD_INPUT, "neither an MPEG transport stream"),
+        ("tcp://127.0.0.1:9", ExitCode.UNAVAILABLE, "does not answer"),
+    ):
+        asked = ["live", source, "--calibration", str(calibration), "--seconds", "2", "--device", "cpu"]
+        assert main(asked) == code
+        assert why in capsys.readouterr().err
+
+
+def test_a_calibration_of_another_size_has_its_exit_code(
+    sender: PhantomSender, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = tmp_path / "calibration.json"
+    other = sender.calibration.model_copy(update={"width": 640, "height": 240})
+    calibration.write_text(other.model_dump_json(exclude={"assumptions"}))
+    asked = ["live", sender.url, "--calibration", str(calibration), "--layout", "sbs", "--seconds", "4"]
+    assert main([*asked, "--device", "cpu"]) == ExitCode.BAD_INPUT
+    assert "calibration: " in capsys.readouterr().err
+
+
 def test_a_source_of_which_nothing_is_known_says_why(sender: PhantomSender, tmp_path: Path) -> None:
     calibration, text = sender.calibration.model_dump(exclude={"assumptions"}), tmp_path / "text.mp4"
     text.write_text("this is no video\n" * 100)
