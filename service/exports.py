@@ -18,7 +18,9 @@ from starlette.responses import StreamingResponse
 
 from contract.access.audit import AuditAction
 from contract.access.keys import KeyScope
+from contract.store.shelf import is_job_id
 from contract.wire.exports import ExportOffer
+from contract.wire.job import JobRecord
 from contract.wire.rendering import CutRequest, ExportRequest
 from intrasplat.errors import UnavailableError
 from intrasplat.formats import EXPORT_FORMATS, ExportOptions, VideoView, check_export, requirement
@@ -29,6 +31,7 @@ from service.connection import Answer
 from service.deps import AnyCaller, Deps, Services
 from service.filenames import attachment
 from service.moments import AskedTime, feed_time, scene_time
+from service.problems import Problem
 from service.renders import image_response, problem_of_reply
 from service.scenes import file_stem, find_finished, finished_job
 from service.shown import Shown
@@ -147,7 +150,7 @@ def _request_of(shown: Shown, query: ExportQuery) -> ExportRequest:
 async def _stored(scene_id: str, name: str, options: ExportOptions, services: Deps, caller: Caller) -> Response:
     """The stored file of a format that needs no worker."""
     caller.require(KeyScope.DOWNLOAD)
-    record = await run_in_threadpool(finished_job, services, caller, scene_id)
+    record = await run_in_threadpool(_stored_job, services, caller, scene_id, name)
     folder = await run_in_threadpool(services.store.scene_folder, scene_id, record.attempt)
     dashboard, label = services.settings.dashboard_dir, record.labels.label
     parts = await run_in_threadpool(stored_parts, name, folder, scene_id, dashboard, label, options.recorded)
@@ -155,6 +158,18 @@ async def _stored(scene_id: str, name: str, options: ExportOptions, services: De
     file_name = file_stem(record) + EXPORT_FORMATS[name].suffix
     headers = {"Content-Disposition": attachment(file_name), "Cache-Control": "no-store"}
     return StreamingResponse(parts, media_type=EXPORT_FORMATS[name].media_type, headers=headers)
+
+
+def _stored_job(services: Deps, caller: Caller, scene_id: str, name: str) -> JobRecord:
+    """As finished_job(); a live feed is named as what it is."""
+    try:
+        return finished_job(services, caller, scene_id)
+    except Problem:
+        feed = services.feeds.record(scene_id) if is_job_id(scene_id) else None
+        if feed is None or not caller.owns(feed):
+            raise
+    remedy = f"GET /scenes/{scene_id}/exports lists the formats; POST /feeds/{scene_id}/cut makes a scene of a part."
+    raise Problem(404, f"A live feed has no export as {name}.", field="scene", remedy=remedy)
 
 
 async def _parts(services: Deps, request: ExportRequest, answer: Answer, part: int) -> AsyncIterator[bytes]:

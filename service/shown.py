@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,9 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.store.shelf import is_job_id
+from contract.wire.feeds import FeedView
 from contract.wire.job import JobState
+from intrasplat.live.state import FeedState
 from service.access import AccessRefusal, Caller
 from service.deps import Deps, no_such_scene, owned_scene
 from service.filenames import stem_of
@@ -27,13 +30,20 @@ class Shown:
 
     scene_id: str
     attempt: int | None
-    is_feed: bool = False
+    feed_state: FeedState | None = None
     stem: str = ""
     """Of the names of files that are made of it."""
 
     @property
-    def state(self) -> JobState:
-        """Of a scene or job."""
+    def is_feed(self) -> bool:
+        """Whether it is a live feed."""
+        return self.feed_state is not None
+
+    @property
+    def state(self) -> JobState | FeedState:
+        """Of the scene, the job, or the feed."""
+        if self.feed_state is not None:
+            return self.feed_state
         return JobState.RUNNING if self.attempt is None else JobState.DONE
 
     def time_fields(self, asked: float | str | None) -> dict[str, Any]:
@@ -100,7 +110,7 @@ def scene_or_feed(
     if record is None or not caller.owns(record):
         raise no_such_scene(scene, caller, record)
     stem = stem_of(record.options.label, record.created_at_s, scene)
-    return Shown(scene, None, is_feed=True, stem=stem)
+    return Shown(scene, None, FeedView.of(record, time.time()).state, stem)
 
 
 def _only(services: Deps, caller: Caller) -> Shown:

@@ -169,7 +169,7 @@ class _Viewer:
         """Send that the scene is there. Raises Problem: it is not, or the caller may not see it."""
         caller = self._entrance.caller()
         self._services.limiter.admit(caller.key_id or caller.address)
-        shown = await find_shown(self._services, caller, message.scene)
+        shown = await find_shown(self._services, caller, message.scene, with_feeds=True)
         await self._entrance.send(json.dumps({"id": message.id, "state": shown.state}))
 
     async def _view(self, message: StreamMessage, newer_than_s: float | None = None) -> tuple[Shown, Answer]:

@@ -308,6 +308,16 @@ def test_following_outlives_the_feeds_process_and_ends_with_the_feed(
             assert problem(viewer)["status"] in (404, 503)
 
 
+def test_that_a_feed_is_there_is_confirmed_without_a_view(service: LiveService, worker: FeedWorker) -> None:
+    feed_id = opened(service)
+    with connected(service, "/stream") as viewer:
+        ask(viewer, scene=feed_id, confirm=True, id=3)
+        answer = json.loads(viewer.recv(timeout=TIMEOUT_S))
+    assert answer["id"] == 3
+    assert answer["state"] in set(FeedState)
+    assert worker.asked == []
+
+
 def test_a_scene_and_the_past_cannot_be_followed(service: LiveService, worker: FeedWorker) -> None:
     scene, feed_id = service.finished_scene(), opened(service)
     with connected(service, "/stream") as viewer:

@@ -329,7 +329,9 @@ def test_a_feed_is_no_scene_of_the_lists_and_no_trainer(service: ServiceUnderTes
     feed_id = followed(service)
     assert service.http.get("/scenes").json() == []
     assert_problem(service.http.get(f"/scenes/{feed_id}"), 404, "scene")
-    assert_problem(service.http.get(f"/scenes/{feed_id}/export", params={"format": "scene"}), 404, "scene")
+    for stored in ("scene", "html"):
+        answer = service.http.get(f"/scenes/{feed_id}/export", params={"format": stored})
+        assert "A live feed has no export" in assert_problem(answer, 404, "scene")["detail"]
     assert_problem(service.http.get(f"/scenes/{feed_id}/cameras"), 404, "scene")
     assert service.http.get("/readyz").json()["workers"] == ["worker-1"]
     service.queue.withdraw("worker-1")
