@@ -184,8 +184,8 @@ class Settings(BaseModel):
         for host in hosts:
             try:
                 is_host = parsed(host).host != ""
-            except InputError:
-                is_host = False
+            except InputError as error:
+                raise ValueError(error.problem.rstrip(".")) from None
             if not is_host:
                 raise ValueError(f"{host!r} is not SCHEME://HOST or SCHEME://HOST:PORT")
         return hosts

@@ -204,7 +204,9 @@ def parsed(url: str) -> Target:
     except ValueError:
         raise InputError(FIELD, f"{without_user(url)[:80]!r} is no source.", _REMEDY) from None
     if not parts.hostname or port is None or parts.fragment:
-        raise InputError(FIELD, f"{without_user(url)[:80]!r} names no host, no port, or a fragment.", _REMEDY)
+        lacks = "names no host" if not parts.hostname else f"names no port, which {scheme}:// needs"
+        problem = "has a fragment (what comes after #)" if parts.fragment else lacks
+        raise InputError(FIELD, f"{without_user(url)[:80]!r} {problem}.", _REMEDY)
     kind = SourceKind(scheme.removesuffix("s"))
     user = parts.netloc.rpartition("@")[0]
     if user and kind is not SourceKind.RTSP:

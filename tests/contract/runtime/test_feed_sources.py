@@ -64,7 +64,18 @@ def test_all_else_is_refused(source: str) -> None:
         allowed_hosts(source, Settings())
 
 
-@pytest.mark.parametrize("host", ["camera.example.org", "/dev/video0", "tcp://camera.example.org", "ftp://x"])
-def test_a_setting_that_names_no_host_is_refused(host: str) -> None:
-    with pytest.raises(InputError, match="FEED_HOSTS"):
+@pytest.mark.parametrize(
+    ("host", "why"),
+    [
+        ("camera.example.org", "is not SCHEME://HOST"),
+        ("/dev/video0", "is not SCHEME://HOST"),
+        ("tcp://camera.example.org", "names no port, which tcp:// needs"),
+        ("rtsp://", "names no host"),
+        ("rtsp://camera.example.org/#1", "has a fragment"),
+        ("ftp://x", "is no source"),
+    ],
+)
+def test_a_setting_that_names_no_host_is_refused_with_its_reason(host: str, why: str) -> None:
+    with pytest.raises(InputError, match="FEED_HOSTS") as refused:
         Settings.from_environment({"INTRASPLAT_FEED_HOSTS": host})
+    assert why in refused.value.problem
