@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contract.runtime.settings import Settings
 from intrasplat.errors import NotListedError
-from intrasplat.live.spec import FIELD, AllowedHosts, SourceKind, parsed
+from intrasplat.live.spec import FIELD, AllowedHosts, SourceKind, parsed, without_user
 
 HOSTS_REMEDY = "Whoever runs the service names hosts in INTRASPLAT_FEED_HOSTS."
 DEVICES_REMEDY = "Whoever runs the service names files and devices of a worker's machine in INTRASPLAT_FEED_DEVICES."
@@ -25,7 +25,7 @@ def allowed_hosts(source: str | None, settings: Settings) -> AllowedHosts | None
     target = parsed(source)
     if target.kind in (SourceKind.FILE, SourceKind.DEVICE):
         if target.path not in settings.feed_devices:
-            raise NotListedError(FIELD, f"{target.path[:80]!r} is not allowed.", DEVICES_REMEDY)
+            raise NotListedError(FIELD, f"{without_user(source)[:80]!r} is not allowed.", DEVICES_REMEDY)
         return None
     if not hosts.has(target):
         raise NotListedError(FIELD, f"{target.origin[:80]} is not allowed.", HOSTS_REMEDY)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from contract.runtime.feed_sources import allowed_hosts
@@ -15,7 +17,7 @@ SETTINGS = Settings(
 )
 
 
-NO_SOURCES = ("ftp://camera.example.org/", "tcp://x")
+NO_SOURCES = ("ftp://camera.example.org/", "tcp://x", "", " ")
 
 
 @pytest.mark.parametrize(
@@ -51,6 +53,7 @@ def test_a_push_connects_to_nothing() -> None:
             "/srv/../srv/x/demo.mp4",
             "/srv/x/../demo.mp4",
             "v4l2:///dev/video1",
+            "demo.mp4",
             *NO_SOURCES,
         ),
     ],
@@ -60,6 +63,7 @@ def test_all_else_is_refused(source: str) -> None:
         allowed_hosts(source, SETTINGS)
     assert refused.value.field == "source"
     assert (refused.value.code is ErrorCode.NOT_LISTED) == (source not in NO_SOURCES)
+    assert str(Path.cwd()) not in str(refused.value)
     with pytest.raises(InputError):
         allowed_hosts(source, Settings())
 
