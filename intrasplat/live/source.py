@@ -29,7 +29,7 @@ WINDOW_S = 3.0
 """Over which rates are measured."""
 STOP_S = 3.0
 """For the reading process to complete the part that it writes."""
-PRUNE_PERIOD_S = 1.0
+PRUNE_PERIOD_S, LAST_S = 1.0, 0.2
 PUSHED = (SourceKind.PUSH, SourceKind.PICTURES)
 PATIENT = (*PUSHED, SourceKind.UDP)
 """A new connection would not bring back a sender that is silent."""
@@ -68,6 +68,7 @@ class Source:
         self._numbers = Numbers()
         self._used = 0
         self._last_given: tuple[int, float] = (0, 0.0)
+        self._last: FeedPair | None = None
         self._segment: Segment | None = None
         self._window: deque[tuple[float, int, int]] = deque()
         is_pushed = self._target.kind in PUSHED
@@ -130,20 +131,19 @@ class Source:
 
     def peek(self, after_sequence: int, timeout_s: float) -> FeedPair | None:
         """As newest, for somebody who only looks: it counts as no pair that was handed over, and is waited for only
-        while the source is read."""
+        while the source is read; else it is the last one that was handed over."""
         with self._changed:
-            process = self._process
-        if process is None or process.end_reason is not None:
-            return None
-        pair = process.newest(after_sequence, timeout_s)
-        if pair is None or pair.sequence <= after_sequence:
-            return None
-        return FeedPair(pair.left, pair.right, pair.source_s, pair.arrived_at, pair.sequence)
+            process, last = self._process, self._last
+        pair = None if process is None else process.newest(after_sequence, timeout_s)
+        if pair is not None and pair.sequence > after_sequence:
+            return FeedPair(pair.left, pair.right, pair.source_s, pair.arrived_at, pair.sequence)
+        return last if last is not None and last.sequence > after_sequence else None
 
     def pause(self) -> None:
         """Read, decode and store nothing from now on. It returns when the reading process has ended, or at resume()."""
+        last = self.peek(0, LAST_S)  # it goes with the process
         with self._changed:
-            self._paused = True
+            self._paused, self._last = True, last
             self._changed.notify_all()
             while self._paused and self._status.state not in (FeedState.PAUSED, FeedState.ENDED) and not self._closed:
                 self._changed.wait(0.1)
@@ -212,7 +212,8 @@ class Source:
                 number = segments + pair.epoch
                 self._segment = Segment(number, reason, height, width, aspect, packing, numbers.codec)
             aspect = self._segment.pixel_aspect if self._segment else 1.0
-            return FeedPair(pair.left, pair.right, source_s, pair.arrived_at, pair.sequence, aspect)
+            self._last = FeedPair(pair.left, pair.right, source_s, pair.arrived_at, pair.sequence, aspect)
+            return self._last
 
     def _run(self) -> None:
         try:
@@ -393,8 +394,3 @@ class Source:
         self._window.append((now_s, self._received + self._numbers.received, self._used))
         while now_s - self._window[0][0] > WINDOW_S:
             self._window.popleft()
-
-
-def open_source(spec: SourceSpec) -> Source:
-    """Read a source from now on. Raises as Source."""
-    return Source(spec)

@@ -13,7 +13,7 @@ from intrasplat.live.eyes import EyesSettings
 from intrasplat.live.feed import Feed, FeedSettings
 from intrasplat.live.follow import FollowSettings
 from intrasplat.live.pair import FeedPair
-from intrasplat.live.source import Source, open_source
+from intrasplat.live.source import Source
 from intrasplat.live.spec import BackOff, Deadlines, RecordingSpec, SourceSpec
 from intrasplat.live.state import FeedReason, FeedState
 from lab.phantom import Phantom, PhantomSettings, make_phantom
@@ -34,7 +34,7 @@ def opened() -> Iterator[Open]:
 
     def open_one(url: str | None = None, **more: object) -> Source:
         given = {"layout": "sbs", "deadlines": SHORT, "back_off": SOON} | more
-        sources.append(open_source(SourceSpec(url, **given)))  # type: ignore[arg-type]
+        sources.append(Source(SourceSpec(url, **given)))  # type: ignore[arg-type]
         return sources[-1]
 
     yield open_one

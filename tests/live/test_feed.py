@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,6 +105,20 @@ def test_the_newest_picture_is_that_of_the_source_and_counts_as_no_used_one(foll
     paused = feed.picture()
     assert paused is not None
     assert feed.picture() is paused
+
+
+@pytest.mark.parametrize("end", [Feed.pause, Feed.close])
+def test_the_last_picture_is_there_after_the_end_though_nobody_looked_before(
+    followed: Follow, end: Callable[[Feed], None]
+) -> None:
+    feed = followed()
+    until_known(feed, 1.0)
+    end(feed)
+    picture, past = feed.picture(), feed.report().past
+    assert picture is not None
+    assert past is not None
+    assert picture.arrived_at >= past.ends_at - 1e-3
+    assert feed.picture() is picture
 
 
 def test_a_picture_without_tissue_is_not_shown(followed: Follow, monkeypatch: pytest.MonkeyPatch) -> None:
