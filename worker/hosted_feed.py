@@ -17,8 +17,6 @@ from intrasplat.live.state import FeedReason, FeedState, LiveReport
 from intrasplat.splat.backend import CPU, Device
 from worker.reply import NotYetError
 
-CALIBRATION = "calibration.txt"
-
 
 class HostedFeed:
     """A feed that is followed from begin() to close(). Any thread may call it.
@@ -101,7 +99,7 @@ class HostedFeed:
 
     def _made(self) -> Feed:
         check_calibration_of(self._record)
-        calibration = self._folder / CALIBRATION  # what it says depends on the size of the pictures
+        calibration = self._folder / Path(self._record.calibration_name).name  # what it says depends on the pictures
         calibration.write_text(self._record.calibration, encoding="utf-8")
         options, half = self._record.options, self._settings.feed_disk_bytes // 2
         keep_s = min(options.keep_s, self._settings.feed_keep_s)

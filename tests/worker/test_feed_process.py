@@ -18,6 +18,7 @@ import pytest
 from contract.runtime.settings import Settings
 from contract.wire.feeds import FeedRecord, FeedWish
 from contract.wire.rendering import CutRequest, ExportRequest, PushRequest, RecordedRequest, WorkerReply
+from intrasplat.live.state import FeedReason
 from intrasplat.live.times import LIVE, FeedTime
 from intrasplat.picture import RecordedMasks
 from lab.phantom import Phantom, PhantomSettings, make_phantom
@@ -25,6 +26,7 @@ from tests.live.senders import PhantomSender
 from tests.worker.feeds import Asker, Hosted, eventually, feed_record, render_request
 from tests.worker.test_supervisor import WorkerProcesses
 from worker.feeds import following
+from worker.hosted_feed import HostedFeed
 
 MAX_BACK_S = 20.0
 """On a machine that is busy with other tests; measured alone it is below 6 s."""
@@ -241,6 +243,20 @@ def test_a_feed_that_cannot_be_followed_says_why(tmp_path: Path, source: str | N
         assert reply.error is not None
         assert reply.error.kind == "input"
         asker.close()
+
+
+def test_a_calibration_of_another_size_is_named_as_it_was_sent(tmp_path: Path, sender: PhantomSender) -> None:
+    record = feed_record(sender.url, sender.calibration.model_copy(update={"width": 640, "height": 240}))
+    settings = Settings(data_dir=tmp_path, feed_hosts=(sender.url,), feed_private="yes")
+    feed = HostedFeed(record, tmp_path, settings)
+    feed.begin()
+    try:
+        eventually(lambda: feed.report().reason is FeedReason.CALIBRATION, feed.report)
+        text = feed.report().text
+    finally:
+        feed.close()
+    assert "calibration.json: " in text
+    assert "640x240 pixels an eye, and the eyes have 128x96" in text
 
 
 def niceness_of(worker_id: int, command: str) -> int:

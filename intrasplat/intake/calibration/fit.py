@@ -31,7 +31,7 @@ def fitted(
     if (calibration.width, calibration.height) == (eye_width, eye_height):
         return calibration
     sx, sy = eye_width / calibration.width, eye_height / calibration.height
-    sizes = f"{calibration.width}x{calibration.height} pixels an eye, the clip has {eye_width}x{eye_height}"
+    sizes = f"{calibration.width}x{calibration.height} pixels an eye, and the eyes have {eye_width}x{eye_height}"
     squeezes = (1.0, 1 / pixel_aspect, *(HALVES if _is_whole_eye(calibration) else ()))
     if min(abs(sx / sy / squeeze - 1) for squeeze in squeezes) > MAX_ASPECT_CHANGE:
         raise InputError(
