@@ -137,12 +137,14 @@ class LiveScene:
 
 def why_unknown(report: LiveReport) -> IntrasplatError | None:
     """Why nothing is known of a feed of which nothing is known; None: only because it has just begun, or was closed."""
-    if report.reason is None or report.reason is FeedReason.BY_HAND:
+    shows_none = report.state is FeedState.NO_TISSUE
+    if not shows_none and report.reason in (None, FeedReason.BY_HAND):
         return None
     if report.reason is FeedReason.CALIBRATION:
         return InputError(CALIBRATION, report.text.removeprefix(f"{CALIBRATION}: "), "Give this source's calibration.")
-    if report.reason in OF_THE_INPUT:
-        return InputError(FIELD, f"nothing can be learnt from it: {report.text}.", "Give a stereo source.")
+    if shows_none or report.reason in OF_THE_INPUT:
+        problem = f"nothing can be learnt from it: {report.text}."
+        return InputError(FIELD, problem, "Give a stereo source that shows tissue.")
     problem = f"Nothing came from the source: {report.text}."
     return UnavailableError(problem, "Start it, or name another one.", may_return=True)
 

@@ -13,7 +13,7 @@ from intrasplat.__main__ import main
 from intrasplat.commands.exits import ExitCode
 from intrasplat.errors import InputError, UnavailableError
 from tests.live.conftest import until
-from tests.live.senders import PhantomSender
+from tests.live.senders import PhantomSender, video_file
 
 
 def test_a_followed_source_is_shown_and_cut(sender: PhantomSender, tmp_path: Path) -> None:
@@ -60,14 +60,16 @@ def test_what_cannot_be_read_has_its_exit_code(
     sender: PhantomSender, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration, text = tmp_path / "calibration.json", tmp_path / "text.mp4"
+    grey = video_file(tmp_path / "grey.mkv", 120)
     text.write_text("this is no video\n" * 100)
     calibration.write_text(sender.calibration.model_dump_json(exclude={"assumptions"}))
     for source, code, why in (
         (str(text), ExitCode.BAD_INPUT, "neither an MPEG transport stream"),
+        (str(grey), ExitCode.BAD_INPUT, "show no tissue"),
         ("tcp://127.0.0.1:9", ExitCode.UNAVAILABLE, "does not answer"),
     ):
-        asked = ["live", source, "--calibration", str(calibration), "--seconds", "2", "--device", "cpu"]
-        assert main(asked) == code
+        asked = ["live", source, "--calibration", str(calibration), "--seconds", "6", "--layout", "sbs"]
+        assert main([*asked, "--device", "cpu"]) == code
         assert why in capsys.readouterr().err
 
 
