@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from intrasplat.errors import InputError
-from intrasplat.live.times import LIVE, REMEDY, FeedTime, NoFeedTime
+from intrasplat.live.times import LIVE, REMEDY, FeedTime
 
 MAX_T = 1e6
 SCENE_T_REMEDY = "Give a number: 0 is the first frame, 1 the end of the clip."
@@ -21,10 +21,7 @@ ABOUT_T = (
 def _checked(asked: float | str | None) -> float | str | None:
     """Refuse a text that is a time of neither. Raises InputError, so that the answer has its remedy."""
     if isinstance(asked, str):
-        try:
-            FeedTime.parse(asked)
-        except NoFeedTime:
-            raise InputError("t", f"{asked[:40]!r} is no time.", f"{SCENE_T_REMEDY} Of a live feed: {REMEDY}") from None
+        FeedTime.parse(asked, f"{SCENE_T_REMEDY} Of a live feed: {REMEDY}")
     return asked
 
 

@@ -16,10 +16,6 @@ _UNESCAPED = re.compile(r".+T.+ [0-9]{2}:[0-9]{2}", re.ASCII)
 _NUMBER = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{1,9})?", re.ASCII)
 
 
-class NoFeedTime(InputError):
-    """A text or number that is no time of a feed."""
-
-
 class FeedTimeKind(StrEnum):
     """What a FeedTime counts from."""
 
@@ -56,8 +52,10 @@ class FeedTime:
         return cls(FeedTimeKind.UNIX, unix_s)
 
     @classmethod
-    def parse(cls, value: str | float) -> FeedTime:
+    def parse(cls, value: str | float, remedy: str = REMEDY) -> FeedTime:
         """live, seconds before live (below 0, or -0), seconds of the source, or a time of RFC 3339 with its zone.
+
+        remedy: of the error for what is none of these.
 
         Raises:
             InputError: it is none of these, or more than MAX_KEEP_S before live.
@@ -66,10 +64,10 @@ class FeedTime:
         if text == FeedTimeKind.LIVE:
             return LIVE
         if not _NUMBER.fullmatch(text):
-            return cls.at(_unix_s(text))
+            return cls.at(_unix_s(text, remedy))
         seconds = float(text)
         if seconds < -MAX_KEEP_S:
-            raise _no_time(text)
+            raise _no_time(text, remedy)
         if not text.startswith("-"):
             return cls.of_source(seconds)
         return cls.before_live(-seconds) if seconds else LIVE
@@ -78,21 +76,21 @@ class FeedTime:
 LIVE = FeedTime()
 
 
-def _unix_s(text: str) -> float:
+def _unix_s(text: str, remedy: str) -> float:
     try:
         moment = datetime.fromisoformat(text)
         unix_s = moment.timestamp() if moment.tzinfo is not None else 0.0
     except (ValueError, OverflowError):
         if _UNESCAPED.fullmatch(text):
-            remedy = "In an address write %2B for the + of a time zone, or give the time in UTC, with a Z."
-            raise InputError(FIELD, f"{text[:40]!r} has a space before its time zone.", remedy) from None
-        raise _no_time(text) from None
+            in_address = "In an address write %2B for the + of a time zone, or give the time in UTC, with a Z."
+            raise InputError(FIELD, f"{text[:40]!r} has a space before its time zone.", in_address) from None
+        raise _no_time(text, remedy) from None
     if moment.tzinfo is None:
         raise InputError(FIELD, f"{text[:40]!r} has no time zone.", "Append Z, or an offset such as +01:00.")
     if unix_s < 0:
-        raise _no_time(text)
+        raise _no_time(text, remedy)
     return unix_s
 
 
-def _no_time(text: str) -> NoFeedTime:
-    return NoFeedTime(FIELD, f"{text[:40]!r} is no time of a feed.", REMEDY)
+def _no_time(text: str, remedy: str) -> InputError:
+    return InputError(FIELD, f"{text[:40]!r} is no time.", remedy)
