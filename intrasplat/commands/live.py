@@ -67,10 +67,10 @@ def run_cli(options: argparse.Namespace) -> int:
             keep_s=options.keep, camera=options.camera, device=options.device,
         ) as live:  # fmt: skip
             trouble = _print_reports(live, ended, options.seconds, is_json=options.json)
-            if options.cut and (trouble is None or live.feed.recorded()):
-                _cut(live, options.cut, options.out / CUT)
             if trouble is not None:
                 raise trouble
+            if options.cut:
+                _cut(live, options.cut, options.out / CUT)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -81,16 +81,15 @@ def _print_reports(
     live: LiveScene, ended: threading.Event, seconds: float | None, *, is_json: bool
 ) -> IntrasplatError | None:
     """Print until the end. Returns why nothing was learnt; None: something was, or it has just begun."""
-    from intrasplat.live.followed import why_unknown
     from intrasplat.live.state import FeedReason, FeedState
 
     passed_s, report = 0.0, live.report()
-    trouble, has_learnt = why_unknown(report), report.model is not None
+    trouble, has_learnt = live.why_unknown(), report.model is not None
     while not ended.wait(PERIOD_S) and (seconds is None or passed_s < seconds):
         passed_s, report = passed_s + PERIOD_S, live.report()
         print(json.dumps(asdict(report)) if is_json else line_of(report), flush=True)
         if trouble is None or report.reason is not FeedReason.END_OF_FILE:  # the end hides why nothing was learnt
-            trouble = why_unknown(report)
+            trouble = live.why_unknown()
         has_learnt = has_learnt or report.model is not None
         if report.state is FeedState.ENDED:
             break
@@ -117,8 +116,8 @@ def line_of(report: LiveReport) -> str:
 
 def _cut(live: LiveScene, seconds: float, path: Path) -> None:
     """Write the last seconds as a clip."""
-    past = live.report().past
-    ends_s = 0.0 if past is None else past.ends_s
     live.pause()  # it completes the part that is being written
+    recorded = live.feed.recorded()
+    ends_s = recorded[-1].to_s if recorded else 0.0
     cut = live.cut(ends_s - seconds, ends_s, path)
     print(f"{cut.path}: {cut.frames} frames, {cut.from_s:.1f} to {cut.to_s:.1f} s of the source", file=sys.stderr)

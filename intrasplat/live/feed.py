@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
+from intrasplat.errors import InputError
 from intrasplat.intake.calibration.types import StereoCalibration
 from intrasplat.live.cut import Cut
 from intrasplat.live.follow import FollowSettings
@@ -132,6 +133,12 @@ class Feed:
             past=past,
             segment=self._source.segment,
         )
+
+    @property
+    def error(self) -> InputError | None:
+        """What is wrong with the calibration or another input, so that pairs cannot be learnt; None: nothing."""
+        trouble = self._model.trouble
+        return None if trouble is None else trouble.error
 
     def _situation(self, age_s: float | None) -> tuple[FeedState, FeedReason | None, str]:
         """State, reason and text of source and model; age_s: of the newest moment that is known, if one is."""

@@ -38,6 +38,12 @@ OF_THE_INPUT = (
     FeedReason.NO_SCENE, FeedReason.END_OF_FILE,
 )  # fmt: skip
 """Reasons for which a source cannot be used as it is. For others it may come back by itself."""
+REMEDIES = {
+    FeedReason.REDIRECTED: "Give the address to which it leads.",
+    FeedReason.PACKING_UNKNOWN: "Name the layout of its eyes.",
+    FeedReason.NO_SCENE: "Give a source whose two eyes show the same scene, and its own calibration.",
+    FeedReason.END_OF_FILE: "Give a longer file.",
+}
 
 
 class LiveScene:
@@ -65,20 +71,17 @@ class LiveScene:
         """Wait until there is something to show. False: not in time, or the source ended without a pair; report() says
         why."""
         deadline_s = time.monotonic() + timeout_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            if self.feed.wait_for_newer(float("-inf"), min(left_s, POLL_S)) is not None:
-                return True
+        while self.feed.wait_for_newer(float("-inf"), min(max(deadline_s - time.monotonic(), 0.0), POLL_S)) is None:
             report = self.report()
-            if report.state is FeedState.ENDED and report.segment is None:
+            if time.monotonic() >= deadline_s or (report.state is FeedState.ENDED and report.segment is None):
                 return False
-        return False
+        return True
 
     def moment(self, t: str | float = "live") -> FeedMoment:
         """The moment of a time, with its age and source time; raises as view()."""
         found = self.feed.moment(FeedTime.parse(t if isinstance(t, str | Real) else repr(t)))
         if found is None:
-            why = why_unknown(self.report())
-            raise why or InputError("t", "nothing is known yet.", "Wait until wait() answers True.")
+            raise self.why_unknown() or InputError("t", "nothing is known yet.", "Wait until wait() answers True.")
         return found
 
     def view(
@@ -101,7 +104,7 @@ class LiveScene:
         Raises:
             InputError: the time lies before the stored past, nothing is known yet, or the pose or size cannot be used;
                 or the source or its calibration cannot, so that nothing is known.
-            UnavailableError: nothing is known because nothing came from the source.
+            UnavailableError: nothing is known because nothing came from the source, or it cannot be followed now.
         """
         found = self.moment(t)
         scene, pose_mm = found.scene, world_from_camera_of(found.scene, pose)
@@ -116,11 +119,25 @@ class LiveScene:
 
         Raises:
             InputError: nothing of this range is recorded (`follow` records if it has `out`), or the path is unusable.
+            OSError: the file cannot be made, such as on a full disk.
         """
-        try:
-            return self.feed.cut(from_s, to_s, Path(path))
-        except OSError as error:
-            raise InputError("path", f"{path} cannot be written ({error.strerror}).", "Name another file.") from error
+        if not Path(path).parent.is_dir():
+            raise InputError("path", f"there is no folder {os.fspath(Path(path).parent)!r}.", "Name another file.")
+        return self.feed.cut(from_s, to_s, Path(path))
+
+    def why_unknown(self) -> IntrasplatError | None:
+        """Why nothing is known of a source yet; None: it has just begun, or is paused or closed."""
+        if (error := self.feed.error) is not None:
+            return error
+        report = self.report()
+        if report.state is FeedState.NO_TISSUE:
+            return InputError(FIELD, "its pictures show no tissue.", "Give a source that shows tissue.")
+        if report.reason in (None, FeedReason.BY_HAND):
+            return None
+        problem = f"nothing can be learnt from it: {report.text}."
+        if report.reason in OF_THE_INPUT:
+            return InputError(FIELD, problem, REMEDIES.get(report.reason, "Give another source."))
+        return UnavailableError(f"{FIELD}: {problem}", "Start or mend the source, or try again later.", may_return=True)
 
     def pause(self) -> None:
         """Read, learn and store nothing from now on."""
@@ -133,20 +150,6 @@ class LiveScene:
     def close(self) -> None:
         """End it. What is in `out` stays."""
         self.feed.close()
-
-
-def why_unknown(report: LiveReport) -> IntrasplatError | None:
-    """Why nothing is known of a feed of which nothing is known; None: only because it has just begun, or was closed."""
-    shows_none = report.state is FeedState.NO_TISSUE
-    if not shows_none and report.reason in (None, FeedReason.BY_HAND):
-        return None
-    if report.reason is FeedReason.CALIBRATION:
-        return InputError(CALIBRATION, report.text.removeprefix(f"{CALIBRATION}: "), "Give this source's calibration.")
-    if shows_none or report.reason in OF_THE_INPUT:
-        problem = f"nothing can be learnt from it: {report.text}."
-        return InputError(FIELD, problem, "Give a stereo source that shows tissue.")
-    problem = f"Nothing came from the source: {report.text}."
-    return UnavailableError(problem, "Start it, or name another one.", may_return=True)
 
 
 def follow(

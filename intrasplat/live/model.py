@@ -57,10 +57,11 @@ FIRST_BACK_OFF_S, MOST_BACK_OFF_S = 0.5, 8.0
 
 @dataclass(frozen=True)
 class Trouble:
-    """Why the model does not go on."""
+    """Why the model does not go on. error: what is wrong with the input, if that is why."""
 
     reason: FeedReason
     text: str
+    error: InputError | None = None
 
 
 def chosen_width(steps: float, width: int, recorded_width: int) -> int:
@@ -285,11 +286,10 @@ class FeedModel:
     def _fail(self, error: Exception) -> None:
         self._coming = None  # it will be old
         if isinstance(error, InputError):
-            self._trouble = Trouble(FeedReason.CALIBRATION, str(error))
+            self._trouble = Trouble(FeedReason.CALIBRATION, str(error), error)
         else:
             logger.error("the model of a feed failed", exc_info=error)
-            text = f"a fault of the program ({type(error).__name__}); another model begins"
-            self._trouble = Trouble(FeedReason.FAULT, text)
+            self._trouble = Trouble(FeedReason.FAULT, "a fault of the program; another model begins")
         self._end_follower()
 
     def _rest(self, seconds: float) -> None:
