@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
@@ -80,7 +81,8 @@ def find_moment(
         begins = getattr(spans[0], axis)[0]
         if wanted < begins - TOLERANCE_S:
             raise _outside("it lies before the past that is stored.", asked, spans)
-        if wanted - getattr(spans[-1], axis)[1] > time.time() - spans[-1].arrived_at[1] + FUTURE_S:
+        passed_s = max(0.0, time.time() - spans[-1].arrived_at[1])
+        if wanted - getattr(spans[-1], axis)[1] > passed_s + FUTURE_S:
             raise _outside("it lies in the future.", asked, spans)
         chosen = _chosen(spans, axis, wanted)
         scene = window if chosen is newest else past.load(chosen)
@@ -142,4 +144,4 @@ def _outside(problem: str, asked: FeedTime, spans: list[PastSegment]) -> InputEr
 
 
 def _utc(unix_s: float) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_s))
+    return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
