@@ -27,6 +27,7 @@ from intrasplat.decode.contained import MALFORMED, lines_of, start_process
 from intrasplat.decode.guard import Allowance
 from intrasplat.intake.limits import MIN_SIDE_PX
 from intrasplat.live.connecting import Connection
+from intrasplat.live.reader import MAX_FAULT_CHARACTERS
 from intrasplat.live.state import FeedReason
 
 logger = logging.getLogger(__name__)
@@ -198,9 +199,9 @@ class ReadingProcess:
         if "received" in line:
             self._note(line)
         if "fault" in line:
-            logger.error("the process that reads a source failed: %r", str(line["fault"])[:300])
+            logger.error("the process that reads a source failed: %r", str(line["fault"])[:MAX_FAULT_CHARACTERS])
         if "end" in line:
-            self._end(FeedReason(line["end"]), str(line["text"])[:300])
+            self._end(FeedReason(line["end"]), str(line["text"])[:MAX_FAULT_CHARACTERS])
         elif "pair" in line:
             with self._answered:
                 if line["pair"]["want"] == self._wanted:

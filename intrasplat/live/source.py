@@ -29,7 +29,9 @@ WINDOW_S = 3.0
 """Over which rates are measured."""
 STOP_S = 3.0
 """For the reading process to complete the part that it writes."""
-PRUNE_PERIOD_S, LAST_S = 1.0, 0.2
+PRUNE_PERIOD_S = 1.0
+LAST_S = 0.2
+"""Longest wait for the last pair before a pause."""
 PUSHED = (SourceKind.PUSH, SourceKind.PICTURES)
 PATIENT = (*PUSHED, SourceKind.UDP)
 """A new connection would not bring back a sender that is silent."""
@@ -130,8 +132,8 @@ class Source:
                 return self._given(pair, process.numbers, segments, ended_for)
 
     def peek(self, after_sequence: int, timeout_s: float) -> FeedPair | None:
-        """As newest, for somebody who only looks: it counts as no pair that was handed over, and is waited for only
-        while the source is read; else it is the last one that was handed over."""
+        """As newest, for somebody who only looks: it counts as no pair that was handed over. If none comes in time, or
+        the source is not read, it is the last one that was handed over."""
         with self._changed:
             process, last = self._process, self._last
         pair = None if process is None else process.newest(after_sequence, timeout_s)
@@ -143,7 +145,9 @@ class Source:
         """Read, decode and store nothing from now on. It returns when the reading process has ended, or at resume()."""
         last = self.peek(0, LAST_S)  # it goes with the process
         with self._changed:
-            self._paused, self._last = True, last
+            self._paused = True
+            if last is not None and (self._last is None or last.sequence > self._last.sequence):
+                self._last = last
             self._changed.notify_all()
             while self._paused and self._status.state not in (FeedState.PAUSED, FeedState.ENDED) and not self._closed:
                 self._changed.wait(0.1)
