@@ -1,6 +1,6 @@
 """Decide when a job hangs: each stage has a limit for the time between two advances.
 
-Time in which the job could have run but had no core does not count, up to STARVED_FACTOR times the limit in all.
+Time in which its threads waited for a core does not count (is_silent in intrasplat/machine/processes.py).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from contract.wire.job import JobProgress
-from intrasplat.machine.processes import STARVED_FACTOR
+from intrasplat.machine.processes import is_silent
 
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
@@ -36,9 +36,8 @@ OTHER_LIMIT_S = 60.0
 MAX_LOOK_S = 1.0
 """Most time between two calls of is_hung() that counts: a suspended supervisor reads no reports."""
 
-
 MEASURED_AFTER_S = 1.0
-"""Silence after which it counts how long the job has no core."""
+"""Silence after which it counts how long the job waits for a core."""
 
 
 class HangDetector:
@@ -73,8 +72,4 @@ class HangDetector:
         if self._starved_before_s is None and self._silence_s > MEASURED_AFTER_S:
             self._starved_before_s = self._starved_s()
         limit_s = STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)
-        if self._silence_s <= limit_s:
-            return False
-        before_s = self._starved_before_s
-        starved_s = 0.0 if before_s is None else max(0.0, self._starved_s() - before_s)
-        return self._silence_s > min(limit_s + starved_s, STARVED_FACTOR * limit_s)
+        return is_silent(self._silence_s, limit_s, self._starved_before_s or 0.0, self._starved_s)

@@ -17,6 +17,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from intrasplat.decode.guard import Allowance
 from intrasplat.errors import Cancelled, ErrorCode, InputError, LimitError, UnavailableError
 from intrasplat.files.disk import Disk
 from intrasplat.files.disk_errors import StoreFullError
-from intrasplat.machine.processes import STARVED_FACTOR, starved_s
+from intrasplat.machine.processes import is_silent, starved_s
 
 MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
 MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
@@ -184,11 +185,8 @@ class Decoder:
 
     def _is_silent(self, now_s: float) -> bool:
         """Whether no picture came for too long; time in which the process had no core does not count."""
-        silence_s, limit_s = now_s - self._advanced_s, self._patience.max_silence_s
-        if silence_s <= limit_s:
-            return False
-        without_core_s = max(0.0, starved_s(self._process.pid) - self._starved_s)
-        return silence_s > min(limit_s + without_core_s, STARVED_FACTOR * limit_s)
+        waited_s = partial(starved_s, self._process.pid)
+        return is_silent(now_s - self._advanced_s, self._patience.max_silence_s, self._starved_s, waited_s)
 
     def _check(self) -> None:
         if self.result is not None:
@@ -197,7 +195,8 @@ class Decoder:
             raise Cancelled("Stopped during stage 'decode'.")
         now_s = time.monotonic()
         if self._is_silent(now_s):
-            raise _undecodable(self._field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
+            silence_s = now_s - self._advanced_s
+            raise _undecodable(self._field, f"the decoder made no progress for {silence_s:.0f} s")
         if now_s > self._end_s:
             raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")
 

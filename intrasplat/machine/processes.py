@@ -9,15 +9,15 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
 STARVED_FACTOR = 10.0
-"""A time limit for a process may become so many times as long while it has no core. Its own threads may compete: even a
-process that never ends may seem to starve."""
+"""A time limit for a process becomes at most so many times as long while its threads wait for a core: they may wait for
+one another, so even a process that never ends may seem to starve."""
 
 
 def shutdown_event() -> threading.Event:
@@ -59,8 +59,8 @@ def die_with_parent() -> None:
 
 
 def starved_s(process_id: int) -> float:
-    """Seconds, in all, in which threads of a process and of its children could have run but had no core; 0 where the
-    system does not say. It falls when a thread ends."""
+    """Seconds for which threads of a process and of its children waited for a core, summed over the threads; 0 where
+    the system does not say. It falls when a thread ends."""
     nanoseconds, waiting = 0, [process_id]
     while waiting:
         for thread in _threads(waiting.pop()):
@@ -68,6 +68,16 @@ def starved_s(process_id: int) -> float:
                 nanoseconds += int((thread / "schedstat").read_text().split()[1])
                 waiting += map(int, (thread / "children").read_text().split())
     return nanoseconds / 1e9
+
+
+def is_silent(silence_s: float, limit_s: float, before_s: float, starved_s: Callable[[], float]) -> bool:
+    """Whether a process was silent for longer than its limit, which grows by the time that it waited for a core.
+
+    before_s: starved_s() when the silence began.
+    """
+    if silence_s <= limit_s:
+        return False
+    return silence_s > min(limit_s + max(0.0, starved_s() - before_s), STARVED_FACTOR * limit_s)
 
 
 def _threads(process_id: int) -> list[Path]:
