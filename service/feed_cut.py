@@ -41,6 +41,8 @@ REMEDY = 'Send {"from": -30, "to": "live"}, and options as POST /reconstruct has
 SUFFIXES = {"video/mp4": ".mp4", "video/x-matroska": ".mkv"}
 REPORTED_WITHIN_S = 2.0
 """Pairs that came since its worker's last report belong to a cut until live."""
+WIDENED_S = 4.0
+"""A cut may be so much longer than what is asked for: it begins and ends at key frames."""
 MAX_WAIT_S = 120.0
 """How long the worker may take until the first bytes come."""
 
@@ -192,8 +194,8 @@ def _check_size(services: Deps, size_bytes: int, available_bytes: int) -> None:
 
 def _too_many_frames(cut: CutRange, most: int) -> LimitError:
     problem = f"the part has {cut.frames} frames; a clip may have {most} (INTRASPLAT_MAX_FRAMES)."
-    possible_s = (cut.to_s - cut.from_s) * most / cut.frames
-    return LimitError("from", problem, f"At this frame rate ask for at most {possible_s:.0f} s.")
+    possible_s = (cut.to_s - cut.from_s) * most / cut.frames - WIDENED_S
+    return LimitError("from", problem, f"At this frame rate ask for at most {max(1, int(possible_s))} s.")
 
 
 def _add(folder: Path, feed: FeedRecord, received: Received) -> None:

@@ -160,7 +160,8 @@ async def read_json(request: Request, services: Deps, model: type[Body], max_byt
         first = error.errors()[0]
         if first["type"] == "json_invalid":
             raise Problem(400, "The body is not JSON.", field="body", remedy=remedy) from None
-        field = ".".join(str(part) for part in first["loc"] if part not in UNION_MEMBERS) or "body"
+        place = [*first["loc"][:1], *(part for part in first["loc"][1:] if part not in UNION_MEMBERS)]
+        field = ".".join(map(str, place)) or "body"
         raise InputError(field, f"{first['msg']}.", remedy) from None
 
 

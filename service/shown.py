@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,6 @@ from starlette.concurrency import run_in_threadpool
 from contract.access.keys import KeyScope
 from contract.runtime import traces
 from contract.store.shelf import is_job_id
-from contract.wire.feeds import FeedView
 from contract.wire.job import JobState
 from intrasplat.live.state import FeedState
 from service.access import AccessRefusal, Caller
@@ -110,7 +108,7 @@ def scene_or_feed(
     if record is None or not caller.owns(record):
         raise no_such_scene(scene, caller, record)
     stem = stem_of(record.options.label, record.created_at_s, scene)
-    return Shown(scene, None, FeedView.of(record, time.time()).state, stem)
+    return Shown(scene, None, record.state, stem)
 
 
 def _only(services: Deps, caller: Caller) -> Shown:

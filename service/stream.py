@@ -166,7 +166,7 @@ class _Viewer:
         return (message, answer.head.feed.source_s) if message.follow and answer.head.feed is not None else None
 
     async def _confirm(self, message: StreamMessage) -> None:
-        """Send that the scene is there. Raises Problem: it is not, or the caller may not see it."""
+        """Send that the scene or feed is there. Raises Problem: it is not, or the caller may not see it."""
         caller = self._entrance.caller()
         self._services.limiter.admit(caller.key_id or caller.address)
         shown = await find_shown(self._services, caller, message.scene, with_feeds=True)

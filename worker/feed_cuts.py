@@ -85,9 +85,8 @@ def _source_times(recorded: Sequence[Part], begins: FeedTime, ends: FeedTime) ->
     if not within:
         arrived = (recorded[0].first_arrived_at, recorded[-1].last_arrived_at) if recorded else ()
         there = " to ".join(time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(each)) for each in arrived)
-        remedy = (
-            f"There is {there or 'nothing'}; the newest seconds follow when their part of the recording is complete."
-        )
+        first = f"Ask for a time from {there}, or" if there else "Ask"
+        remedy = f"{first} again in some seconds: the newest ones are recorded when their part is complete."
         raise InputError(FIELD, "nothing of this range is recorded.", remedy)
     return _source_s(within[0], begins), _source_s(within[-1], ends)
 

@@ -303,8 +303,8 @@ class CutRange(Model):
     """of its last frame"""
     frames: int
     is_whole: bool = True
-    """whether it holds all frames of the range that are recorded so far: a change of size or coding ends it. The
-    newest seconds are recorded a little later: to_s says where it ends
+    """whether it holds all frames of the range that are recorded so far: after a change of size or coding it holds
+    only what came later. The newest seconds are recorded a little later: to_s says where it ends
     """
 
 

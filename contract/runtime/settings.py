@@ -185,7 +185,7 @@ class Settings(BaseModel):
             try:
                 is_host = parsed(host).host != ""
             except InputError as error:
-                raise ValueError(error.problem.rstrip(".")) from None
+                raise ValueError(f"{error.problem} It takes SCHEME://HOST, with the port of tcp and udp") from None
             if not is_host:
                 raise ValueError(f"{host!r} is not SCHEME://HOST or SCHEME://HOST:PORT")
         return hosts

@@ -114,6 +114,11 @@ class FeedRecord(BaseModel):
     report: FeedReport | None = None
     reported_at_s: float | None = None
 
+    @property
+    def state(self) -> FeedState:
+        """As its worker reported it last. Without a worker it is connecting."""
+        return FeedState.CONNECTING if self.owner is None or self.report is None else self.report.state
+
 
 class FeedView(FeedReport):
     """A feed as the API shows it: what was asked for, and what its worker said of it last."""
@@ -177,8 +182,8 @@ class CutRange(BaseModel):
     frames: int
     is_whole: bool = Field(
         default=True,
-        description="whether it holds all frames of the range that are recorded so far: a change of size or coding "
-        "ends it. The newest seconds are recorded a little later: to_s says where it ends",
+        description="whether it holds all frames of the range that are recorded so far: after a change of size or "
+        "coding it holds only what came later. The newest seconds are recorded a little later: to_s says where it ends",
     )
 
 

@@ -27,7 +27,7 @@ class Cut:
 
     from_s, to_s   source times of its first and last frame
     frames         their number
-    is_whole       whether it holds all recorded frames of the range that was asked for: a change of the coding ends it
+    is_whole       whether it holds all recorded frames of the range: after a change of coding only what came later
     container      mp4, or mkv for Motion JPEG
     """
 

@@ -191,7 +191,7 @@ def parsed(url: str) -> Target:
         InputError: it is none.
     """
     if not url.strip():
-        raise InputError(FIELD, "it is empty.", "Name a source, or leave it out for a push.")
+        raise InputError(FIELD, "it is empty.", "Name a source; over HTTP leave it out for a push.")
     scheme = url.partition("://")[0].lower() if "://" in url else "file"
     if scheme in ("file", "v4l2"):
         path = url.partition("://")[2] if "://" in url else url
