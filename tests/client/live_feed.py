@@ -25,6 +25,7 @@ from contract.wire.rendering import (
     WorkerAddress,
 )
 from intrasplat.errors import InputError
+from intrasplat.live.looking import FUTURE_S
 from intrasplat.live.state import FeedReason, FeedState
 from intrasplat.live.times import LIVE, FeedTimeKind
 from intrasplat.notices import Notice, NoticeCode
@@ -172,6 +173,8 @@ class LivePainter(FeedWorker):
         at_s = moment.seconds if moment.kind is FeedTimeKind.UNIX else newest_s - moment.seconds
         if at_s < self.began_s:
             raise InputError("t", "This is before the feed's past.", "Give a later moment.")
+        if at_s > time.time() + FUTURE_S:
+            raise InputError("t", "This is in the future.", "Give an earlier moment.")
         return min(newest_s, round(at_s * FPS) / FPS)
 
 

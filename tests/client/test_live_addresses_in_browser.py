@@ -7,11 +7,14 @@ from datetime import UTC, datetime
 
 import pytest
 
-from tests.client.live_feed import PAST_S, LivePage, LivePainter, opened_feed
+from intrasplat.live.looking import FUTURE_S
+from tests.client.live_feed import LivePage, LivePainter, opened_feed
 from tests.client.page import Site
 from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
 from tests.client.words import say
+
+CLOCK_TIME = "return import('/base/element.js').then(({ clockTime }) => clockTime(1000 * arguments[0]))"
 
 
 def test_the_page_leads_to_open_feeds(site: Site, page: LivePage, painter: LivePainter) -> None:
@@ -49,13 +52,18 @@ def test_an_address_of_a_moment_that_is_not_stored_says_so_and_how_to_come_to_li
     def open_at(at_s: float) -> None:
         page.watch(f"{feed_id}?at={datetime.fromtimestamp(at_s, UTC).isoformat(timespec='milliseconds')}")
 
-    open_at(time.time() - PAST_S - 3600)
-    begin, end = say("live.moment_gone", **{"from": "|"}).split("|")
-    page.until_text("#model-message", begin)
-    assert page.text("#model-message").endswith(end)
-    assert page.script("return document.getElementById('live').classList.contains('wanted')")
-    page.click("#live")
-    page.until(lambda: page.state == "live" and page.text("#model-message") == "")
-    open_at(time.time() + 3600)
+    begin, middle, end = say("live.moment_gone", **{"from": "|", "to": "|"}).split("|")
+    for at_s in (painter.began_s - 3600, time.time() + 3600):
+        open_at(at_s)
+        page.until_text("#model-message", begin)
+        text = page.text("#model-message").removeprefix(begin)
+        assert text.endswith(end)
+        stored_from, stored_to = text.removesuffix(end).split(middle)
+        assert stored_from == page.script(CLOCK_TIME, painter.began_s)
+        assert stored_to != stored_from
+        assert page.script("return document.getElementById('live').classList.contains('wanted')")
+        page.click("#live")
+        page.until(lambda: page.state == "live" and page.text("#model-message") == "")
+    open_at(time.time() + FUTURE_S / 2)
     page.until_text("#model-age", "of ")
     assert page.text("#word") == say("live.word_frozen", time=page.text("#model-age").removeprefix("of "))

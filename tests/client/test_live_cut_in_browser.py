@@ -6,7 +6,6 @@ import pytest
 
 from contract.runtime.settings import Settings
 from contract.wire.job import JobState
-from contract.wire.rendering import CutRequest
 from intrasplat.errors import InputError, LimitError
 from tests.client import live_feed
 from tests.client.live_feed import LivePage, LivePainter
@@ -15,6 +14,18 @@ from tests.client.test_live_in_browser import page as page
 from tests.client.test_live_in_browser import painter as painter
 from tests.client.test_live_in_browser import watched
 from tests.client.words import say
+
+NOTE_CUTS = """
+const [lost] = arguments;
+const ask = window.fetch;
+window.cuts = [];
+window.fetch = (path, options) => {
+  if (path === lost) return Promise.reject(new TypeError("lost"));
+  if (path.endsWith("/cut")) window.cuts.push(JSON.parse(options.body));
+  return ask(path, options);
+};
+"""
+"""Note the parts that the page asks for from now on; no answer comes from the path `lost`."""
 
 
 def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: LivePage, painter: LivePainter) -> None:
@@ -35,15 +46,26 @@ def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: Liv
     page.until_text("#kept", say("state.done"))
 
 
+@pytest.mark.parametrize(
+    ("fps", "lost", "length_s"), [(30.0, None, 28.3), (50.0, None, 15.0), (500.0, None, 1.0), (50.0, "/info", 30.0)]
+)
 def test_no_longer_part_is_asked_for_than_a_clip_may_have_frames(
-    site: Site, page: LivePage, painter: LivePainter, monkeypatch: pytest.MonkeyPatch
+    site: Site,
+    page: LivePage,
+    painter: LivePainter,
+    monkeypatch: pytest.MonkeyPatch,
+    fps: float,
+    lost: str | None,
+    length_s: float,
 ) -> None:
-    monkeypatch.setattr(live_feed, "FPS", 50.0)
+    assert Settings().max_frames == 1000
+    monkeypatch.setattr(live_feed, "FPS", fps)
     watched(site, page)
+    page.script(NOTE_CUTS, lost)
     page.click("#keep")
     page.until_text("#kept", say("live.kept_open"))
-    cut = next(each for each in painter.asked if isinstance(each, CutRequest))
-    assert 15 < cut.ends.seconds - cut.begins.seconds < Settings().max_frames / 50
+    (cut,) = page.script("return window.cuts")
+    assert (cut["from"], cut["to"]) == (-length_s, "live")
 
 
 @pytest.mark.parametrize("refusal", [InputError, LimitError])

@@ -31,9 +31,15 @@ for (const kind of ["pointerdown", "pointerup"]) stage.dispatchEvent(new Pointer
 HAS_CLOCK = "return import(document.scripts[0].src).then(({ clock }) => clock.bounds.length > 10)"
 DRAG_TAPE = """
 const tape = document.getElementById("tape");
-tape.value = String(arguments[0]);
-for (const kind of ["input", "change"]) tape.dispatchEvent(new Event(kind, { bubbles: true }));
+return (async () => {
+  for (const each of arguments) {
+    tape.value = String(each);
+    for (const kind of ["input", "change"]) tape.dispatchEvent(new Event(kind, { bubbles: true }));
+    await new Promise((done) => setTimeout(done, 100));
+  }
+})();
 """
+"""Drag the tape's thumb to each of these places, 100 ms apart."""
 WRITES = """
 const [done] = arguments;
 import(document.scripts[0].src).then(({ look }) => {

@@ -30,6 +30,24 @@ const feed = { state: "live", reason: null, received_fps: 30, last_frame_at_s: 1
 return import("/live/headline.js").then(({ headlineOf }) =>
   cases.map((each) => headlineOf({ ...fresh, ...each, feed: { ...feed, ...each.feed } }).place));
 """
+ALOUD = """
+const [words] = arguments;
+return Promise.all([import("/live/aloud.js"), import("/base/messages.js")]).then(([{ Aloud }, { setLanguage }]) => {
+  const line = document.createElement("p");
+  const aloud = new Aloud(line);
+  try {
+    return words.map(([atMs, place, text, code]) => {
+      performance.now = () => atMs;
+      setLanguage(code);
+      aloud.note({ kind: "live", place }, text);
+      return line.textContent;
+    });
+  } finally {
+    delete performance.now;
+  }
+});
+"""
+"""What is read aloud after each of these words, which stand on top at these times."""
 REFUSED = {"pictureProblem": {"status": 503}, "pictureAgeS": 2.5}
 STALLED = {"state": "stalled", "reason": "undecodable"}
 
@@ -67,8 +85,7 @@ def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, 
     aloud = "return document.getElementById('word-aloud').textContent"
     page.until(lambda: page.script(aloud) == say("live.word_live"))
     page.script(NOTE_WORDS, "word-aloud", "said")
-    for back_s in (1, 3, 5):
-        page.script(DRAG_TAPE, -back_s)
+    page.script(DRAG_TAPE, -1, -3, -5)
     page.until(lambda: page.script(aloud) == say("live.word_back", s=5))
     page.click("#live")
     page.until(lambda: page.script(aloud) == say("live.word_live"))
@@ -78,6 +95,23 @@ def test_the_word_is_read_aloud_as_it_comes_to_rest(site: Site, page: LivePage, 
     page.until(lambda: page.script(aloud) == "")
     said = [text for text in page.script("return window.said") if text]
     assert [text.rstrip("0123456789 s") for text in said] == ["LOOKING BACK", "LIVE", "MODEL BEHIND"]
+
+
+def test_a_word_is_read_aloud_again_after_another_one_and_in_another_language(site: Site, page: LivePage) -> None:
+    shown = [
+        (0, "live", "LIVE", "en", ""),
+        (800, "live", "LIVE", "en", "LIVE"),
+        (1000, "behind", "BEHIND 3 s", "en", ""),
+        (1300, "live", "LIVE", "en", ""),
+        (2100, "live", "LIVE", "en", "LIVE"),
+        (3000, "live", "JETZT", "de", ""),
+        (3800, "live", "JETZT", "de", "JETZT"),
+        (4000, "behind", "BEHIND 3 s", "en", ""),
+        (4800, "behind", "BEHIND 3 s", "en", "BEHIND 3 s"),
+        (5000, "behind", "BEHIND 4 s", "en", ""),
+        (5800, "behind", "BEHIND 4 s", "en", ""),
+    ]
+    assert page.script(ALOUD, [each[:4] for each in shown]) == [said for *_, said in shown]
 
 
 def test_a_model_that_is_there_is_said_to_be_loaded(site: Site, page: LivePage, painter: LivePainter) -> None:

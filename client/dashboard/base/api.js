@@ -125,7 +125,7 @@ export const listExports = (id) => json(`/scenes/${id}/exports`);
 export const exportScene = (id, wanted) => file(`/scenes/${id}/export?${queryOf(wanted)}`);
 /** A zip of the masks that were found. @param {string} id */
 export const getMasks = (id) => file(`/scenes/${id}/masks`);
-/** @returns {Promise<{version: string, limits: {max_frames: number | null}}>} */
+/** @returns {Promise<{version: string, limits: {max_frames: number}}>} */
 export const getInfo = () => json("/info");
 
 /**

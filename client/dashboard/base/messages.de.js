@@ -644,7 +644,7 @@ export const DE = {
     "ended_note": "Diese Übertragung ist beendet, ihre Aufzeichnung gelöscht.",
     "no_model": "Noch kein Modell.",
     "model_loads": "Das Modell wird geladen.",
-    "moment_gone": "Dieser Zeitpunkt ist nicht gespeichert. Gespeichert ist ab {from}. „Zurück zu live“ zeigt, was jetzt ist.",
+    "moment_gone": "Dieser Zeitpunkt ist nicht gespeichert. Gespeichert ist {from} bis {to}. „Zurück zu live“ zeigt, was jetzt ist.",
     "rocking": "pendelt hin und her",
     "stage": "Das Modell. Ziehen dreht es; beim Messen bewegen Pfeiltasten ein Kreuz, und die Eingabetaste wählt.",
     "tape": "Die Vergangenheit",

@@ -644,7 +644,7 @@ export const EN = {
     "ended_note": "This feed has ended, and its recording is deleted.",
     "no_model": "No model yet.",
     "model_loads": "The model is being loaded.",
-    "moment_gone": "This moment is not stored. What is stored begins at {from}. “Back to live” shows what is now.",
+    "moment_gone": "This moment is not stored. What is stored begins at {from} and ends at {to}. “Back to live” shows what is now.",
     "rocking": "rocking to and fro",
     "stage": "The model. Drag to turn it; while measuring, arrow keys move a cross and Enter chooses.",
     "tape": "The past",

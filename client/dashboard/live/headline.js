@@ -22,7 +22,7 @@ const SILENT_AFTER_S = 2;
 const UNASKED_AFTER_S = 4;
 /** Pairs that came so much later than a picture show that the picture is late, and not the source. */
 const LATER_S = 0.5;
-/** Of the times of pictures. */
+/** Times of pictures are rounded by up to this. */
 const ROUNDED_S = 0.002;
 /** In place of a status: the service did not answer. */
 const NO_ANSWER = 0;
@@ -41,7 +41,7 @@ const STALLED = {
   too_slow: "too_slow",
   no_scene: "no_model", calibration: "no_model",
 };
-/** What every picture of the endoscope may show; else the screen is blank, and none is asked for. */
+/** States in which no picture is shown or asked for. */
 export const HIDDEN_STATES = ["no_tissue"];
 /** Reasons that may be the model's alone: the picture comes in. */
 const OF_MODEL = ["no_scene", "calibration", "fault"];

@@ -12,16 +12,24 @@ import { cutFeed } from "./feeds.js";
 
 export const KEPT_S = 30;
 const LOOK_MS = 1000;
-/** Of the frames that a clip may have: a part begins and ends at key frames, so it may be longer than asked for. */
-const FILLED = 0.9;
+/** A part may be so much longer than asked for: it begins and ends at key frames, and "live" may be some seconds later. */
+const LONGER_S = 5;
+const MIN_S = 1;
 
 const capitalised = (sentence) => sentence[0].toUpperCase() + sentence.slice(1);
 const isOver = ({ state }) => state !== "queued" && state !== "running";
 
-/** @param {import("./feeds.js").Feed} feed @returns {Promise<number>} s that a clip of it may last, by its frames */
-async function longestOf({ received_fps: fps }) {
-  const { limits } = await getInfo();
-  return limits.max_frames === null || fps <= 0 ? Infinity : (FILLED * limits.max_frames) / fps;
+/**
+ * @param {import("./feeds.js").Feed} feed
+ * @returns {Promise<number>} s to ask for, so that a clip has no more frames than it may; at most KEPT_S
+ */
+async function lengthOf({ received_fps: fps }) {
+  try {
+    const { limits } = await getInfo();
+    return fps > 0 ? Math.min(KEPT_S, Math.max(MIN_S, limits.max_frames / fps - LONGER_S)) : KEPT_S;
+  } catch {
+    return KEPT_S; // the service refuses what is too long
+  }
 }
 
 export class Keeping {
@@ -52,11 +60,11 @@ export class Keeping {
     if (this.isCutting) return;
     const visit = ++this.visit;
     const nowS = this.clock.nowS;
-    const pastS = feed.begins_s === null ? KEPT_S : Math.max(1, nowS - feed.begins_s);
+    const pastS = feed.begins_s === null ? KEPT_S : Math.max(MIN_S, nowS - feed.begins_s);
     Object.assign(this, { isCutting: true, kept: null, problem: null });
     this.#say();
     try {
-      const lengthS = Math.min(KEPT_S, pastS, await longestOf(feed));
+      const lengthS = Math.min(pastS, await lengthOf(feed));
       const job = await cutFeed(feed.id, { from: -Number(lengthS.toFixed(1)), to: "live", label: this.#label(feed, nowS) });
       this.isCutting = false;
       if (visit !== this.visit) return;

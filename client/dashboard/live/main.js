@@ -227,8 +227,9 @@ function refreshModel({ modelAgeS }) {
 }
 
 function refusalWords() {
-  const isOfTime = refused.document?.field === "t" && feed?.begins_s != null;
-  return isOfTime ? words("live.moment_gone", { from: clockTime(1000 * feed.begins_s) }) : refused.message;
+  if (refused.document?.field !== "t" || feed?.begins_s == null) return refused.message;
+  const [from, to] = [feed.begins_s, feed.ends_s].map((atS) => clockTime(1000 * atS));
+  return words("live.moment_gone", { from, to });
 }
 
 /** How far the view in sight can be trusted, with the worst reason, and what else the service notes of it. */
