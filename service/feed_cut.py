@@ -41,7 +41,7 @@ REMEDY = 'Send {"from": -30, "to": "live"}, and options as POST /reconstruct has
 SUFFIXES = {"video/mp4": ".mp4", "video/x-matroska": ".mkv"}
 REPORTED_WITHIN_S = 2.0
 """Pairs that came since its worker's last report belong to a cut until live."""
-WIDENED_S = 4.0
+WIDENED_S = 3.0
 """A cut may be so much longer than what is asked for: it begins and ends at key frames."""
 MAX_WAIT_S = 120.0
 """How long the worker may take until the first bytes come."""

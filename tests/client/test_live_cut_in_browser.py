@@ -47,7 +47,7 @@ def test_the_last_30_s_become_a_job_and_its_state_is_shown(site: Site, page: Liv
 
 
 @pytest.mark.parametrize(
-    ("fps", "lost", "length_s"), [(30.0, None, 28.3), (50.0, None, 15.0), (500.0, None, 1.0), (50.0, "/info", 30.0)]
+    ("fps", "lost", "length_s"), [(30.0, None, 30.0), (50.0, None, 17.0), (500.0, None, 1.0), (50.0, "/info", 30.0)]
 )
 def test_no_longer_part_is_asked_for_than_a_clip_may_have_frames(
     site: Site,

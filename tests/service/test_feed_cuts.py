@@ -63,7 +63,7 @@ def test_a_cut_of_too_many_frames_is_refused_with_the_seconds_that_are_possible(
         feed_id = followed(service)
         wait_until(lambda: service.http.get(f"/feeds/{feed_id}").json()["state"] == "live")
         answer = service.http.post(f"/feeds/{feed_id}/cut", json={"from": -30, "to": "2023-11-14T22:14:20Z"})
-        assert "at most 16 s" in assert_problem(answer, 413, "from")["remedy"]
+        assert "at most 17 s" in assert_problem(answer, 413, "from")["remedy"]
         assert not service.spooled()
 
 

@@ -10,10 +10,10 @@ import { progressOf } from "../library/progress.js";
 import { TimesLeft } from "../library/timeleft.js";
 import { cutFeed } from "./feeds.js";
 
-export const KEPT_S = 30;
+const KEPT_S = 30;
 const LOOK_MS = 1000;
 /** A part may be so much longer than asked for: it begins and ends at key frames, and "live" may be some seconds later. */
-const LONGER_S = 5;
+const LONGER_S = 3;
 const MIN_S = 1;
 
 const capitalised = (sentence) => sentence[0].toUpperCase() + sentence.slice(1);
