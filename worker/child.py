@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -86,6 +85,10 @@ class DeviceChild:
         status = self.process.poll()
         return None if status is None else Ended(cause_of(status))
 
+    def starved_s(self) -> float:
+        """As of intrasplat/machine/processes.py."""
+        return starved_s(self.process.pid)
+
     def send(self, order: DeviceOrder) -> None:
         """Give an order; do not wait until the child reads it. If it is dead, next_report() returns its end."""
         self._orders.send(order)
@@ -126,7 +129,7 @@ def watch(
     stop: when it returns True, the child is ordered to stop, and killed if it needs more than MAX_STOP_S for that.
     on_progress: receives the child's progress.
     """
-    detector, asked_s = HangDetector(starved_s=partial(starved_s, child.process.pid)), None
+    detector, asked_s = HangDetector(starved_s=child.starved_s), None
     while True:
         report = child.next_report(LOOK_PERIOD_S)
         if isinstance(report, Ended):

@@ -195,8 +195,7 @@ class Decoder:
             raise Cancelled("Stopped during stage 'decode'.")
         now_s = time.monotonic()
         if self._is_silent(now_s):
-            silence_s = now_s - self._advanced_s
-            raise _undecodable(self._field, f"the decoder made no progress for {silence_s:.0f} s")
+            raise _undecodable(self._field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
         if now_s > self._end_s:
             raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")
 

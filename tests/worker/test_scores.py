@@ -36,6 +36,9 @@ class Child:
         self.sent.append(order)
         self.due_s = time.monotonic() + self.score_s
 
+    def starved_s(self) -> float:
+        return 0.0
+
     def next_report(self, timeout_s: float) -> JobReport | None:
         time.sleep(timeout_s / 10)
         if isinstance(self.sent[-1], StopJob):
