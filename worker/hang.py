@@ -1,6 +1,6 @@
 """Decide when a job hangs: each stage has a limit for the time between two advances.
 
-Time in which its threads waited for a core does not count (is_silent in intrasplat/machine/processes.py).
+Time in which its threads waited for a core does not count (Silence in intrasplat/machine/processes.py).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from contract.wire.job import JobProgress
-from intrasplat.machine.processes import is_silent
+from intrasplat.machine.processes import Silence
 
 STAGE_LIMITS_S: Mapping[str, float] = MappingProxyType(
     {
@@ -36,9 +36,6 @@ OTHER_LIMIT_S = 60.0
 MAX_LOOK_S = 1.0
 """Most time between two calls of is_hung() that counts: a suspended supervisor reads no reports."""
 
-MEASURED_AFTER_S = 1.0
-"""Silence after which it counts how long the job waits for a core."""
-
 
 class HangDetector:
     """Watches the reports of one job. Call is_hung() often."""
@@ -47,8 +44,7 @@ class HangDetector:
         self, clock: Callable[[], float] = time.monotonic, starved_s: Callable[[], float] = lambda: 0.0
     ) -> None:
         """starved_s: as of intrasplat/machine/processes.py, of the job's process."""
-        self._clock, self._starved_s = clock, starved_s
-        self._starved_before_s: float | None = None
+        self._clock, self._silence = clock, Silence(starved_s)
         self._place: tuple[str, float, int] = ("", 0.0, 0)
         self._looked_s = clock()
         self._silence_s = 0.0
@@ -62,14 +58,12 @@ class HangDetector:
         """Take a report. It counts as an advance unless it repeats the last one's stage, fraction and iteration."""
         place = (progress.stage, progress.fraction, progress.iteration)
         if place != self._place:
-            self._place, self._silence_s, self._starved_before_s = place, 0.0, None
+            self._place, self._silence_s = place, 0.0
+            self._silence.end()
 
     def is_hung(self) -> bool:
         """Whether the job has not advanced for longer than its stage allows."""
         now_s = self._clock()
         self._silence_s += min(MAX_LOOK_S, now_s - self._looked_s)
         self._looked_s = now_s
-        if self._starved_before_s is None and self._silence_s > MEASURED_AFTER_S:
-            self._starved_before_s = self._starved_s()
-        limit_s = STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S)
-        return is_silent(self._silence_s, limit_s, self._starved_before_s or 0.0, self._starved_s)
+        return self._silence.is_too_long(self._silence_s, STAGE_LIMITS_S.get(self.stage, OTHER_LIMIT_S))

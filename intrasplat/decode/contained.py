@@ -25,7 +25,7 @@ from intrasplat.decode.guard import Allowance
 from intrasplat.errors import Cancelled, ErrorCode, InputError, LimitError, UnavailableError
 from intrasplat.files.disk import Disk
 from intrasplat.files.disk_errors import StoreFullError
-from intrasplat.machine.processes import is_silent, starved_s
+from intrasplat.machine.processes import Silence, starved_s
 
 MAX_SILENCE_S = 10.0  # without another picture; the largest frame allowed takes well under a second
 MAX_TOTAL_S = 1800.0  # the largest clip allowed takes minutes
@@ -118,7 +118,8 @@ class Decoder:
             patience,
         )
         self._field, self._pictures = "clip", -1
-        self._advance()
+        self._silence = Silence(partial(starved_s, self._process.pid))
+        self._advanced_s = time.monotonic()
         self._end_s = self._advanced_s + patience.max_total_s
         self._lines = lines_of(self._process)
         assert self._process.stdin is not None
@@ -174,19 +175,11 @@ class Decoder:
     def _note(self, message: dict[str, Any]) -> None:
         self._field = "calibration" if message.get("field") == "calibration" else "clip"
         if int(message["pictures"]) > self._pictures:
-            self._pictures = int(message["pictures"])
-            self._advance()
+            self._pictures, self._advanced_s = int(message["pictures"]), time.monotonic()
+            self._silence.end()
         self.frames = max(self.frames, int(message["frames"]))
         if self.opened is None:
             self._on_report(min(1.0, max(0.0, float(message["share"]))))
-
-    def _advance(self) -> None:
-        self._advanced_s, self._starved_s = time.monotonic(), starved_s(self._process.pid)
-
-    def _is_silent(self, now_s: float) -> bool:
-        """Whether no picture came for too long; time in which the process had no core does not count."""
-        waited_s = partial(starved_s, self._process.pid)
-        return is_silent(now_s - self._advanced_s, self._patience.max_silence_s, self._starved_s, waited_s)
 
     def _check(self) -> None:
         if self.result is not None:
@@ -194,7 +187,7 @@ class Decoder:
         if self._should_stop():
             raise Cancelled("Stopped during stage 'decode'.")
         now_s = time.monotonic()
-        if self._is_silent(now_s):
+        if self._silence.is_too_long(now_s - self._advanced_s, self._patience.max_silence_s):
             raise _undecodable(self._field, f"the decoder made no progress for {self._patience.max_silence_s:g} s")
         if now_s > self._end_s:
             raise _undecodable(self._field, f"the decoder took more than {self._patience.max_total_s:g} s")

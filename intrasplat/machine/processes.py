@@ -18,6 +18,8 @@ _PR_SET_PDEATHSIG = 1
 STARVED_FACTOR = 10.0
 """A time limit for a process becomes at most so many times as long while its threads wait for a core: they may wait for
 one another, so even a process that never ends may seem to starve."""
+STARVED_FROM_S = 1.0
+"""Silence, or a tenth of its limit if that is less, from which on waiting for a core is measured: that takes 1 ms."""
 
 
 def shutdown_event() -> threading.Event:
@@ -70,14 +72,27 @@ def starved_s(process_id: int) -> float:
     return nanoseconds / 1e9
 
 
-def is_silent(silence_s: float, limit_s: float, before_s: float, starved_s: Callable[[], float]) -> bool:
-    """Whether a process was silent for longer than its limit, which grows by the time that it waited for a core.
+class Silence:
+    """Judges the silence of a process by a limit, which grows by the time for which the process waits for a core.
 
-    before_s: starved_s() when the silence began.
+    starved_s: as the function of that name, of this process.
     """
-    if silence_s <= limit_s:
-        return False
-    return silence_s > min(limit_s + max(0.0, starved_s() - before_s), STARVED_FACTOR * limit_s)
+
+    def __init__(self, starved_s: Callable[[], float]) -> None:
+        self._starved_s = starved_s
+        self._before_s: float | None = None
+
+    def end(self) -> None:
+        """The process was heard."""
+        self._before_s = None
+
+    def is_too_long(self, silence_s: float, limit_s: float) -> bool:
+        """Whether the silence exceeds its limit. Call it often, with the seconds since the process was heard."""
+        if self._before_s is None and silence_s > min(STARVED_FROM_S, limit_s / 10):
+            self._before_s = self._starved_s()
+        if silence_s <= limit_s or self._before_s is None:
+            return silence_s > limit_s
+        return silence_s > min(limit_s + max(0.0, self._starved_s() - self._before_s), STARVED_FACTOR * limit_s)
 
 
 def _threads(process_id: int) -> list[Path]:
