@@ -144,7 +144,7 @@ class FeedView(FeedReport):
             about["model_age_s"] = known.model_age_s + max(0.0, now_s - record.reported_at_s)
         if record.owner is None:
             text = "No worker follows this feed; the next one with a free place does."
-            about |= {"state": FeedState.CONNECTING, "reason": FeedReason.NO_WORKER, "text": text}
+            about |= {"state": record.state, "reason": FeedReason.NO_WORKER, "text": text}
             about |= {"since_s": record.reported_at_s or record.created_at_s, "received_fps": 0.0, "used_fps": 0.0}
         source, path = record.options.source, f"/feeds/{record.feed_id}"
         links = {"self": path, "events": f"{path}/events", "cut": f"{path}/cut"}
