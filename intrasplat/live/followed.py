@@ -44,6 +44,7 @@ REMEDIES = {
     FeedReason.NO_SCENE: "Give a source whose two eyes show the same scene, and its own calibration.",
     FeedReason.END_OF_FILE: "Give a longer file.",
 }
+"""What to do about such a source, if more is known than to give another one."""
 
 
 class LiveScene:
