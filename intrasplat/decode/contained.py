@@ -52,7 +52,7 @@ OnReport = Callable[[float], None]
 class Patience:
     """Time limits of the process in seconds: without another picture, in total, and from its answer to its exit.
 
-    Time in which it had no core does not count as silence, up to STARVED_FACTOR times the limit.
+    The time for which its threads wait for a core makes the first up to STARVED_FACTOR times as long.
     """
 
     max_silence_s: float = MAX_SILENCE_S
