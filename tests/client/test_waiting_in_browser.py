@@ -27,10 +27,10 @@ def test_the_first_frame_of_the_users_own_clip_is_on_the_stage_until_the_first_p
     assert page.script(PREVIEW) == [96, 80, True]  # the left eye of two
     assert page.text("#badge") == say("screen.own_clip")
     assert not page.find("#drawer").is_displayed()
-    claim = site.claim()
-    page.until(lambda: not page.find("#play").is_enabled())
+    assert not page.find("#play").is_enabled()
     page.script(SPACE)
     assert page.script(PRESSED) == "false"
+    claim = site.claim()  # from now on the worker may answer with pictures
     site.train(claim, 20, 24.0)
     page.until_state("training")
     page.until(lambda: page.find("#play").is_enabled())
