@@ -42,7 +42,7 @@ QUEUE_ENDS = {
     ServerEnd.DIED: "had died",
     ServerEnd.WITH_ITS_STARTER: "ended with the command that had started it, such as a backup,",
 }
-HEALTHY_AFTER_S = 60.0
+HEALTHY_AFTER_S = 15.0
 """A child that has run this long is healthy: if it ends, it is started again at once."""
 STOP_TIMEOUT_S = 15.0
 WORKER_NAME_VARIABLE = "INTRASPLAT_WORKER_NAME"
