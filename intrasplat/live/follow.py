@@ -47,7 +47,7 @@ from intrasplat.train.targets import units_per_mm
 RATES = replace(
     INSTANT.rates,
     **{
-        name: replace(getattr(INSTANT.rates, name), end=3 * (getattr(INSTANT.rates, name).end or 0.0))
+        name: replace(getattr(INSTANT.rates, name), end=4.5 * (getattr(INSTANT.rates, name).end or 0.0))
         for name in ("motion_mean", "motion_quaternion", "motion_log_scale")
     },
 )

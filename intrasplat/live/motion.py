@@ -18,6 +18,8 @@ from intrasplat.splat.constants import SH_C0
 Floats = NDArray[np.float32]
 NOISE_PX, DEPTH_NOISE_PX = 0.2, 0.3
 """Motion across the view, and change of disparity, in px of the coarse grid, that are as likely noise as motion."""
+COLOUR_NOISE = 3 / 255
+"""Change of a cell's colour from what the model shows to the next frame that is as likely noise as change."""
 MAX_OFF = 0.2
 """Relative difference of depth from which on the model shows something else than the recorded frame, and a Gaussian is
 not part of the surface that flow follows."""
@@ -60,6 +62,8 @@ class FlowStart:
         last, new = self._last, CoarseFrame(clip, 0, self._grid)
         displacement_mm, colour, _ = lifted(last, new, *Flows(last).to(new))
         self._last = new
+        squared = np.square(colour).mean(-1, keepdims=True)
+        colour = np.asarray(colour * (squared / (squared + COLOUR_NOISE**2)), np.float32)
         return Carried(last, self._beyond_noise(displacement_mm, last), colour)
 
 
