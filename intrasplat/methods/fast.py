@@ -18,11 +18,11 @@ from intrasplat.names import BUDGETS_S
 from intrasplat.splat.deformation import SharedBasis
 from intrasplat.splat.optimize import Rate
 
-MIN_POINTS, FEW_POINTS, MANY_POINTS = 20_000, 40_000, 80_000
+FEW_POINTS, MANY_POINTS = 20_000, 80_000
 """Points per image."""
 MANY_POINTS_FROM_S = 9.0
-"""From this budget on MANY_POINTS score more than FEW_POINTS, on two cores (docs/decisions/training.md). A faster
-machine could afford them sooner, but nothing measures it, because a resumed run must start with the same points."""
+"""From this budget on a run starts with MANY_POINTS, on two cores (docs/decisions/training.md). A faster machine could
+afford them sooner, but nothing measures it, because a resumed run must start with the same points."""
 
 DEPARTURES = (
     # Points
@@ -145,7 +145,7 @@ QUALITY = replace(FAST, name="quality", min_gain_db=0.05, budget_s=BUDGETS_S["qu
 SMALL = replace(
     FAST,
     name="small",
-    points_per_image=MIN_POINTS,
+    points_per_image=FEW_POINTS,
     points_by_budget=False,
     max_bases=17,
     rates=replace(FAST.rates, motion_log_scale=Rate(0.0)),

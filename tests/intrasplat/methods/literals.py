@@ -11,7 +11,7 @@ LITERALS = (
     Preset(
         name="instant",
         fusion=FusionSettings(mode="fill", stride=3, motion_percentile=95.0, frame_share=0.1, total_share=0.1),
-        points_per_image=40000,
+        points_per_image=20000,
         points_by_budget=True,
         deformation="shared",
         bases=None,

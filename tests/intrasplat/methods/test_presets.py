@@ -84,7 +84,7 @@ def test_ours_differ_in_time_and_in_how_many_gaussians_it_pays_for() -> None:
 def test_small_is_fast_with_less_to_store() -> None:
     small, fast = PRESETS["small"], PRESETS["fast"]
     assert differing(small, fast) == {"points_per_image", "points_by_budget", "max_bases", "rates", "budget_s"}
-    assert (small.points_per_image or 0) < (PRESETS["instant"].points_per_image or 0)
+    assert small.points_per_image == PRESETS["instant"].points_per_image
     still = dataclasses.replace(fast.rates, motion_log_scale=Rate(0.0))
     assert small.rates == still
 
