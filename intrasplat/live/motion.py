@@ -19,7 +19,7 @@ Floats = NDArray[np.float32]
 NOISE_PX, DEPTH_NOISE_PX = 0.2, 0.3
 """Motion across the view, and change of disparity, in px of the coarse grid, that are as likely noise as motion."""
 COLOUR_NOISE = 3 / 255
-"""Change of a cell's colour from what the model shows to the next frame that is as likely noise as change."""
+"""Change of a cell's colour, in [0, 1], from the model's last picture to the next frame that is as likely noise."""
 MAX_OFF = 0.2
 """Relative difference of depth from which on the model shows something else than the recorded frame, and a Gaussian is
 not part of the surface that flow follows."""
@@ -44,8 +44,8 @@ class FlowStart:
         lateral = camera[..., :2] - camera[..., 2:] * self._grid.rays[..., :2]
         squared = np.square(lateral).sum(-1) * np.square(self._focal / z)
         disparity = np.square(camera[..., 2] * self._focal_baseline / (z * z))
-        camera[..., :2] = lateral * (squared / (squared + NOISE_PX**2))[..., None]
-        camera[..., 2] *= disparity / (disparity + DEPTH_NOISE_PX**2)
+        camera[..., :2] = lateral * _share_beyond(NOISE_PX, squared)[..., None]
+        camera[..., 2] *= _share_beyond(DEPTH_NOISE_PX, disparity)
         camera[..., :2] += camera[..., 2:] * self._grid.rays[..., :2]
         return np.asarray(camera @ start.axes.T, np.float32)
 
@@ -62,9 +62,13 @@ class FlowStart:
         last, new = self._last, CoarseFrame(clip, 0, self._grid)
         displacement_mm, colour, _ = lifted(last, new, *Flows(last).to(new))
         self._last = new
-        squared = np.square(colour).mean(-1, keepdims=True)
-        colour = np.asarray(colour * (squared / (squared + COLOUR_NOISE**2)), np.float32)
-        return Carried(last, self._beyond_noise(displacement_mm, last), colour)
+        colour = colour * _share_beyond(COLOUR_NOISE, np.square(colour).mean(-1, keepdims=True))
+        return Carried(last, self._beyond_noise(displacement_mm, last), np.asarray(colour, np.float32))
+
+
+def _share_beyond(noise: float, squared: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The share of a change that is more than noise, from its square; both in one unit."""
+    return np.asarray(squared / (squared + noise**2))
 
 
 @dataclass(frozen=True, eq=False)
